@@ -1,0 +1,568 @@
+"""The environment: hooks, spaces and episodes around a pool of one FMU instance."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym import spaces as fmu_spaces
+from fmugym.adapters import Status
+from fmugym.archive import FMU
+from fmugym.config import EnvConfig, checked, checked_value, output_variable, start_variable
+from fmugym.distributions import draw, is_distribution
+from fmugym.errors import ConfigError, SimulationError, unknown_name
+from fmugym.pool import Pool, PythonPool
+from fmugym.values import EpisodeVariables, NamedValues
+
+__all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
+
+
+class FMUEnv(gymnasium.Env[Any, Any], ABC):
+    """A co-simulation FMU as a Gymnasium environment.
+
+    A subclass for an FMU of its own derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv``
+    and supplies ``_is_done``; every other hook has a default. Hooks are called once a step in the
+    order in which they stand below. All but ``_get_inputs`` and ``_update`` are free of side
+    effects, and none draws random numbers: what is random is a distribution in the config.
+
+    Args:
+        fmu_path: The FMU; a relative path is relative to the file of the class.
+        config: See ``EnvConfig``.
+        log_level: Level of this class's logger, which gets the FMU's messages.
+        render_mode: One of the class's ``metadata["render_modes"]``, or None.
+
+    Attributes:
+        fmu: The FMU; ``fmu.description`` is what it says of itself.
+        config: The checked config.
+        state: The outputs in the order of the config, floats.
+        out: The outputs and the monitored variables by name.
+        action: The action of this step as it was given; None after a reset.
+        inputs: What was written to the FMU's inputs in this step, floats.
+        previous_state: ``state`` before this step.
+        previous_action: The action of the step before; None in the first.
+        time: The FMU's time in seconds.
+        step_count: Steps since the reset.
+        done: What ``_is_done`` said in this step.
+        after_end: Whether this step began after the end of the episode.
+        parameters: The parameters of this episode by name.
+        variables: The episode variables by name; ``_update`` may write them.
+        logger: The logger of the class.
+
+    Raises:
+        ConfigError: If the config does not fit the FMU.
+        FMULoadError: If the FMU cannot be used on this machine.
+    """
+
+    fmi_version: ClassVar[int]
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
+
+    steps_after_end: ClassVar[bool] = False
+    """Whether ``step`` may go on after the end of an episode, as some of Gymnasium's own do."""
+
+    reset_options: ClassVar[tuple[str, ...]] = ("model_parameters",)
+    """The keys that ``reset`` takes in its options."""
+
+    _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
+    _pool: Pool | None = None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> FMUEnv:
+        """Keep the arguments: an environment pickles as its class and them."""
+        env = super().__new__(cls)
+        env._constructor_arguments = args, kwargs
+        return env
+
+    def __init__(
+        self,
+        fmu_path: str | os.PathLike[str],
+        config: Mapping[str, Any] | EnvConfig,
+        log_level: int = logging.WARNING,
+        *,
+        render_mode: str | None = None,
+    ) -> None:
+        self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
+        self.logger.setLevel(log_level)
+        self.config = EnvConfig.from_dict(config)
+        self.render_mode = self._checked_render_mode(render_mode)
+        self.fmu = FMU(_find_fmu(type(self), fmu_path))
+        self._require_fmi_version()
+        self._interface = self.config.resolve(self.fmu.description)
+        self._spec = self._interface.pool_spec()
+        self._warn_of_small_steps()
+        self._prepare_values()
+        self._prepare_spaces()
+        self._pool = PythonPool(self.fmu, self._spec, 1, self.logger)
+
+    def _checked_render_mode(self, mode: str | None) -> str | None:
+        if mode is not None and mode not in self.metadata["render_modes"]:
+            raise unknown_name("render mode", mode, self.metadata["render_modes"])
+        return mode
+
+    def _require_fmi_version(self) -> None:
+        found = self.fmu.description.fmi_major_version
+        if found != self.fmi_version:
+            raise ConfigError(
+                f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
+                f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
+                f"derive from FMI{found}CSEnv instead"
+            )
+
+    def _warn_of_small_steps(self) -> None:
+        internal = self.fmu.description.fixed_internal_step_size
+        if internal is not None and self._spec.communication_step_size < 0.999999 * internal:
+            self.logger.warning(
+                "the communication step of %g s is smaller than the internal step of %g s of %s: "
+                "some of the steps will do nothing",
+                self._spec.communication_step_size,
+                internal,
+                self.fmu.path.name,
+            )
+
+    def _prepare_values(self) -> None:
+        interface, config = self._interface, self.config
+        names = [variable.name for variable in interface.outputs + interface.monitors]
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / interface.time_step))}
+        self._output_count = len(interface.outputs)
+        self._values: tuple[float, ...] = (math.nan,) * len(names)
+        self.out = NamedValues("output", names, lambda: self._values)
+        self.state: Any = self._values[: self._output_count]
+        self.previous_state: Any = self.state
+        self.inputs: Any = (0.0,) * len(interface.inputs)
+        self.action: Any = None
+        self.previous_action: Any = None
+        self.parameters: Mapping[str, Any] = MappingProxyType({})
+        self._configured_variables = tuple(map(self.fmu.variable, interface.parameters))
+        self.variables = EpisodeVariables(config.episode_variables)
+        self.step_count = 0
+        self.time = self._spec.communication_point(0)
+        self.done = False
+        self.after_end = False
+        self._ended = True
+        self._in_hooks = False
+        self._was_reset = False
+
+    def _prepare_spaces(self) -> None:
+        self.action_space = self._get_action_space()
+        self.observation_space = self._get_observation_space()
+        for name, space in (("action", self.action_space), ("observation", self.observation_space)):
+            if not isinstance(space, spaces.Space):
+                raise ConfigError(
+                    f"{type(self).__name__}._get_{name}_space returned {space!r}, "
+                    "expected a gymnasium.spaces.Space"
+                )
+        interface, cls = self._interface, type(self)
+        derived = cls._get_action_space is FMUEnv._get_action_space
+        values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
+        self._action_values = values
+        if cls._get_observation is FMUEnv._get_observation:
+            self._observe = fmu_spaces.default_observation(interface, self.observation_space)
+        self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
+        self._input_buffer = np.zeros((len(interface.inputs), 1))
+        self._takes_one_real = [v.kind for v in interface.inputs] == ["real"]
+
+    # Hooks, in the order of a step.
+
+    def _get_inputs(self) -> Any:
+        """Turn ``self.action`` into the values of the inputs, in the order of the config.
+
+        Returns:
+            One number for each input. By default the action's own elements; for a ``Discrete``
+            made from an Enumeration or Integer, the value that the element stands for.
+        """
+        if self._action_values is None:
+            return self.action
+        if self.action not in self.action_space:
+            raise ConfigError(f"action {self.action!r} is not in {self.action_space}")
+        return self._action_values[int(self.action)]
+
+    def _update(self) -> None:
+        """Advance what the task itself integrates or filters; called once after each FMU step."""
+
+    @abstractmethod
+    def _is_done(self) -> bool:
+        """Whether the task has ended, by success or by failure: ``terminated``."""
+
+    def _is_truncated(self) -> bool:
+        """Whether the episode is to be cut short for a reason outside of the task."""
+        return False
+
+    def _reward_policy(self) -> float:
+        """The reward of this step.
+
+        Returns:
+            By default ``negative_reward`` where the task has ended and ``positive_reward``
+            otherwise; for a goal task ``_goal_reward`` of this observation.
+        """
+        if self._is_goal_task:
+            observation = self._get_observation()
+            achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+            return float(self._goal_reward(achieved, desired))
+        return self.config.negative_reward if self.done else self.config.positive_reward
+
+    def _get_observation(self) -> Any:
+        """The observation, a new array (or dict of new arrays).
+
+        Returns:
+            By default the outputs in the type of the observation space.
+        """
+        return self._observe(self.state)
+
+    def _get_info(self) -> dict[str, Any]:
+        """What else is worth knowing of this step, a new dict."""
+        return {}
+
+    def _get_action_space(self) -> spaces.Space[Any]:
+        """The action space; by default from the inputs' types, min and max."""
+        return fmu_spaces.action_space(self._interface)
+
+    def _get_observation_space(self) -> spaces.Space[Any]:
+        """The observation space; by default from the outputs' types, min and max."""
+        return fmu_spaces.observation_space(self._interface)
+
+    def _goal_reward(self, achieved_goal: Any, desired_goal: Any) -> Any:
+        """The reward for having reached one goal when another was wanted, element-wise.
+
+        Override it for a goal task, whose observations are dicts with ``achieved_goal`` and
+        ``desired_goal``: the default reward and ``compute_reward`` are then made from it.
+        """
+        raise SimulationError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
+
+    def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The parameters that the options of ``reset`` override for one episode, by name."""
+        overrides = options.get("model_parameters", {})
+        if not isinstance(overrides, Mapping):
+            raise ConfigError(f"option 'model_parameters' must be a dict, got {overrides!r}")
+        return overrides
+
+    # Gymnasium's interface.
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start a new episode with the FMU instance at hand.
+
+        What is random is drawn from this environment's own generator: the parameters in the order
+        of the config, then those only in the options, then the episode variables.
+
+        Args:
+            seed: Seeds the generator; None goes on with it.
+            options: ``{"model_parameters": {name: value or distribution}}`` overrides parameters
+                for this episode; an environment may take more, see its ``reset_options``.
+
+        Returns:
+            The first observation, and the info with the values that were drawn or overridden
+            under ``"drawn"``.
+
+        Raises:
+            ConfigError: If an option is unknown or does not fit.
+            SimulationError: If the FMU cannot be initialized, or the environment is closed.
+        """
+        pool = self._open_pool("reset")
+        super().reset(seed=seed)
+        drawn = self._draw_episode(self._checked_options(options))
+        self._ended = True  # should the FMU fail in what follows
+        values = np.array([[value] for value in self.parameters.values()])
+        outputs = pool.reset(self._parameter_variables, values.reshape(-1, 1))
+        self._begin_episode(outputs[:, 0].tolist())
+        observation, info = self._observation_and_info()
+        if self.render_mode == "human":
+            self.render()
+        return observation, info | {"drawn": drawn}
+
+    def _checked_options(self, options: Mapping[str, Any] | None) -> Mapping[str, Any]:
+        for name in options or {}:
+            if name not in self.reset_options:
+                raise unknown_name("reset option", name, self.reset_options)
+        return options or {}
+
+    def _draw_episode(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Draw the parameters and variables; returns those that were drawn or overridden."""
+        overrides = self._checked_overrides(options)
+        base = self._interface.parameters
+        given = {**base, **overrides}
+        if given.keys() == base.keys():
+            self._parameter_variables = self._configured_variables
+        else:
+            self._parameter_variables = tuple(self.fmu.variable(name) for name in given)
+        rng = self.np_random
+        parameters: dict[str, Any] = {}
+        drawn: dict[str, Any] = {}
+        for variable, (name, value) in zip(self._parameter_variables, given.items(), strict=True):
+            parameters[name] = value
+            if is_distribution(value):
+                parameters[name] = checked_value(variable, draw(value, rng))
+                drawn[name] = parameters[name]
+            elif name in overrides:
+                drawn[name] = value
+        self.parameters = MappingProxyType(parameters)
+        return drawn | self._draw_variables(rng)
+
+    def _checked_overrides(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        overrides = {}
+        for name, value in self._get_episode_parameters(options).items():
+            variable = start_variable(self.fmu.description, name, value)
+            if not variable.numeric:
+                raise ConfigError(f"{name!r} is a String: it can be set in the config only")
+            overrides[name] = checked(variable, value)
+        return overrides
+
+    def _draw_variables(self, rng: np.random.Generator) -> dict[str, Any]:
+        drawn = {}
+        for name, value in self.config.episode_variables.items():
+            self.variables[name] = draw(value, rng)
+            if is_distribution(value):
+                drawn[name] = self.variables[name]
+        return drawn
+
+    def _begin_episode(self, values: list[float]) -> None:
+        self.step_count = 0
+        self.time = self._spec.communication_point(self._spec.warm_up_steps * self._spec.substeps)
+        self.action = self.previous_action = None
+        self.inputs = (0.0,) * len(self._interface.inputs)
+        self.done = self.after_end = False
+        self._set_values(values)
+        self.previous_state = self.state
+        self._was_reset, self._ended = True, False
+
+    def _set_values(self, values: list[float]) -> None:
+        self._values = tuple(values)
+        self.state = self._values[: self._output_count]
+
+    def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
+        self._in_hooks = True
+        try:
+            return self._get_observation(), self._get_info()
+        finally:
+            self._in_hooks = False
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Write the action to the FMU, simulate one time step and evaluate the hooks.
+
+        Args:
+            action: An element of the action space, or whatever ``_get_inputs`` takes.
+
+        Returns:
+            Observation, reward, terminated, truncated, info. After a fault of the FMU the
+            observation is the last good one and the info has ``"fault"``, the reason.
+
+        Raises:
+            ConfigError: If the action does not fit the inputs, or is not finite.
+            SimulationError: Before the first reset, after the end of an episode, after ``close``,
+                and, with ``on_fault="raise"``, if the FMU fails.
+        """
+        pool = self._pool
+        if pool is None or self._ended:
+            pool = self._checked_before_step()
+        self._in_hooks = True
+        try:
+            self._take_action(action)
+            outputs, status = pool.step(self._input_buffer)
+            self._advance_time()
+            result = self._evaluate(outputs[:, 0].tolist(), int(status[0]))
+        finally:
+            self._in_hooks = False
+        if self.render_mode == "human":
+            self.render()
+        return result
+
+    def _checked_before_step(self) -> Pool:
+        pool = self._open_pool("step")
+        if not self._was_reset:
+            raise SimulationError("step was called before the first reset")
+        if not self.steps_after_end:
+            raise SimulationError("step was called after the end of the episode; call reset first")
+        return pool
+
+    def _open_pool(self, method: str) -> Pool:
+        if self._pool is None:
+            raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
+        return self._pool
+
+    def _take_action(self, action: Any) -> None:
+        before = self.action, self.previous_action, self.previous_state
+        self.previous_action, self.action, self.previous_state = self.action, action, self.state
+        try:
+            self._write_inputs(self._get_inputs())
+        except BaseException:  # the FMU was not touched: a better action may follow
+            self.action, self.previous_action, self.previous_state = before
+            raise
+
+    def _write_inputs(self, values: Any) -> None:
+        buffer = self._input_buffer
+        if self._takes_one_real and isinstance(values, float | int):
+            buffer[0, 0] = values
+            self.inputs = (buffer[0, 0].item(),)
+        else:
+            buffer[:, 0] = self._flat_inputs(values)
+            self.inputs = tuple(buffer[:, 0].tolist())
+        if not all(map(math.isfinite, self.inputs)):
+            self._raise_for_inputs("every input must be finite")
+
+    def _flat_inputs(self, values: Any) -> npt.NDArray[np.float64]:
+        try:
+            flat = np.asarray(values, dtype=np.float64).ravel()
+        except (TypeError, ValueError):
+            raise ConfigError(f"action {self.action!r} does not make numbers") from None
+        variables = self._interface.inputs
+        if flat.size != len(variables):
+            names = ", ".join(variable.name for variable in variables)
+            raise ConfigError(
+                f"action {self.action!r} makes {flat.size} values, "
+                f"expected {len(variables)}, one for each input ({names})"
+            )
+        return flat if self._takes_one_real else fmu_spaces.to_input_types(variables, flat)
+
+    def _raise_for_inputs(self, why: str) -> None:
+        pairs = zip(self.config.model_input_names, self.inputs, strict=True)
+        listing = ", ".join(f"{name} = {value}" for name, value in pairs)
+        raise ConfigError(f"action {self.action!r} makes {listing}; {why}")
+
+    def _advance_time(self) -> None:
+        spec = self._spec
+        self.step_count += 1
+        steps = spec.warm_up_steps + self.step_count
+        self.time = spec.communication_point(steps * spec.substeps)
+
+    def _evaluate(
+        self, values: list[float], status: int
+    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        stopped = status == Status.TERMINATED
+        if status > Status.WARNING and not stopped:
+            return self._fault(self._open_pool("step").failure(0))
+        total = sum(values)
+        if total - total != 0.0 and not all(map(math.isfinite, values)):
+            return self._fault(
+                f"the outputs are not finite: {dict(zip(self.out, values, strict=True))}"
+            )
+        self.after_end = self._ended
+        self._set_values(values)
+        self._update()
+        done = self._is_done()
+        if done is None:
+            raise ConfigError("_is_done returned None, expected True or False")
+        self.done = terminated = bool(done) or stopped
+        truncated = self._reached_limit() or bool(self._is_truncated())
+        reward = self._reward_policy()
+        if reward is None:
+            raise ConfigError("_reward_policy returned None, expected a number")
+        observation, info = self._get_observation(), self._get_info()
+        if stopped:
+            info["fmu_terminated"] = True
+        self._ended = self._ended or terminated or truncated
+        return observation, float(reward), terminated, truncated, info
+
+    def _reached_limit(self) -> bool:
+        config = self.config
+        limit = config.max_episode_steps
+        if limit is not None and self.step_count >= limit:
+            return True
+        return config.stop_time is not None and self._next_step_exceeds(config.stop_time)
+
+    def _next_step_exceeds(self, stop_time: float) -> bool:
+        spec = self._spec
+        steps = spec.warm_up_steps + self.step_count + 1
+        return spec.communication_point(steps * spec.substeps) > stop_time + 1e-9 * spec.time_step
+
+    def _fault(self, reason: str) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._ended = True
+        policy = self.config.on_fault
+        if policy == "raise":
+            raise SimulationError(reason)
+        self.logger.warning("%s", reason)
+        self.done = policy == "terminate"
+        info = self._get_info() | {"fault": reason}
+        reward = float(self.config.fault_reward)
+        return self._get_observation(), reward, self.done, not self.done, info
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """The goal reward in the form that hindsight replay calls; see ``_goal_reward``."""
+        return self._goal_reward(achieved_goal, desired_goal)
+
+    def read_variables(self, *names: str) -> dict[str, float]:
+        """Read any numeric variables of the FMU now, for inspection outside of an episode's loop.
+
+        Raises:
+            ConfigError: If a name is unknown or its variable is not numeric.
+            SimulationError: If the environment is closed or was never reset.
+        """
+        pool = self._open_pool("read_variables")
+        if not self._was_reset:
+            raise SimulationError("read_variables was called before the first reset")
+        variables = tuple(output_variable(self.fmu.description, name) for name in names)
+        return dict(zip(names, pool.read(variables)[:, 0].tolist(), strict=True))
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The environment's generator; not for hooks, whose results must not depend on it."""
+        if self._in_hooks:
+            raise SimulationError(
+                "a hook drew random numbers; give a distribution in the config under "
+                "'model_parameters' or 'episode_variables' instead and read the drawn value"
+            )
+        return super().np_random
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        self._np_random = value
+        self._np_random_seed = -1
+
+    def close(self) -> None:
+        """Free the FMU and its temporary folder; more than one call is fine."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+        super().close()
+
+    def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
+        return _rebuild, (type(self), *self._constructor_arguments)
+
+
+class FMI1CSEnv(FMUEnv):
+    """Base class for FMUs of FMI 1.0 co-simulation; see ``FMUEnv``."""
+
+    fmi_version = 1
+
+
+class FMI2CSEnv(FMUEnv):
+    """Base class for FMUs of FMI 2.0 co-simulation; see ``FMUEnv``."""
+
+    fmi_version = 2
+
+
+class FMI3CSEnv(FMUEnv):
+    """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
+
+    fmi_version = 3
+
+
+def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:
+    return cls(*args, **kwargs)
+
+
+def _find_fmu(cls: type, fmu_path: str | os.PathLike[str]) -> Path:
+    """Find a relative path beside the file of the class, or of a class that it derives from."""
+    path = Path(fmu_path).expanduser()
+    if path.is_absolute():
+        return path
+    folders = [Path(inspect.getfile(c)).parent for c in cls.__mro__ if _has_file(c)]
+    candidates = [folder / path for folder in folders] or [Path.cwd() / path]
+    return next((c for c in candidates if c.exists()), candidates[0])
+
+
+def _has_file(cls: type) -> bool:
+    """Classes of a notebook or the interactive interpreter have none."""
+    try:
+        return Path(inspect.getfile(cls)).is_file() and cls.__module__ != __name__
+    except (TypeError, OSError):
+        return False

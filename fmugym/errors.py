@@ -1,0 +1,53 @@
+"""The errors that fmugym raises for mistakes and faults it can name.
+
+::
+
+    FMUGymError
+    ├── ConfigError       a name, number or type that the user gave does not fit the FMU
+    ├── FMULoadError      an archive, a model description or a library cannot be used
+    └── SimulationError   an FMI call failed, or a call came out of its order
+
+Every error takes one argument, its text, and so survives pickling between processes.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = ["ConfigError", "FMUGymError", "FMULoadError", "SimulationError", "unknown_name"]
+
+
+class FMUGymError(Exception):
+    """Base class of all errors of this package."""
+
+
+class ConfigError(FMUGymError):
+    """A configuration, an option or an action does not fit the FMU or the environment."""
+
+
+class FMULoadError(FMUGymError):
+    """An FMU cannot be opened, read, loaded or instantiated on this machine."""
+
+
+class SimulationError(FMUGymError):
+    """An FMI function failed, or a method was called at a time when it has no meaning."""
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
+    """Make the error for a name that does not exist.
+
+    Args:
+        kind: What the name should have named, for example ``"config key"``.
+        name: The name as it was given.
+        known: All the names that would have been right.
+
+    Returns:
+        The error, with the nearest known name or, where none is near, some of the known names.
+    """
+    names = list(known)
+    near = difflib.get_close_matches(str(name), names, n=1)
+    if near:
+        return ConfigError(f"unknown {kind} {name!r}; did you mean {near[0]!r}?")
+    listing = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
+    return ConfigError(f"unknown {kind} {name!r}; known are: {listing or 'none'}")
