@@ -3,11 +3,14 @@
 Importing this package registers its environments, so that ``gymnasium.make("fmugym/...")`` works.
 """
 
+from fmugym import envs
 from fmugym.archive import FMU
+from fmugym.bundled import bundled_fmu
 from fmugym.config import EnvConfig
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, FMULoadError, SimulationError
+from fmugym.registration import register
 
 __all__ = [
     "FMU",
@@ -24,4 +27,7 @@ __all__ = [
     "Normal",
     "SimulationError",
     "Uniform",
+    "bundled_fmu",
+    "envs",
+    "register",
 ]

@@ -247,7 +247,7 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
     """Find a variable that can be set before initialization.
 
     Raises:
-        ConfigError: If there is none of this name, it cannot be set, or it is a String and the value not.
+        ConfigError: If there is none of this name, or it cannot be set or not be carried.
     """
     variable = description.variable(name)
     if not variable.settable_at_start:

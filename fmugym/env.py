@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import logging
 import math
+import operator
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -25,6 +26,9 @@ from fmugym.distributions import draw, is_distribution
 from fmugym.errors import ConfigError, SimulationError, unknown_name
 from fmugym.pool import Pool, PythonPool
 from fmugym.values import EpisodeVariables, NamedValues
+
+if TYPE_CHECKING:
+    from fmugym.rendering import Renderer, Scene
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
@@ -65,7 +69,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         FMULoadError: If the FMU cannot be used on this machine.
     """
 
-    fmi_version: ClassVar[int]
+    fmi_version: ClassVar[int | None] = None
+    """The FMI version that the FMU must have; None for any."""
+
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
 
     steps_after_end: ClassVar[bool] = False
@@ -75,7 +81,11 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     """The keys that ``reset`` takes in its options."""
 
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
+    render_size: ClassVar[tuple[int, int]] = (600, 400)
+    """Width and height of the pictures in pixels."""
+
     _pool: Pool | None = None
+    _renderer: Renderer[Any] | None = None
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUEnv:
         """Keep the arguments: an environment pickles as its class and them."""
@@ -111,7 +121,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
 
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
-        if found != self.fmi_version:
+        if self.fmi_version is not None and found != self.fmi_version:
             raise ConfigError(
                 f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
                 f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
@@ -151,6 +161,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._ended = True
         self._in_hooks = False
         self._was_reset = False
+        self._last_reward: float | None = None
+        self._return = 0.0
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -167,6 +179,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._action_values = values
         if cls._get_observation is FMUEnv._get_observation:
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
+        self._elements = _elements(self.action_space) if cls.step is FMUEnv.step else None
         self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
         self._input_buffer = np.zeros((len(interface.inputs), 1))
         self._takes_one_real = [v.kind for v in interface.inputs] == ["real"]
@@ -182,8 +195,6 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """
         if self._action_values is None:
             return self.action
-        if self.action not in self.action_space:
-            raise ConfigError(f"action {self.action!r} is not in {self.action_space}")
         return self._action_values[int(self.action)]
 
     def _update(self) -> None:
@@ -237,6 +248,18 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         ``desired_goal``: the default reward and ``compute_reward`` are then made from it.
         """
         raise SimulationError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
+
+    def _get_scene(self) -> Scene[Any]:
+        """What ``render`` draws; see ``fmugym.rendering``. Called once."""
+        raise SimulationError(f"{type(self).__name__} has render modes, but no _get_scene")
+
+    def _get_frame(self) -> Any:
+        """What the scene needs to know of this moment; by default ``out``."""
+        return self.out
+
+    def _describe_action(self) -> str:
+        """The action as text for the picture."""
+        return ", ".join(f"{value:+.3g}" for value in self.inputs)
 
     def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """The parameters that the options of ``reset`` override for one episode, by name."""
@@ -333,6 +356,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.done = self.after_end = False
         self._set_values(values)
         self.previous_state = self.state
+        self._last_reward, self._return = None, 0.0
         self._was_reset, self._ended = True, False
 
     def _set_values(self, values: list[float]) -> None:
@@ -372,9 +396,14 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             result = self._evaluate(outputs[:, 0].tolist(), int(status[0]))
         finally:
             self._in_hooks = False
+        if self.render_mode is not None:
+            self._note_for_picture(result[1])
+        return result
+
+    def _note_for_picture(self, reward: float) -> None:
+        self._last_reward, self._return = reward, self._return + reward
         if self.render_mode == "human":
             self.render()
-        return result
 
     def _checked_before_step(self) -> Pool:
         pool = self._open_pool("step")
@@ -382,6 +411,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             raise SimulationError("step was called before the first reset")
         if not self.steps_after_end:
             raise SimulationError("step was called after the end of the episode; call reset first")
+        if not self.after_end:
+            gymnasium.logger.warn("step was called after the end of the episode; call reset first")
         return pool
 
     def _open_pool(self, method: str) -> Pool:
@@ -390,6 +421,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         return self._pool
 
     def _take_action(self, action: Any) -> None:
+        if self._elements is not None and not _is_element(action, self._elements):
+            raise ConfigError(f"action {action!r} is not in {self.action_space}")
         before = self.action, self.previous_action, self.previous_state
         self.previous_action, self.action, self.previous_state = self.action, action, self.state
         try:
@@ -485,6 +518,29 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         reward = float(self.config.fault_reward)
         return self._get_observation(), reward, self.done, not self.done, info
 
+    def render(self) -> Any:
+        """Draw the present state.
+
+        Returns:
+            In the mode ``rgb_array`` an array of shape (height, width, 3) and type uint8, in the
+            mode ``human`` None: the picture is in a window.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called, but no render_mode was given at construction")
+            return None
+        if not self._was_reset:
+            raise SimulationError("render was called before the first reset")
+        from fmugym.rendering import Overlay, Renderer  # pygame takes a while to import
+
+        if self._renderer is None:
+            fps = 1 / self._interface.time_step
+            title = type(self).__name__
+            scene = self._get_scene()
+            self._renderer = Renderer(scene, self.render_size, fps, self.render_mode, title)
+        action = "" if self.action is None else self._describe_action()
+        overlay = Overlay(self.time, action, self._last_reward, self._return)
+        return self._renderer.render(self._get_frame(), overlay)
+
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """The goal reward in the form that hindsight replay calls; see ``_goal_reward``."""
         return self._goal_reward(achieved_goal, desired_goal)
@@ -522,6 +578,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         if self._pool is not None:
             self._pool.close()
             self._pool = None
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
         super().close()
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
@@ -548,6 +607,20 @@ class FMI3CSEnv(FMUEnv):
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:
     return cls(*args, **kwargs)
+
+
+def _elements(space: spaces.Space[Any]) -> range | None:
+    """The elements of a ``Discrete``; a subclass that overrides ``step`` may take other actions."""
+    if isinstance(space, spaces.Discrete):
+        return range(int(space.start), int(space.start + space.n))
+    return None
+
+
+def _is_element(action: Any, elements: range) -> bool:
+    try:
+        return operator.index(action) in elements
+    except TypeError:
+        return False
 
 
 def _find_fmu(cls: type, fmu_path: str | os.PathLike[str]) -> Path:

@@ -1,0 +1,147 @@
+"""The cart-pole FMU as the equal of Gymnasium's CartPole-v1."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.bundled import bundled_fmu
+from fmugym.distributions import Uniform
+from fmugym.env import FMUEnv
+from fmugym.rendering import CartPoleFrame, CartPoleScene
+
+__all__ = ["CartPoleEnv"]
+
+START_VALUES = ("x_0", "x_dot_0", "phi_0", "phi_dot_0")
+
+_GYMNASIUM_PLANT = {
+    "m_cart": 1.0,
+    "m_pole": 0.1,
+    "pole_length": 1.0,
+    "pole_type": "uniform_rod",
+    "g": 9.8,
+    "theta_0": math.pi / 2,
+    "theta_dot_0": 0.0,
+    "solver": "explicit_euler",
+    "max_step": 1.0,
+}
+
+
+class CartPoleEnv(FMUEnv):
+    """Balance a pole on a cart by pushing the cart left or right.
+
+    ## Description
+    The drop-in equal of Gymnasium's ``CartPole-v1``, simulated by a compiled FMU: same spaces,
+    rewards, limits, start distribution, arguments and reset options, and from the same seed and
+    actions the same observations, bit for bit, where numpy's sine and the C library's agree.
+    The plant is that of Barto, Sutton and Anderson, "Neuronlike Adaptive Elements That Can Solve
+    Difficult Learning Control Problems" (1983), in the corrected equations of Florian (2005).
+
+    ## Action Space
+    ``Discrete(2)``
+
+    | Num | Action                              |
+    |-----|-------------------------------------|
+    | 0   | push the cart to the left (-10 N)   |
+    | 1   | push the cart to the right (+10 N)  |
+
+    ## Observation Space
+    ``Box(float32)`` of shape (4,)
+
+    | Num | Observation             | Min               | Max              |
+    |-----|-------------------------|-------------------|------------------|
+    | 0   | cart position [m]       | -4.8              | 4.8              |
+    | 1   | cart velocity [m/s]     | -inf              | inf              |
+    | 2   | pole angle [rad]        | -0.418 (-24 deg)  | 0.418 (24 deg)   |
+    | 3   | pole velocity [rad/s]   | -inf              | inf              |
+
+    ## Rewards
+    +1 for each step, the last one included. With ``sutton_barto_reward=True`` 0 for each step and
+    -1 for the one that ends the task.
+
+    ## Starting State
+    Each of the four values uniform in [-0.05, 0.05). The reset options ``low`` and ``high``
+    change the bounds for one episode.
+
+    ## Episode End
+    Terminated when the cart is more than 2.4 m from the centre or the pole leans more than
+    12 degrees; truncated after 500 steps of 0.02 s (by ``gymnasium.make``).
+
+    ## Arguments
+    * ``sutton_barto_reward``: see above.
+    * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
+    * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
+    * ``render_mode``: "human", "rgb_array" or None.
+
+    ## Version History
+    * v0: Initial version, equal to Gymnasium's v1.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    steps_after_end: ClassVar[bool] = True
+    reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "low", "high")
+
+    def __init__(
+        self,
+        sutton_barto_reward: bool = False,
+        render_mode: str | None = None,
+        *,
+        fmi_version: str | float = "2.0",
+        model_parameters: Mapping[str, Any] | None = None,
+        log_level: int = logging.WARNING,
+    ) -> None:
+        self.sutton_barto_reward = sutton_barto_reward
+        self.force_mag = 10.0
+        self.x_threshold = 2.4
+        self.theta_threshold_radians = 12 * 2 * math.pi / 360
+        start = {name: Uniform(-0.05, 0.05) for name in START_VALUES}
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
+            "model_parameters": {**start, **_GYMNASIUM_PLANT, **(model_parameters or {})},
+            "time_step": 0.02,
+        }
+        fmu_path = bundled_fmu("CartPole", fmi_version)
+        super().__init__(fmu_path, config, log_level, render_mode=render_mode)
+
+    def _get_action_space(self) -> spaces.Space[Any]:
+        return spaces.Discrete(2)
+
+    def _get_observation_space(self) -> spaces.Space[Any]:
+        limits = [2 * self.x_threshold, math.inf, 2 * self.theta_threshold_radians, math.inf]
+        high = np.array(limits, dtype=np.float32)
+        return spaces.Box(-high, high, dtype=np.float32)
+
+    def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        parameters = dict(super()._get_episode_parameters(options))
+        if "low" in options or "high" in options:
+            start = Uniform(float(options.get("low", -0.05)), float(options.get("high", 0.05)))
+            parameters |= dict.fromkeys(START_VALUES, start)
+        return parameters
+
+    def _get_inputs(self) -> Any:
+        return self.force_mag * (2.0 * self.action - 1.0)
+
+    def _is_done(self) -> Any:
+        x, _, theta, _ = self.state
+        return (abs(x) > self.x_threshold) | (abs(theta) > self.theta_threshold_radians)
+
+    def _reward_policy(self) -> Any:
+        if self.sutton_barto_reward:
+            return 0.0 - self.done
+        return 1.0 - (self.done & self.after_end)
+
+    def _get_scene(self) -> CartPoleScene:
+        return CartPoleScene(self.x_threshold, 1.0, self.theta_threshold_radians)
+
+    def _get_frame(self) -> CartPoleFrame:
+        x, _, theta, _ = self.state
+        return CartPoleFrame(x, theta, self.inputs[0])
+
+    def _describe_action(self) -> str:
+        return f"{self.inputs[0]:+.1f} N"

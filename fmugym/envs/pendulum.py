@@ -1,0 +1,162 @@
+"""The pendulum FMU as the equal of Gymnasium's Pendulum-v1."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.bundled import bundled_fmu
+from fmugym.distributions import Uniform
+from fmugym.env import FMUEnv
+from fmugym.rendering import PendulumFrame, PendulumScene
+
+__all__ = ["PendulumEnv"]
+
+_GYMNASIUM_PLANT = {
+    "m": 1.0,
+    "l": 1.0,
+    "body": "uniform_rod",
+    "b": 0.0,
+    "c": 0.0,
+    "tau_max": 2.5,  # the environment limits the torque itself, to 2 N m, before rounding it
+    "theta_dot_max": 8.0,
+    "solver": "semi_implicit_euler",
+    "max_step": 1.0,
+}
+
+
+class PendulumEnv(FMUEnv):
+    """Swing a rod up and hold it upright with a torque that is too weak to lift it at once.
+
+    ## Description
+    The drop-in equal of Gymnasium's ``Pendulum-v1``, simulated by a compiled FMU: same spaces,
+    rewards, limits, start distribution, arguments and reset options, and from the same seed and
+    actions the same observations and rewards, bit for bit, where numpy's sine and the C library's
+    agree. The plant is a uniform rod of 1 kg and 1 m on a frictionless pivot.
+
+    ## Action Space
+    ``Box(-2.0, 2.0, (1,), float32)``
+
+    | Num | Action                                    | Min  | Max |
+    |-----|-------------------------------------------|------|-----|
+    | 0   | torque [N m], counter-clockwise positive  | -2.0 | 2.0 |
+
+    ## Observation Space
+    ``Box(float32)`` of shape (3,); theta is the angle from upright, counter-clockwise positive
+
+    | Num | Observation               | Min  | Max |
+    |-----|---------------------------|------|-----|
+    | 0   | cos theta                 | -1.0 | 1.0 |
+    | 1   | sin theta                 | -1.0 | 1.0 |
+    | 2   | angular velocity [rad/s]  | -8.0 | 8.0 |
+
+    ## Rewards
+    ``-(theta^2 + 0.1 theta_dot^2 + 0.001 torque^2)`` with the angle, normalized to [-pi, pi), and
+    the velocity before the step.
+
+    ## Starting State
+    The angle uniform in [-pi, pi), the velocity in [-1, 1). The reset options ``x_init`` and
+    ``y_init`` replace the bounds pi and 1 for one episode.
+
+    ## Episode End
+    Never terminated; truncated after 200 steps of 0.05 s (by ``gymnasium.make``).
+
+    ## Arguments
+    * ``g``: acceleration of gravity in m/s^2, by default 10.
+    * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
+    * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
+    * ``render_mode``: "human", "rgb_array" or None.
+
+    ## Version History
+    * v0: Initial version, equal to Gymnasium's v1.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    steps_after_end: ClassVar[bool] = True
+    reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "x_init", "y_init")
+    render_size: ClassVar[tuple[int, int]] = (500, 500)
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        g: float = 10.0,
+        *,
+        fmi_version: str | float = "2.0",
+        model_parameters: Mapping[str, Any] | None = None,
+        log_level: int = logging.WARNING,
+    ) -> None:
+        self.max_speed = 8.0
+        self.max_torque = 2.0
+        start = {"theta_0": Uniform(-np.pi, np.pi), "theta_dot_0": Uniform(-1.0, 1.0)}
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["theta", "theta_dot"],
+            "model_parameters": {**start, **_GYMNASIUM_PLANT, "g": g, **(model_parameters or {})},
+            "time_step": 0.05,
+        }
+        fmu_path = bundled_fmu("Pendulum", fmi_version)
+        super().__init__(fmu_path, config, log_level, render_mode=render_mode)
+
+    def _get_action_space(self) -> spaces.Space[Any]:
+        limit = self.max_torque
+        return spaces.Box(-limit, limit, shape=(1,), dtype=np.float32)
+
+    def _get_observation_space(self) -> spaces.Space[Any]:
+        high = np.array([1.0, 1.0, self.max_speed], dtype=np.float32)
+        return spaces.Box(-high, high, dtype=np.float32)
+
+    def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        parameters = dict(super()._get_episode_parameters(options))
+        for option, name in (("x_init", "theta_0"), ("y_init", "theta_dot_0")):
+            if option in options:
+                limit = float(options[option])
+                parameters[name] = Uniform(-limit, limit)
+        return parameters
+
+    def _clipped_torque(self) -> Any:
+        """The torque in the type of the action, float32 for elements of the action space."""
+        return np.minimum(np.maximum(self.action[0], -self.max_torque), self.max_torque)
+
+    def _get_inputs(self) -> Any:
+        """The torque whose threefold is Gymnasium's ``3 * u``, which is rounded to float32.
+
+        The FMU computes ``3 / (m l^2) * tau`` in float64, and thrice a third of a float64 is that
+        float64 again.
+        """
+        return np.float64(3.0 * self._clipped_torque()) / 3.0
+
+    def _is_done(self) -> Any:
+        return self.state[0] != self.state[0]  # never, in the shape of the state
+
+    def _reward_policy(self) -> Any:
+        theta, theta_dot = self.previous_state
+        angle = ((theta + np.pi) % (2 * np.pi)) - np.pi
+        effort = np.float64(0.001 * _squared(self._clipped_torque()))  # rounded as the action is
+        return -(_squared(angle) + 0.1 * _squared(theta_dot) + effort)
+
+    def _get_observation(self) -> Any:
+        theta, theta_dot = self.state
+        return np.array([np.cos(theta), np.sin(theta), theta_dot], dtype=np.float32)
+
+    def _get_scene(self) -> PendulumScene:
+        return PendulumScene(torque_limit=self.max_torque)
+
+    def _get_frame(self) -> PendulumFrame:
+        return PendulumFrame(self.state[0], self.inputs[0])
+
+    def _describe_action(self) -> str:
+        return f"{self.inputs[0]:+.2f} N m"
+
+
+def _squared(value: Any) -> Any:
+    """The C library's ``pow``, as in Gymnasium: it differs from a product in one bit at times.
+
+    numpy takes the product for arrays, unless the exponent is an array too.
+    """
+    if isinstance(value, np.ndarray):
+        return np.power(value, np.full_like(value, 2.0))
+    return value**2

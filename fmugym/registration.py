@@ -1,0 +1,24 @@
+"""Registration of environments with Gymnasium."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvCreator
+
+__all__ = ["register"]
+
+
+def register(
+    env_id: str, env: EnvCreator | str, max_episode_steps: int | None = None, **spec: Any
+) -> None:
+    """Register an environment, so that ``gymnasium.make(env_id)`` makes it.
+
+    Args:
+        env_id: ``[namespace/]Name-vN``, for example ``"me/Boiler-v0"``.
+        env: The class, or ``"module:Class"``.
+        max_episode_steps: Steps after which ``make``'s time limit truncates an episode.
+        spec: More fields of Gymnasium's ``EnvSpec``, for example ``reward_threshold``.
+    """
+    gymnasium.register(env_id, entry_point=env, max_episode_steps=max_episode_steps, **spec)
