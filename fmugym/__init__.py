@@ -9,13 +9,14 @@ from fmugym.bundled import bundled_fmu
 from fmugym.config import EnvConfig
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
-from fmugym.errors import ConfigError, FMUGymError, FMULoadError, SimulationError
+from fmugym.errors import ConfigError, ContractError, FMUGymError, FMULoadError, SimulationError
 from fmugym.registration import register
 
 __all__ = [
     "FMU",
     "Choice",
     "ConfigError",
+    "ContractError",
     "EnvConfig",
     "FMI1CSEnv",
     "FMI2CSEnv",

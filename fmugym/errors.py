@@ -5,7 +5,8 @@
     FMUGymError
     ├── ConfigError       a name, number or type that the user gave does not fit the FMU
     ├── FMULoadError      an archive, a model description or a library cannot be used
-    └── SimulationError   an FMI call failed, or a call came out of its order
+    ├── SimulationError   an FMI call failed, or a call came out of its order
+    └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
 Every error takes one argument, its text, and so survives pickling between processes.
 """
@@ -15,7 +16,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["ConfigError", "FMUGymError", "FMULoadError", "SimulationError", "unknown_name"]
+__all__ = [
+    "ConfigError",
+    "ContractError",
+    "FMUGymError",
+    "FMULoadError",
+    "SimulationError",
+    "unknown_name",
+]
 
 
 class FMUGymError(Exception):
@@ -32,6 +40,10 @@ class FMULoadError(FMUGymError):
 
 class SimulationError(FMUGymError):
     """An FMI function failed, or a method was called at a time when it has no meaning."""
+
+
+class ContractError(FMUGymError):
+    """An environment does not keep what every environment of this package promises."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:

@@ -1,0 +1,268 @@
+"""The contract of this package's environments as functions: run them on an environment of yours.
+
+``check_fmu_env`` is what the project's own tests run on every environment and FMI version. It
+finds what goes wrong when a new FMU is integrated: a reset that does not restore everything,
+parameters without effect, observations outside of their space.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils.env_checker import data_equivalence
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, ContractError
+
+__all__ = ["check_fmu_env"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Transition:
+    observation: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 200) -> None:
+    """Check that an environment over an FMU keeps its contract.
+
+    The environment itself is not used: everything is tried on copies of it, made from its class
+    and the arguments of its constructor.
+
+    Args:
+        env: The environment, wrapped or not.
+        seed: Seeds the episodes and the actions.
+        num_steps: Length of each trial in steps; episodes that end are followed by others.
+
+    Raises:
+        ContractError: If the environment breaks the contract; the text says how.
+        ConfigError: If it is none of this package.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, FMUEnv):
+        raise ConfigError(f"expected an environment of fmugym, got {type(inner).__name__}")
+    actions = _sample_actions(inner, seed, num_steps)
+    for check in _CHECKS:
+        check(inner, actions, seed)
+
+
+def _sample_actions(env: FMUEnv, seed: int, count: int) -> list[Any]:
+    space = copy.deepcopy(env.action_space)
+    space.seed(seed)
+    return [space.sample() for _ in range(count)]
+
+
+@contextmanager
+def _fresh(env: FMUEnv) -> Iterator[FMUEnv]:
+    """A new environment of the same class and arguments, without a window."""
+    fresh = copy.deepcopy(env)
+    fresh.render_mode = None
+    try:
+        yield fresh
+    finally:
+        fresh.close()
+
+
+def _rollout(env: FMUEnv, actions: list[Any], seed: int) -> list[_Transition]:
+    """Run episodes one after another; the first is seeded, the others go on with the stream."""
+    observation, _ = env.reset(seed=seed)
+    transitions = [_Transition(observation, 0.0, False, False)]
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        transitions.append(_Transition(observation, reward, terminated, truncated))
+        if terminated or truncated:
+            observation, _ = env.reset()
+            transitions.append(_Transition(observation, 0.0, False, False))
+    return transitions
+
+
+def _require_equal(what: str, first: list[_Transition], second: list[_Transition]) -> None:
+    if len(first) != len(second):
+        raise ContractError(f"{what}: the episodes end at different steps")
+    for index, (a, b) in enumerate(zip(first, second, strict=True)):
+        for field in ("observation", "reward", "terminated", "truncated"):
+            left, right = getattr(a, field), getattr(b, field)
+            if not data_equivalence(left, right, exact=True):
+                raise ContractError(f"{what}: at step {index} {field} was {left}, then {right}")
+
+
+def _check_determinism(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    with _fresh(env) as first, _fresh(env) as second:
+        _require_equal(
+            "two environments with the same seed and actions differ",
+            _rollout(first, actions, seed),
+            _rollout(second, actions, seed),
+        )
+
+
+def _check_reset(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    with _fresh(env) as tried:
+        fresh = _rollout(tried, actions, seed)
+        _rollout(tried, actions[::-1], seed + 1)
+        for _ in range(3):  # once more by reset and initialization, then from a saved state
+            again = _rollout(tried, actions, seed)
+            _require_equal("reset does not restore everything", fresh, again)
+
+
+def _check_spaces(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    with _fresh(env) as tried:
+        for transition in _rollout(tried, actions, seed):
+            if not tried.observation_space.contains(transition.observation):
+                raise ContractError(
+                    f"observation {transition.observation!r} is not in {tried.observation_space}"
+                )
+
+
+def _check_types(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    with _fresh(env) as tried:
+        for transition in _rollout(tried, actions, seed):
+            _require_type("reward", transition.reward, float)
+            _require_type("terminated", transition.terminated, bool)
+            _require_type("truncated", transition.truncated, bool)
+            if not math.isfinite(transition.reward):
+                raise ContractError(f"a reward is {transition.reward}")
+
+
+def _require_type(what: str, value: Any, expected: type) -> None:
+    if not isinstance(value, expected):
+        raise ContractError(
+            f"{what} is of type {type(value).__name__}, expected {expected.__name__}"
+        )
+
+
+def _check_time(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    with _fresh(env) as tried:
+        tried.reset(seed=seed)
+        start, step = tried.time, tried._interface.time_step
+        for count, action in enumerate(actions, start=1):
+            *_, terminated, truncated, _ = tried.step(action)
+            expected = start + count * step
+            if not math.isclose(tried.time, expected, rel_tol=1e-15, abs_tol=1e-15):
+                raise ContractError(f"time is {tried.time} after {count} steps, not {expected}")
+            if terminated or truncated:
+                return
+
+
+def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    """What was set must be read back, and a changed value must change the simulation."""
+    with _fresh(env) as tried:
+        tried.reset(seed=seed)
+        given = dict(tried.parameters)
+        read = tried.read_variables(*given)
+        for name, value in given.items():
+            if not math.isclose(read[name], value, rel_tol=1e-6):
+                raise ContractError(f"parameter {name!r} was set to {value}, but is {read[name]}")
+        before = _trace(tried, actions, seed, {})
+        for name, value in given.items():
+            changed = _changed(tried, name, value)
+            if changed is not None and _trace(tried, actions, seed, {name: changed}) == before:
+                logger.warning(
+                    "parameter %r has no effect on the outputs: %g gives the same as %g",
+                    name,
+                    changed,
+                    value,
+                )
+
+
+def _changed(env: FMUEnv, name: str, value: float) -> float | None:
+    """Another value of a Real within its limits, a percent away; None for other types."""
+    variable = env.fmu.variable(name)
+    if variable.kind != "real":
+        return None
+    nominal = abs(value) or abs(variable.nominal or 1.0)
+    for candidate in (value + 0.01 * nominal, value - 0.01 * nominal):
+        if variable.minimum <= candidate <= variable.maximum:
+            return candidate
+    return None
+
+
+def _trace(
+    env: FMUEnv, actions: list[Any], seed: int, parameters: dict[str, float]
+) -> list[tuple[float, ...]]:
+    """The outputs of one episode."""
+    env.reset(seed=seed, options={"model_parameters": parameters})
+    trace = [env.state]
+    for action in actions:
+        *_, terminated, truncated, _ = env.step(action)
+        trace.append(env.state)
+        if terminated or truncated:
+            break
+    return trace
+
+
+def _check_hooks(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    """Evaluated once more after a step, every hook must say the same and change nothing."""
+    with _fresh(env) as tried:
+        tried.reset(seed=seed)
+        for action in actions[:20]:
+            observation, reward, terminated, truncated, _ = tried.step(action)
+            if terminated or truncated:
+                tried.reset()
+                continue
+            before = _readable(tried)
+            repeated = tried._get_observation()
+            if not data_equivalence(observation, repeated, exact=True):
+                raise ContractError("_get_observation has a side effect: called again it differs")
+            if _shares_memory(observation, repeated):
+                raise ContractError("_get_observation returns the same array again, not a new one")
+            for hook, value in _hook_values(tried, terminated, reward):
+                if hook() != value:
+                    raise ContractError(f"{hook.__name__} has a side effect: it was {value}")
+            if not data_equivalence(before, _readable(tried), exact=True):
+                raise ContractError("a hook other than _get_inputs and _update changes values")
+
+
+def _hook_values(
+    env: FMUEnv, terminated: bool, reward: float
+) -> tuple[tuple[Callable[[], Any], Any], ...]:
+    return (env._is_done, terminated), (env._reward_policy, reward)
+
+
+def _readable(env: FMUEnv) -> dict[str, Any]:
+    """What hooks may read."""
+    return {
+        "out": dict(env.out),
+        "inputs": env.inputs,
+        "previous_state": env.previous_state,
+        "step_count": env.step_count,
+        "parameters": dict(env.parameters),
+        "variables": dict(env.variables),
+    }
+
+
+def _shares_memory(first: Any, second: Any) -> bool:
+    if isinstance(first, dict):
+        return any(_shares_memory(first[key], second[key]) for key in first)
+    both = isinstance(first, np.ndarray) and isinstance(second, np.ndarray)
+    return both and np.shares_memory(first, second)
+
+
+def _check_close(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    with _fresh(env) as tried:
+        tried.reset(seed=seed)
+        tried.close()
+        tried.close()
+
+
+_CHECKS = (
+    _check_types,
+    _check_spaces,
+    _check_time,
+    _check_determinism,
+    _check_reset,
+    _check_parameters,
+    _check_hooks,
+    _check_close,
+)

@@ -1,0 +1,87 @@
+/* FMU states: copies of the simulation, and their serialized form, the FMU's token and a copy. */
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "simulation.h"
+
+enum { TOKEN_SIZE = 40, SERIALIZED_SIZE = TOKEN_SIZE + sizeof(Simulation) };
+
+static Status store(const Instance *instance, const char *function, const void *simulation,
+                    void **state) {
+    if (*state == NULL) {
+        *state = malloc(sizeof(Simulation));
+    }
+    if (*state == NULL) {
+        return report(instance, STATUS_ERROR, function, "out of memory");
+    }
+    memcpy(*state, simulation, sizeof(Simulation));
+    return STATUS_OK;
+}
+
+Status get_state(const Instance *instance, const char *function, void **state) {
+    const Status status = check_phase(instance, function, ANY_PHASE);
+    return status == STATUS_OK ? store(instance, function, &instance->simulation, state) : status;
+}
+
+static Status check_state(const Instance *instance, const char *function, const void *state) {
+    const Status status = check_phase(instance, function, ANY_PHASE);
+    if (status == STATUS_OK && state == NULL) {
+        return report(instance, STATUS_ERROR, function, "the FMU state is NULL");
+    }
+    return status;
+}
+
+Status set_state(Instance *instance, const char *function, const void *state) {
+    const Status status = check_state(instance, function, state);
+    if (status == STATUS_OK) {
+        memcpy(&instance->simulation, state, sizeof(Simulation));
+    }
+    return status;
+}
+
+Status free_state(const Instance *instance, const char *function, void **state) {
+    const Status status = check_phase(instance, function, ANY_PHASE);
+    if (status == STATUS_OK && state != NULL) {
+        free(*state);
+        *state = NULL;
+    }
+    return status;
+}
+
+Status serialized_size(const Instance *instance, const char *function, size_t *size) {
+    const Status status = check_phase(instance, function, ANY_PHASE);
+    if (status == STATUS_OK) {
+        *size = SERIALIZED_SIZE;
+    }
+    return status;
+}
+
+Status serialize_state(const Instance *instance, const char *function, const void *state,
+                       void *bytes, size_t size) {
+    const Status status = check_state(instance, function, state);
+    if (status != STATUS_OK) {
+        return status;
+    }
+    if (size < SERIALIZED_SIZE) {
+        return report(instance, STATUS_ERROR, function, "a state needs %u bytes, not %u",
+                      (unsigned)SERIALIZED_SIZE, (unsigned)size);
+    }
+    memset(bytes, 0, TOKEN_SIZE);
+    memcpy(bytes, model_token, strlen(model_token));
+    memcpy((char *)bytes + TOKEN_SIZE, state, sizeof(Simulation));
+    return STATUS_OK;
+}
+
+Status deserialize_state(const Instance *instance, const char *function, const void *bytes,
+                         size_t size, void **state) {
+    const Status status = check_phase(instance, function, ANY_PHASE);
+    if (status != STATUS_OK) {
+        return status;
+    }
+    if (size < SERIALIZED_SIZE || memcmp(bytes, model_token, strlen(model_token)) != 0) {
+        return report(instance, STATUS_ERROR, function,
+                      "these bytes are not a serialized state of this FMU");
+    }
+    return store(instance, function, (const char *)bytes + TOKEN_SIZE, state);
+}
