@@ -31,11 +31,11 @@ from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmu_log import MessageLog, fmi1_callbacks, fmi2_callbacks, fmi3_log_message
 from fmugym.model_description import Variable
 
-__all__ = ["Access", "Instance", "Library", "Status"]
+__all__ = ["Access", "Instance", "Library", "Phase", "SavedState", "Status"]
 
 
 class Status(enum.IntEnum):
-    """What a step returned: FMI's own codes, and one for an FMU that asked to stop."""
+    """What a call returned: FMI's own codes, and two of ours."""
 
     OK = 0
     WARNING = 1
@@ -43,6 +43,9 @@ class Status(enum.IntEnum):
     ERROR = 3
     FATAL = 4
     TERMINATED = 6
+    """The FMU asked to stop; its outputs are valid."""
+    NOT_FINITE = 7
+    """An output is NaN or infinite."""
 
 
 class Phase(enum.Enum):
@@ -221,6 +224,7 @@ class Instance(ABC):
         self._slave.instanceName = self._log.instance_name
         self._instantiate_checked()
         self._component = ctypes.c_void_p(self._slave.component)
+        self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
         self.step = self._prepare_step()
 
     def _instantiate_checked(self) -> None:
@@ -349,6 +353,8 @@ class Instance(ABC):
         """Terminate and free the instance; more than one call is fine."""
         if not self._slave.component:
             return
+        for state in self._saved_states:
+            state.release()
         if self.phase is Phase.STEPPING:
             self._function("Terminate")(self._component)
         fatal, self.phase = self.phase is Phase.DEAD, Phase.DEAD
@@ -393,28 +399,54 @@ class Instance(ABC):
 
     # FMU state, where the FMU offers it (FMI 2.0 and 3.0).
 
-    def save_state(self) -> ctypes.c_void_p:
-        """Copy the FMU state; the caller frees it with ``free_state`` before the instance goes."""
+    def save_state(self) -> SavedState:
+        """Copy the FMU state.
+
+        Raises:
+            SimulationError: If the FMU offers none, or fails.
+        """
+        if not self._description.capabilities.can_get_and_set_fmu_state:
+            raise SimulationError(f"{self._description.model_name} cannot get and set its state")
+        self._require(Phase.STEPPING, "save the FMU state")
         state = ctypes.c_void_p()
         get_state = self._function(self._state_function("Get"))
         self.check("saving the FMU state", get_state(self._component, ctypes.byref(state)))
-        return state
+        saved = SavedState(self, state)
+        self._saved_states.add(saved)
+        return saved
 
-    def restore_state(self, state: ctypes.c_void_p) -> None:
-        """Return to a state saved at a communication point of this instance."""
+    def restore_state(self, state: SavedState) -> None:
+        """Return to a state saved by this instance.
+
+        Raises:
+            SimulationError: If the FMU fails, or is past any call.
+        """
         if self.phase is Phase.DEAD:
             raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
         set_state = self._function(self._state_function("Set"))
-        self.check("restoring the FMU state", set_state(self._component, state))
+        self.check("restoring the FMU state", set_state(self._component, state.pointer))
         self.phase = Phase.STEPPING
 
-    def free_state(self, state: ctypes.c_void_p) -> None:
-        """Free a saved state."""
+    def free_state(self, pointer: ctypes.c_void_p) -> None:
+        """Free a state; only ``SavedState`` calls this."""
         if self.phase is not Phase.DEAD:
-            self._function(self._state_function("Free"))(self._component, ctypes.byref(state))
+            free_state = self._function(self._state_function("Free"))
+            free_state(self._component, ctypes.byref(pointer))
 
     def _state_function(self, verb: str) -> str:
         return f"{verb}FMUState"
+
+
+class SavedState:
+    """The owner of an FMU state: frees it once, while its instance still lives.
+
+    Attributes:
+        pointer: The FMU's own handle.
+    """
+
+    def __init__(self, instance: Instance, pointer: ctypes.c_void_p) -> None:
+        self.pointer = pointer
+        self.release = weakref.finalize(self, instance.free_state, pointer)
 
 
 class FMI1Instance(Instance):

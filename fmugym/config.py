@@ -198,6 +198,7 @@ class Interface:
             inputs=self.inputs,
             outputs=self.outputs + self.monitors,
             time_step=self.time_step,
+            num_observed=len(self.outputs),
             substeps=config.substeps,
             start_time=description.start_time if start is None else start,
             stop_time=config.stop_time,

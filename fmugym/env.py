@@ -296,7 +296,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         drawn = self._draw_episode(self._checked_options(options))
         self._ended = True  # should the FMU fail in what follows
         values = np.array([[value] for value in self.parameters.values()])
-        outputs = pool.reset(self._parameter_variables, values.reshape(-1, 1))
+        outputs, status = pool.reset(self._parameter_variables, values.reshape(-1, 1))
+        if status[0] > Status.WARNING:
+            raise SimulationError(pool.failure(0))
         self._begin_episode(outputs[:, 0].tolist())
         observation, info = self._observation_and_info()
         if self.render_mode == "human":
@@ -473,11 +475,6 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         stopped = status == Status.TERMINATED
         if status > Status.WARNING and not stopped:
             return self._fault(self._open_pool("step").failure(0))
-        total = sum(values)
-        if total - total != 0.0 and not all(map(math.isfinite, values)):
-            return self._fault(
-                f"the outputs are not finite: {dict(zip(self.out, values, strict=True))}"
-            )
         self.after_end = self._ended
         self._set_values(values)
         self._update()

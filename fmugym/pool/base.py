@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.model_description import Variable
 
-__all__ = ["Pool", "PoolSpec"]
+__all__ = ["FloatArray", "MaskArray", "Pool", "PoolSpec", "StatusArray", "whole_number_of_steps"]
+
+FloatArray = npt.NDArray[np.float64]
+StatusArray = npt.NDArray[np.int8]
+MaskArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,7 @@ class PoolSpec:
         inputs: The variables set before each step, in the order of the rows of ``step``'s argument.
         outputs: The variables read after each step, in the order of the rows of its result.
         time_step: Simulated time of one step, in seconds.
+        num_observed: How many of the outputs, from the first, make an observation.
         substeps: Number of communication steps in one step.
         start_time: First communication point, in seconds.
         stop_time: Passed to the FMU where it is not None, in seconds.
@@ -34,6 +39,7 @@ class PoolSpec:
     inputs: tuple[Variable, ...]
     outputs: tuple[Variable, ...]
     time_step: float
+    num_observed: int = 0
     substeps: int = 1
     start_time: float = 0.0
     stop_time: float | None = None
@@ -55,43 +61,75 @@ class Pool(Protocol):
     """N instances of one FMU.
 
     Arrays have variables first, ``(k, N)``, so that a hook's ``x, v = state`` gives one row each.
-    Arrays that come out are the pool's own, valid until the next call.
+    Outputs and statuses that come out are the pool's own arrays, valid until the next call.
+
+    A status is a ``fmugym.adapters.Status``. What an FMU does wrong is never raised, since it
+    concerns one instance only: its status tells, ``failure`` gives the reason, its outputs stay
+    those before the call, and the next reset mends or replaces it.
     """
 
     num_instances: int
 
     def reset(
-        self,
-        variables: tuple[Variable, ...],
-        values: npt.NDArray[np.float64],
-        mask: npt.NDArray[np.bool_] | None = None,
-    ) -> npt.NDArray[np.float64]:
-        """Start the instances anew.
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """Start instances anew, at the first communication point, warm-up included.
 
         Args:
-            variables: The variables to be set before initialization, P of them.
-            values: Their values, shape (P, N).
+            variables: The variables to be set before initialization, P of them; all numeric.
+            values: Their values, shape (P, N); only the columns in the mask are used.
             mask: Which instances to start anew, shape (N,); None for all.
 
         Returns:
-            The outputs, shape (k, N); those of instances not in the mask are unchanged.
-
-        Raises:
-            SimulationError: If an instance cannot be initialized.
+            The outputs, shape (k, N), and the statuses, shape (N,); of instances outside of the
+            mask both are as before.
         """
         ...
 
     def step(
-        self, inputs: npt.NDArray[np.float64]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int8]]:
-        """Do one step with all instances.
+        self,
+        inputs: FloatArray,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
+        """Do one step with the instances.
 
         Args:
             inputs: Shape (k_in, N), finite.
+            skip: Which instances not to step, shape (N,); their outputs and statuses stay.
+            observations: Filled with the first ``num_observed`` outputs of all instances, shape
+                (N, num_observed), C-contiguous.
 
         Returns:
-            The outputs, shape (k, N), and a ``Status`` per instance, shape (N,). After Error and
-            Fatal the outputs are those before the step.
+            The outputs, shape (k, N), and the statuses, shape (N,).
+        """
+        ...
+
+    def save(self) -> Any:
+        """Copy the FMU states and times of all instances.
+
+        Returns:
+            A snapshot for ``restore`` of this very pool, freed when it is no longer referred to.
+
+        Raises:
+            SimulationError: If the FMU offers no state, or an instance cannot save it now.
+        """
+        ...
+
+    def restore(
+        self, snapshot: Any, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """Return instances to a snapshot.
+
+        Args:
+            snapshot: From ``save``.
+            mask: Which instances, shape (N,); None for all.
+
+        Returns:
+            As ``reset``.
+
+        Raises:
+            SimulationError: If the snapshot is another pool's, or an instance was replaced since.
         """
         ...
 
@@ -99,8 +137,12 @@ class Pool(Protocol):
         """Say why an instance's last status was worse than a warning."""
         ...
 
-    def read(self, variables: tuple[Variable, ...]) -> npt.NDArray[np.float64]:
-        """Read any variables now, shape (len(variables), N)."""
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
+        """Read any numeric variables now, shape (len(variables), N).
+
+        Raises:
+            SimulationError: If an instance refuses.
+        """
         ...
 
     def close(self) -> None:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.adapters import Access, Library, Phase, Status
+from fmugym.adapters import Access, Instance, Library, Phase, SavedState, Status
 from fmugym.archive import FMU
-from fmugym.errors import SimulationError
+from fmugym.errors import FMUGymError, SimulationError
 from fmugym.model_description import Variable
-from fmugym.pool.base import PoolSpec
+from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 
 __all__ = ["PythonPool"]
 
@@ -32,7 +33,8 @@ class PythonPool:
 
     def __init__(self, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> None:
         self.num_instances = num_instances
-        # One row an instance, so that the FMU reads and writes this memory without a copy.
+        self._spec = spec
+        # One row an instance, so that the FMU reads this memory without a copy.
         input_rows = np.zeros((num_instances, len(spec.inputs)))
         output_rows = np.zeros((num_instances, len(spec.outputs)))
         self._inputs, self._outputs = input_rows.T, output_rows.T
@@ -48,32 +50,51 @@ class PythonPool:
             raise
 
     def reset(
-        self,
-        variables: tuple[Variable, ...],
-        values: npt.NDArray[np.float64],
-        mask: npt.NDArray[np.bool_] | None = None,
-    ) -> npt.NDArray[np.float64]:
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
         for index, slot in enumerate(self._slots):
             if mask is None or mask[index]:
-                slot.reset(variables, values[:, index])
-                self._status[index] = Status.OK
-        return self._outputs
+                self._status[index] = slot.reset(variables, values[:, index])
+        return self._outputs, self._status
 
     def step(
-        self, inputs: npt.NDArray[np.float64]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int8]]:
+        self,
+        inputs: FloatArray,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
         np.copyto(self._inputs, inputs)
         for index, slot in enumerate(self._slots):
-            self._status[index] = slot.step()
+            if skip is None or not skip[index]:
+                self._status[index] = slot.step()
+        if observations is not None:
+            np.copyto(observations, self._outputs[: self._spec.num_observed].T, casting="same_kind")
+        return self._outputs, self._status
+
+    def save(self) -> list[_Snapshot]:
+        """See ``Pool.save``."""
+        return [slot.save() for slot in self._slots]
+
+    def restore(
+        self, snapshot: list[_Snapshot], mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.restore``."""
+        chosen = [i for i in range(self.num_instances) if mask is None or mask[i]]
+        if len(snapshot) != self.num_instances:
+            raise SimulationError("the snapshot was taken from another pool")
+        for index in chosen:
+            self._slots[index].require_own(snapshot[index])
+        for index in chosen:
+            self._status[index] = self._slots[index].restore(snapshot[index])
         return self._outputs, self._status
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
-        return self._slots[index].describe_failure(int(self._status[index]))
+        return self._slots[index].failure
 
-    def read(self, variables: tuple[Variable, ...]) -> npt.NDArray[np.float64]:
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         return np.stack([slot.read(variables) for slot in self._slots], axis=1)
 
@@ -82,53 +103,51 @@ class PythonPool:
         self._library.close()
 
 
-_OUTPUTS_ARE_LOST = frozenset({int(Status.ERROR), int(Status.FATAL)})
-
-
-def _is_bad(status: int) -> bool:
-    return status > Status.WARNING or status < 0
+@dataclass(frozen=True, eq=False)
+class _Snapshot:
+    instance: Instance
+    state: SavedState
+    count: int
 
 
 class _Slot:
     """One place of the pool: its instance, which is replaced when it is past mending."""
 
     def __init__(
-        self,
-        library: Library,
-        spec: PoolSpec,
-        input_row: npt.NDArray[np.float64],
-        output_row: npt.NDArray[np.float64],
+        self, library: Library, spec: PoolSpec, input_row: FloatArray, output_row: FloatArray
     ) -> None:
+        self.failure = ""
         self._library = library
         self._spec = spec
-        self._rows = input_row, output_row
+        self._input_row, self._output_row = input_row, output_row
         self._step_size = spec.communication_step_size
-        self._doing = ""
         self._build()
 
     def _build(self) -> None:
-        spec, (input_row, output_row) = self._spec, self._rows
         self._instance = self._library.instantiate()
-        self._inputs = Access(self._instance, spec.inputs, input_row)
-        self._outputs = Access(self._instance, spec.outputs, output_row)
+        self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
+        self._outputs = Access(self._instance, self._spec.outputs)
         self._start_variables: tuple[Variable, ...] = ()
         self._start = Access(self._instance, ())
         self._start_key: tuple[tuple[Variable, ...], bytes] | None = None
-        self._saved: ctypes.c_void_p | None = None
+        self._saved: SavedState | None = None
         self._count = 0
 
-    def reset(self, variables: tuple[Variable, ...], values: npt.NDArray[np.float64]) -> None:
+    def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
         """Start anew by the cheapest way that gives the same as a fresh instance.
 
         The state after initialization is kept once the same start values come a second time, and
         restored from then on; other start values take a reset and an initialization.
         """
         key = (variables, values.tobytes())
-        if not self._restored(key):
-            self._initialize(variables, values)
-            self._keep_state(key)
+        try:
+            if not self._restored(key):
+                self._initialize(variables, values)
+                self._keep_state(key)
+        except FMUGymError as error:
+            return self._failed(str(error))
         self._count = self._spec.warm_up_steps * self._spec.substeps
-        self._instance.check("reading the outputs", self._outputs.get())
+        return self._read_outputs(Status.OK)
 
     def _restored(self, key: tuple[tuple[Variable, ...], bytes]) -> bool:
         if self._saved is None or key != self._start_key or self._instance.phase is Phase.DEAD:
@@ -137,14 +156,12 @@ class _Slot:
         return True
 
     def _keep_state(self, key: tuple[tuple[Variable, ...], bytes]) -> None:
-        if self._saved is not None:
-            self._instance.free_state(self._saved)
-            self._saved = None
-        if self._library.can_save_state and key == self._start_key:
+        again = key == self._start_key
+        self._start_key, self._saved = key, None
+        if again and self._library.can_save_state:
             self._saved = self._instance.save_state()
-        self._start_key = key
 
-    def _initialize(self, variables: tuple[Variable, ...], values: npt.NDArray[np.float64]) -> None:
+    def _initialize(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         self._return_to_instantiated()
         if variables is not self._start_variables:
             self._start = Access(self._instance, variables)
@@ -174,19 +191,19 @@ class _Slot:
     def _warm_up(self) -> None:
         self._count = 0
         for _ in range(self._spec.warm_up_steps):
-            self._instance.check("the warm-up", self._advance())
+            if self._advance() > Status.WARNING:
+                raise SimulationError(f"the warm-up failed: {self.failure}")
 
     def step(self) -> int:
-        """Set the inputs, step, get the outputs; returns the worst status."""
+        """Set the inputs, step, get the outputs."""
+        if self._instance.phase is not Phase.STEPPING:
+            return self._failed("a step was asked for before a reset has mended the instance")
         status = self._inputs.set()
-        if status != 0 and _is_bad(status):
-            return self._failed("setting the inputs", status)
+        if status > Status.WARNING or status < 0:
+            return self._failed_call("setting the inputs", status)
         status = self._advance()
-        if status in _OUTPUTS_ARE_LOST:
-            return status
-        got = self._outputs.get()
-        if got != 0 and _is_bad(got):
-            return self._failed("reading the outputs", got)
+        if status <= Status.WARNING or status == Status.TERMINATED:
+            return self._read_outputs(status)
         return status
 
     def _advance(self) -> int:
@@ -196,19 +213,53 @@ class _Slot:
             status = self._instance.step(time, self._step_size)
             self._count += 1
             if status > Status.WARNING:
-                self._doing = f"the step at t = {time:g} s"
+                doing = f"the step at t = {time:g} s"
+                self.failure = self._instance.describe_failure(doing, status)
                 break
         return status
 
-    def _failed(self, doing: str, status: int) -> int:
-        self._doing = doing
-        return self._instance.judge(status)
+    def _read_outputs(self, status: int) -> int:
+        access = self._outputs
+        got = access.get()
+        if got > Status.WARNING or got < 0:
+            return self._failed_call("reading the outputs", got)
+        total = sum(access.values.tolist())
+        if total - total != 0.0 and not np.isfinite(access.values).all():
+            named = zip(self._spec.outputs, access.values.tolist(), strict=True)
+            bad = ", ".join(f"{v.name} = {value}" for v, value in named if not math.isfinite(value))
+            self.failure = f"the outputs are not finite: {bad}"
+            return Status.NOT_FINITE
+        self._output_row[:] = access.values
+        return status
 
-    def describe_failure(self, status: int) -> str:
-        """Say what the last bad status came from."""
-        return self._instance.describe_failure(self._doing, status)
+    def _failed_call(self, doing: str, status: int) -> int:
+        status = self._instance.judge(status)
+        self.failure = self._instance.describe_failure(doing, status)
+        return status
 
-    def read(self, variables: tuple[Variable, ...]) -> npt.NDArray[np.float64]:
+    def _failed(self, reason: str) -> int:
+        self.failure = reason
+        return Status.FATAL if self._instance.phase is Phase.DEAD else Status.ERROR
+
+    def save(self) -> _Snapshot:
+        """Copy the FMU state and the time."""
+        return _Snapshot(self._instance, self._instance.save_state(), self._count)
+
+    def require_own(self, snapshot: _Snapshot) -> None:
+        """Refuse a state of another instance, which FMUs accept silently."""
+        if snapshot.instance is not self._instance:
+            raise SimulationError("the snapshot is of another instance than this one")
+
+    def restore(self, snapshot: _Snapshot) -> int:
+        """Return to a state and its time."""
+        try:
+            self._instance.restore_state(snapshot.state)
+        except SimulationError as error:
+            return self._failed(str(error))
+        self._count = snapshot.count
+        return self._read_outputs(Status.OK)
+
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""
         access = Access(self._instance, variables)
         self._instance.check("reading variables", access.get())
