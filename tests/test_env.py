@@ -1,0 +1,433 @@
+"""The single environment: its contract, hooks, episodes and faults."""
+
+import logging
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
+from fmugym.bundled import FMI_VERSIONS
+from fmugym.testing import check_fmu_env
+
+ENV_IDS = ["fmugym/CartPole-v0", "fmugym/ModelicaCartPole-v0", "fmugym/Pendulum-v0"]
+
+
+class Swing(fmugym.FMUEnv):
+    """A pendulum, torque in, angle and velocity out; the config may be changed at will."""
+
+    def __init__(self, fmi_version="2.0", **config):
+        defaults = {
+            "model_input_names": ["tau"],
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"q_0": 1.0},
+            "time_step": 0.02,
+            "bounds": {"tau": (-1.0, 1.0)},
+        }
+        path = fmugym.bundled_fmu("Pendulum", fmi_version)
+        super().__init__(path, defaults | config)
+
+    def _is_done(self):
+        return self.out["q"] > 2.0
+
+
+class Cart(fmugym.FMUEnv):
+    """A cart-pole that fails (Discard) under an absurd force."""
+
+    def __init__(self, **config):
+        defaults = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot"],
+            "time_step": 0.02,
+        }
+        super().__init__(fmugym.bundled_fmu("CartPole"), defaults | config)
+
+    def _is_done(self):
+        return False
+
+
+ABSURD = 1e308
+
+
+@pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_contract(env_id, fmi_version):
+    env = gym.make(env_id, fmi_version=fmi_version)
+    check_fmu_env(env)
+    env.close()
+
+
+@pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
+def test_time_is_exact_after_100_000_steps(fmi_version):
+    env = Swing(fmi_version, time_step=0.1, start_time=0.0)
+    env.reset()
+    for _ in range(100_000):
+        env.step(0.0)
+    assert env.time == 100_000 * 0.1
+    assert env.read_variables("time")["time"] == pytest.approx(10_000, rel=1e-12)
+    env.close()
+
+
+def test_start_time_and_stop_time():
+    env = Swing(start_time=5.0, stop_time=5.1)
+    env.reset()
+    assert env.time == 5.0
+    ends = [env.step(0.0)[2:4] for _ in range(5)]
+    assert ends == [(False, False)] * 4 + [(False, True)]
+    env.close()
+
+
+def test_substeps_divide_the_step():
+    """With one internal step per communication step, ten substeps are ten Euler steps."""
+    euler = {"solver": "explicit_euler", "max_step": 1.0, "q_0": 1.0}
+    coarse = Swing(model_parameters=euler, time_step=0.02, substeps=10)
+    fine = Swing(model_parameters=euler, time_step=0.002)
+    coarse.reset()
+    fine.reset()
+    coarse.step(0.01)
+    for _ in range(10):
+        fine.step(0.01)
+    assert coarse.state == pytest.approx(fine.state, abs=1e-15)
+    assert coarse.time == fine.time == 0.02
+    coarse.close()
+    fine.close()
+
+
+def test_warm_up_runs_before_the_first_observation():
+    warm, cold = Swing(warm_up=0.1), Swing()
+    first, _ = warm.reset()
+    cold.reset()
+    for _ in range(5):
+        observation, *_ = cold.step(0.0)
+    assert first.tolist() == observation.tolist()
+    assert (warm.time, warm.step_count) == (0.1, 0)
+    for _ in range(3):  # also from the saved state
+        assert warm.reset()[0].tolist() == first.tolist()
+    warm.close()
+    cold.close()
+
+
+def test_max_episode_steps_truncates():
+    env = Swing(max_episode_steps=3)
+    env.reset()
+    assert [env.step(0.0)[3] for _ in range(3)] == [False, False, True]
+    with pytest.raises(SimulationError, match="after the end of the episode"):
+        env.step(0.0)
+    env.close()
+
+
+def test_terminated_and_truncated_may_both_be_true():
+    class Both(Swing):
+        def _is_done(self):
+            return True
+
+        def _is_truncated(self):
+            return True
+
+    env = Both(positive_reward=2, negative_reward=-3)
+    env.reset()
+    _, reward, terminated, truncated, _ = env.step(0.0)
+    assert (reward, terminated, truncated) == (-3.0, True, True)
+    env.close()
+
+
+@pytest.mark.parametrize(("positive", "negative"), [(1, -100), (0, 0), (0.5, -1.5)])
+def test_default_reward(positive, negative):
+    env = Swing(positive_reward=positive, negative_reward=negative)
+    env.reset(options={"model_parameters": {"q_0": 1.5}})
+    rewards = []
+    terminated = False
+    while not terminated:
+        _, reward, terminated, _, _ = env.step(1.0)
+        rewards.append(reward)
+    assert rewards == [positive] * (len(rewards) - 1) + [negative]
+    env.close()
+
+
+def test_hooks_are_called_in_order():
+    calls = []
+
+    class Logged(Swing):
+        def _get_inputs(self):
+            calls.append("inputs")
+            return self.action
+
+        def _update(self):
+            calls.append("update")
+
+        def _is_done(self):
+            calls.append("done")
+            return False
+
+        def _is_truncated(self):
+            calls.append("truncated")
+            return False
+
+        def _reward_policy(self):
+            calls.append("reward")
+            return 0
+
+        def _get_observation(self):
+            calls.append("observation")
+            return np.array(self.state, np.float32)
+
+        def _get_info(self):
+            calls.append("info")
+            return {}
+
+    env = Logged()
+    env.reset()
+    assert calls == ["observation", "info"]
+    calls.clear()
+    env.step(0.0)
+    order = ["inputs", "update", "done", "truncated", "reward", "observation", "info"]
+    assert calls == order
+    env.close()
+
+
+def test_what_hooks_read():
+    env = Swing(monitor_names=["theta", "theta_ddot"], model_parameters={"q_0": 1.0, "m": 0.05})
+    env.reset()
+    start = env.state
+    assert start == (1.0, 0.0)
+    assert (env.action, env.previous_action, env.previous_state) == (None, None, start)
+    assert (env.time, env.step_count, env.done) == (0.0, 0, False)
+    env.step(0.01)
+    env.step(0.02)
+    assert (env.action, env.previous_action) == (0.02, 0.01)
+    assert env.inputs == (0.02,)
+    assert (env.time, env.step_count) == (0.04, 2)
+    assert env.out["q"] == env.state[0]
+    assert env.out["theta"] == pytest.approx(env.state[0] - math.pi)
+    assert dict(env.out).keys() == {"q", "q_dot", "theta", "theta_ddot"}
+    assert len(env.state) == 2
+    assert env.parameters["m"] == 0.05
+    assert env.read_variables("m", "tau") == {"m": 0.05, "tau": 0.02}
+    env.close()
+
+
+def test_episode_variables():
+    class Tracking(Swing):
+        def _update(self):
+            self.variables["integral"] += abs(self.out["q"] - self.variables["target"])
+
+        def _is_done(self):
+            return False
+
+        def _reward_policy(self):
+            return -self.variables["integral"]
+
+    env = Tracking(episode_variables={"target": Uniform(-1, 1), "integral": 0.0})
+    _, info = env.reset(seed=1)
+    target = env.variables["target"]
+    assert info["drawn"] == {"target": target}
+    assert -1 <= target <= 1
+    total = 0.0
+    for _ in range(3):
+        _, reward, *_ = env.step(0.0)
+        total += abs(env.out["q"] - target)
+    assert reward == -total
+    env.reset()
+    assert env.variables["integral"] == 0.0
+    assert env.variables["target"] != target
+    with pytest.raises(ConfigError, match="episode variable 'targe'; did you mean 'target'"):
+        env.variables["targe"] = 1
+    with pytest.raises(ConfigError, match="episode variable 'goal'"):
+        env.variables["goal"]
+    env.close()
+
+
+def test_drawn_parameters_are_set_and_told():
+    random = {"q_0": Uniform(0.5, 1.5), "m": Choice([0.05, 0.07]), "b": Normal(4e-4, 1e-4, low=0)}
+    env = Swing(model_parameters=random)
+    seen = []
+    for seed in (1, 2, 1):
+        observation, info = env.reset(seed=seed)
+        assert info["drawn"] == dict(env.parameters) == env.read_variables("q_0", "m", "b")
+        assert observation[0] == np.float32(info["drawn"]["q_0"])
+        seen.append(info["drawn"])
+    assert seen[0] == seen[2] != seen[1]
+    assert env.reset()[1]["drawn"] != seen[0]  # no seed: the stream goes on
+    env.close()
+
+
+def test_scipy_distributions_are_taken():
+    stats = pytest.importorskip("scipy.stats")
+    env = Swing(model_parameters={"q_0": stats.truncnorm(-1, 1, loc=1.0, scale=0.1)})
+    first = env.reset(seed=5)[1]["drawn"]["q_0"]
+    assert 0.9 <= first <= 1.1
+    assert env.reset(seed=5)[1]["drawn"]["q_0"] == first
+    env.close()
+
+
+def test_parameters_of_one_episode():
+    env = Swing()
+    _, info = env.reset(options={"model_parameters": {"q_0": 0.5, "m": 0.1}})
+    assert info["drawn"] == {"q_0": 0.5, "m": 0.1}
+    assert (env.state[0], env.read_variables("m")["m"]) == (0.5, 0.1)
+    _, info = env.reset()
+    assert info["drawn"] == {}
+    assert (env.state[0], env.read_variables("m")["m"]) == (1.0, 0.06)
+    env.close()
+
+
+def test_enumeration_parameters_by_name_and_value():
+    for solver in ("rk4", 3):
+        env = Swing(model_parameters={"solver": solver})
+        env.reset()
+        assert env.read_variables("solver") == {"solver": 3.0}
+        env.close()
+
+
+@pytest.mark.parametrize("action", [0.01, np.float32(0.01), [0.01], np.array([0.01])])
+def test_forms_of_an_action(action):
+    env = Swing()
+    env.reset()
+    env.step(action)
+    assert env.inputs == (float(np.ravel(action)[0]),)
+    env.close()
+
+
+def test_a_refused_action_leaves_the_episode_as_it_was():
+    env, twin = Swing(), Swing()
+    env.reset()
+    twin.reset()
+    env.step(0.01)
+    twin.step(0.01)
+    with pytest.raises(ConfigError, match="must be finite"):
+        env.step(math.nan)
+    assert env.action == 0.01
+    assert env.step(0.02)[0].tolist() == twin.step(0.02)[0].tolist()
+    env.close()
+    twin.close()
+
+
+def test_observations_are_new_arrays():
+    env = Swing()
+    first, _ = env.reset()
+    kept = first.copy()
+    second, *_ = env.step(0.0)
+    assert first.tolist() == kept.tolist() != second.tolist()
+    env.close()
+
+
+def test_a_fault_truncates_with_the_last_good_observation():
+    env = Cart(fault_reward=-7.0)
+    env.reset()
+    before, *_ = env.step(1.0)
+    observation, reward, terminated, truncated, info = env.step(ABSURD)
+    assert observation.tolist() == before.tolist()
+    assert (reward, terminated, truncated) == (-7.0, False, True)
+    assert "returned Discard" in info["fault"]
+    assert "t = 0.02 s" in info["fault"]
+    assert np.isfinite(env.reset()[0]).all()  # mended
+    assert np.isfinite(env.step(1.0)[0]).all()
+    env.close()
+
+
+def test_a_fault_may_terminate_or_raise():
+    env = Cart(on_fault="terminate")
+    env.reset()
+    assert env.step(ABSURD)[2:4] == (True, False)
+    env.close()
+    env = Cart(on_fault="raise")
+    env.reset()
+    with pytest.raises(SimulationError, match=r"returned Discard; the FMU said: .*finite"):
+        env.step(ABSURD)
+    env.reset()
+    env.step(0.0)
+    env.close()
+
+
+def test_faults_are_logged(caplog):
+    env = Cart()
+    env.reset()
+    with caplog.at_level(logging.WARNING, "fmugym.Cart"):
+        env.step(ABSURD)
+    assert "returned Discard" in caplog.text
+    env.close()
+
+
+def test_goal_task():
+    class Reach(Swing):
+        def _get_observation_space(self):
+            box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+            return gym.spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
+
+        def _get_observation(self):
+            return {
+                "observation": np.array([self.out["q_dot"]]),
+                "achieved_goal": np.array([self.out["q"]]),
+                "desired_goal": np.array([self.variables["target"]]),
+            }
+
+        def _goal_reward(self, achieved_goal, desired_goal):
+            return -abs(achieved_goal - desired_goal).sum(-1)
+
+        def _is_done(self):
+            return False
+
+    env = Reach(episode_variables={"target": 0.5})
+    env.reset()
+    _, reward, *_ = env.step(0.0)
+    assert reward == -abs(env.out["q"] - 0.5)
+    goals = np.array([[0.0], [1.0]]), np.array([[1.0], [1.0]])
+    assert env.compute_reward(*goals, {}).tolist() == [-1.0, 0.0]
+    check_fmu_env(env)
+    env.close()
+    with pytest.raises(SimulationError, match="no goal task"):
+        Swing().compute_reward(0, 0, {})
+
+
+def test_render_fps_follows_the_time_step():
+    assert Swing(time_step=0.04).metadata["render_fps"] == 25
+    assert Swing(time_step=3.0).metadata["render_fps"] == 1
+    assert Swing.metadata == {"render_modes": []}
+
+
+def test_default_time_step_is_the_fmus():
+    env = Swing(time_step=None)
+    env.reset()
+    env.step(0.0)
+    assert env.time == env.fmu.description.step_size == 0.01
+    env.close()
+
+
+def test_the_class_may_be_subclassed_for_a_relative_path(tmp_path, monkeypatch):
+    """A relative path is looked for beside the file of the class, not in the working directory."""
+    import shutil
+    import sys
+
+    package = tmp_path / "somewhere"
+    package.mkdir()
+    shutil.copy(fmugym.bundled_fmu("Pendulum"), package / "My.fmu")
+    (package / "my_relative_env.py").write_text(
+        "import fmugym\n"
+        "class Mine(fmugym.FMI2CSEnv):\n"
+        "    def __init__(self, path='My.fmu'):\n"
+        "        super().__init__(path, {'model_input_names': 'tau', 'model_output_names': 'q'})\n"
+        "    def _is_done(self):\n"
+        "        return False\n"
+    )
+    monkeypatch.syspath_prepend(str(package))
+    monkeypatch.chdir(tmp_path)
+    from my_relative_env import Mine
+
+    env = Mine()
+    env.reset()
+    assert np.isfinite(env.step(0.0)[0]).all()
+    env.close()
+    with pytest.raises(fmugym.FMULoadError, match="somewhere"):
+        Mine("Other.fmu")
+    sys.modules.pop("my_relative_env")
+
+
+def test_register_makes_an_id():
+    fmugym.register("tests/Swing-v0", Swing, max_episode_steps=2)
+    env = gym.make("tests/Swing-v0")
+    env.reset()
+    assert [env.step(np.zeros(1, np.float32))[3] for _ in range(2)] == [False, True]
+    env.close()
+    gym.registry.pop("tests/Swing-v0")
