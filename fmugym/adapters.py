@@ -63,6 +63,9 @@ _TRUE: Final = b"\x01"
 _FALSE: Final = b"\x00"
 _load_lock = threading.Lock()
 
+Initialize = Callable[[float, float | None, float | None, Callable[[], None]], None]
+"""Takes the arguments of ``Instance.initialize``."""
+
 
 class Access:
     """The values of a fixed list of variables, copied to or from the FMU one call per C type.
@@ -226,6 +229,8 @@ class Instance(ABC):
         self._component = ctypes.c_void_p(self._slave.component)
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
         self.step = self._prepare_step()
+        self._initialize = self._prepare_initialization()
+        self._reset_function = self._function("Reset")
 
     def _instantiate_checked(self) -> None:
         failure = ""
@@ -258,13 +263,7 @@ class Instance(ABC):
     def _prepare_step(self) -> Callable[[float, float], int]: ...
 
     @abstractmethod
-    def _initialize(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        tolerance: float | None,
-        set_start_values: Callable[[], None],
-    ) -> None: ...
+    def _prepare_initialization(self) -> Initialize: ...
 
     @abstractmethod
     def c_type(self, variable: Variable) -> str:
@@ -346,7 +345,7 @@ class Instance(ABC):
             raise SimulationError(
                 f"{self._log.instance_name}: no reset is legal after a fatal error"
             )
-        self.check("reset", self._function("Reset")(self._component))
+        self.check("reset", self._reset_function(self._component))
         self.phase = Phase.INSTANTIATED
 
     def free(self) -> None:
@@ -504,19 +503,24 @@ class FMI1Instance(Instance):
 
         return step
 
-    def _initialize(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        tolerance: float | None,
-        set_start_values: Callable[[], None],
-    ) -> None:
-        set_start_values()
-        defined = _FALSE if stop_time is None else _TRUE
-        status = self._slave.fmi1InitializeSlave(
-            self._component, start_time, defined, stop_time or 0.0
+    def _prepare_initialization(self) -> Initialize:
+        double = ctypes.c_double
+        initialize = self._function(
+            "InitializeSlave", ctypes.c_void_p, double, ctypes.c_char, double
         )
-        self.check("initialization", status)
+
+        def run(
+            start_time: float,
+            stop_time: float | None,
+            tolerance: float | None,
+            set_start_values: Callable[[], None],
+        ) -> None:
+            set_start_values()
+            defined = _FALSE if stop_time is None else _TRUE
+            status = initialize(self._component, start_time, defined, stop_time or 0.0)
+            self.check("initialization", status)
+
+        return run
 
 
 class FMI2Instance(Instance):
@@ -563,25 +567,29 @@ class FMI2Instance(Instance):
         status = get_status(self._component, self._TERMINATED, ctypes.byref(terminated))
         return status <= Status.WARNING and terminated.value != 0
 
-    def _initialize(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        tolerance: float | None,
-        set_start_values: Callable[[], None],
-    ) -> None:
-        check = self.check
-        stop = (stop_time is not None, stop_time or 0.0)
+    def _prepare_initialization(self) -> Initialize:
         double, integer = ctypes.c_double, ctypes.c_int
         setup = self._function(
             "SetupExperiment", ctypes.c_void_p, integer, double, double, integer, double
         )
-        status = setup(self._component, tolerance is not None, tolerance or 0.0, start_time, *stop)
-        check("setting up the experiment", status)
-        set_start_values()
-        enter, leave = "EnterInitializationMode", "ExitInitializationMode"
-        check("entering initialization", self._function(enter)(self._component))
-        check("initialization", self._function(leave)(self._component))
+        enter = self._function("EnterInitializationMode")
+        leave = self._function("ExitInitializationMode")
+        component, check = self._component, self.check
+
+        def run(
+            start_time: float,
+            stop_time: float | None,
+            tolerance: float | None,
+            set_start_values: Callable[[], None],
+        ) -> None:
+            tolerances = (tolerance is not None, tolerance or 0.0)
+            times = (start_time, stop_time is not None, stop_time or 0.0)
+            check("setting up the experiment", setup(component, *tolerances, *times))
+            set_start_values()
+            check("entering initialization", enter(component))
+            check("initialization", leave(component))
+
+        return run
 
 
 class FMI3Instance(Instance):
@@ -649,23 +657,27 @@ class FMI3Instance(Instance):
 
         return step
 
-    def _initialize(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        tolerance: float | None,
-        set_start_values: Callable[[], None],
-    ) -> None:
-        set_start_values()
+    def _prepare_initialization(self) -> Initialize:
         boolean, double = ctypes.c_bool, ctypes.c_double
         enter = self._function(
             "EnterInitializationMode", ctypes.c_void_p, boolean, double, double, boolean, double
         )
-        tolerances = (tolerance is not None, tolerance or 0.0)
-        times = (start_time, stop_time is not None, stop_time or 0.0)
-        self.check("entering initialization", enter(self._component, *tolerances, *times))
         leave = self._function("ExitInitializationMode")
-        self.check("initialization", leave(self._component))
+        component, check = self._component, self.check
+
+        def run(
+            start_time: float,
+            stop_time: float | None,
+            tolerance: float | None,
+            set_start_values: Callable[[], None],
+        ) -> None:
+            set_start_values()
+            tolerances = (tolerance is not None, tolerance or 0.0)
+            times = (start_time, stop_time is not None, stop_time or 0.0)
+            check("entering initialization", enter(component, *tolerances, *times))
+            check("initialization", leave(component))
+
+        return run
 
 
 _INSTANCE_CLASSES: Final[dict[int, type[Instance]]] = {

@@ -7,6 +7,7 @@ import logging
 import math
 import operator
 import os
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,10 +22,10 @@ from gymnasium import spaces
 from fmugym import spaces as fmu_spaces
 from fmugym.adapters import Status
 from fmugym.archive import FMU
-from fmugym.config import EnvConfig, checked, checked_value, output_variable, start_variable
-from fmugym.distributions import draw, is_distribution
+from fmugym.config import EnvConfig, checked, output_variable, start_variable
+from fmugym.episode import Episode, EpisodePlan
 from fmugym.errors import ConfigError, SimulationError, unknown_name
-from fmugym.pool import Pool, PythonPool
+from fmugym.pool import Pool, PoolSpec, PythonPool
 from fmugym.values import EpisodeVariables, NamedValues
 
 if TYPE_CHECKING:
@@ -56,7 +57,6 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         inputs: What was written to the FMU's inputs in this step, floats.
         previous_state: ``state`` before this step.
         previous_action: The action of the step before; None in the first.
-        time: The FMU's time in seconds.
         step_count: Steps since the reset.
         done: What ``_is_done`` said in this step.
         after_end: Whether this step began after the end of the episode.
@@ -113,6 +113,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._prepare_values()
         self._prepare_spaces()
         self._pool = PythonPool(self.fmu, self._spec, 1, self.logger)
+        self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
 
     def _checked_render_mode(self, mode: str | None) -> str | None:
         if mode is not None and mode not in self.metadata["render_modes"]:
@@ -144,18 +145,20 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         names = [variable.name for variable in interface.outputs + interface.monitors]
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / interface.time_step))}
         self._output_count = len(interface.outputs)
+        self._no_monitors = not interface.monitors
         self._values: tuple[float, ...] = (math.nan,) * len(names)
         self.out = NamedValues("output", names, lambda: self._values)
         self.state: Any = self._values[: self._output_count]
         self.previous_state: Any = self.state
-        self.inputs: Any = (0.0,) * len(interface.inputs)
+        self._start_inputs = (0.0,) * len(interface.inputs)
+        self.inputs: Any = self._start_inputs
         self.action: Any = None
         self.previous_action: Any = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
-        self._configured_variables = tuple(map(self.fmu.variable, interface.parameters))
         self.variables = EpisodeVariables(config.episode_variables)
+        self._plan = self._plan_episode({})
+        self._step_limit = _step_limit(config, self._spec)
         self.step_count = 0
-        self.time = self._spec.communication_point(0)
         self.done = False
         self.after_end = False
         self._ended = True
@@ -181,7 +184,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
         self._elements = _elements(self.action_space) if cls.step is FMUEnv.step else None
         self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
-        self._input_buffer = np.zeros((len(interface.inputs), 1))
+        self._has_update = cls._update is not FMUEnv._update
+        self._has_truncation = cls._is_truncated is not FMUEnv._is_truncated
+        self._has_info = cls._get_info is not FMUEnv._get_info
         self._takes_one_real = [v.kind for v in interface.inputs] == ["real"]
 
     # Hooks, in the order of a step.
@@ -293,77 +298,58 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """
         pool = self._open_pool("reset")
         super().reset(seed=seed)
-        drawn = self._draw_episode(self._checked_options(options))
+        plan = self._plan_of_reset(options)
+        episode = plan.draw(self.np_random)
         self._ended = True  # should the FMU fail in what follows
-        values = np.array([[value] for value in self.parameters.values()])
-        outputs, status = pool.reset(self._parameter_variables, values.reshape(-1, 1))
-        if status[0] > Status.WARNING:
+        pool.reset(plan.model_variables, episode.start_values)
+        if pool.statuses.item(0) > Status.WARNING:
             raise SimulationError(pool.failure(0))
-        self._begin_episode(outputs[:, 0].tolist())
+        self._begin_episode(episode)
         observation, info = self._observation_and_info()
+        info["drawn"] = episode.drawn
         if self.render_mode == "human":
             self.render()
-        return observation, info | {"drawn": drawn}
+        return observation, info
 
-    def _checked_options(self, options: Mapping[str, Any] | None) -> Mapping[str, Any]:
-        for name in options or {}:
+    def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
+        if not options:
+            return self._plan
+        for name in options:
             if name not in self.reset_options:
                 raise unknown_name("reset option", name, self.reset_options)
-        return options or {}
+        return self._plan_episode(self._get_episode_parameters(options))
 
-    def _draw_episode(self, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Draw the parameters and variables; returns those that were drawn or overridden."""
-        overrides = self._checked_overrides(options)
-        base = self._interface.parameters
-        given = {**base, **overrides}
-        if given.keys() == base.keys():
-            self._parameter_variables = self._configured_variables
-        else:
-            self._parameter_variables = tuple(self.fmu.variable(name) for name in given)
-        rng = self.np_random
-        parameters: dict[str, Any] = {}
-        drawn: dict[str, Any] = {}
-        for variable, (name, value) in zip(self._parameter_variables, given.items(), strict=True):
-            parameters[name] = value
-            if is_distribution(value):
-                parameters[name] = checked_value(variable, draw(value, rng))
-                drawn[name] = parameters[name]
-            elif name in overrides:
-                drawn[name] = value
-        self.parameters = MappingProxyType(parameters)
-        return drawn | self._draw_variables(rng)
-
-    def _checked_overrides(self, options: Mapping[str, Any]) -> dict[str, Any]:
-        overrides = {}
-        for name, value in self._get_episode_parameters(options).items():
+    def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
+        """Prepare the draws of episodes whose parameters are the config's and these instead."""
+        parameters = dict(self._interface.parameters)
+        for name, value in overrides.items():
             variable = start_variable(self.fmu.description, name, value)
             if not variable.numeric:
                 raise ConfigError(f"{name!r} is a String: it can be set in the config only")
-            overrides[name] = checked(variable, value)
-        return overrides
+            parameters[name] = checked(variable, value)
+        return EpisodePlan(
+            tuple(map(self.fmu.variable, parameters)),
+            parameters,
+            self.config.episode_variables,
+            overrides.keys(),
+        )
 
-    def _draw_variables(self, rng: np.random.Generator) -> dict[str, Any]:
-        drawn = {}
-        for name, value in self.config.episode_variables.items():
-            self.variables[name] = draw(value, rng)
-            if is_distribution(value):
-                drawn[name] = self.variables[name]
-        return drawn
-
-    def _begin_episode(self, values: list[float]) -> None:
+    def _begin_episode(self, episode: Episode) -> None:
+        self.parameters = episode.parameters
+        self.variables.update(episode.variables)
         self.step_count = 0
-        self.time = self._spec.communication_point(self._spec.warm_up_steps * self._spec.substeps)
         self.action = self.previous_action = None
-        self.inputs = (0.0,) * len(self._interface.inputs)
+        self.inputs = self._start_inputs
         self.done = self.after_end = False
-        self._set_values(values)
+        self._set_values()
         self.previous_state = self.state
         self._last_reward, self._return = None, 0.0
         self._was_reset, self._ended = True, False
 
-    def _set_values(self, values: list[float]) -> None:
-        self._values = tuple(values)
-        self.state = self._values[: self._output_count]
+    def _set_values(self) -> None:
+        """Take the pool's outputs over: hooks get floats, which are faster than numpy's."""
+        self._values = values = tuple(self._output_row.tolist())
+        self.state = values if self._no_monitors else values[: self._output_count]
 
     def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
         self._in_hooks = True
@@ -393,9 +379,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._in_hooks = True
         try:
             self._take_action(action)
-            outputs, status = pool.step(self._input_buffer)
-            self._advance_time()
-            result = self._evaluate(outputs[:, 0].tolist(), int(status[0]))
+            pool.step()
+            self.step_count += 1
+            result = self._evaluate(pool, pool.statuses.item(0))
         finally:
             self._in_hooks = False
         if self.render_mode is not None:
@@ -434,15 +420,16 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             raise
 
     def _write_inputs(self, values: Any) -> None:
-        buffer = self._input_buffer
-        if self._takes_one_real and isinstance(values, float | int):
-            buffer[0, 0] = values
-            self.inputs = (buffer[0, 0].item(),)
+        if self._takes_one_real and isinstance(values, float):
+            self.inputs = (values,)
+            self._input_row[0] = values
         else:
-            buffer[:, 0] = self._flat_inputs(values)
-            self.inputs = tuple(buffer[:, 0].tolist())
-        if not all(map(math.isfinite, self.inputs)):
-            self._raise_for_inputs("every input must be finite")
+            flat = self._flat_inputs(values)
+            self.inputs = tuple(flat.tolist())
+            self._input_row[:] = flat
+        for value in self.inputs:
+            if value - value != 0.0:
+                self._raise_for_inputs("every input must be finite")
 
     def _flat_inputs(self, values: Any) -> npt.NDArray[np.float64]:
         try:
@@ -463,46 +450,39 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         listing = ", ".join(f"{name} = {value}" for name, value in pairs)
         raise ConfigError(f"action {self.action!r} makes {listing}; {why}")
 
-    def _advance_time(self) -> None:
-        spec = self._spec
-        self.step_count += 1
-        steps = spec.warm_up_steps + self.step_count
-        self.time = spec.communication_point(steps * spec.substeps)
-
-    def _evaluate(
-        self, values: list[float], status: int
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        stopped = status == Status.TERMINATED
-        if status > Status.WARNING and not stopped:
-            return self._fault(self._open_pool("step").failure(0))
+    def _evaluate(self, pool: Pool, status: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        stopped = False
+        if status != 0:
+            stopped = status == Status.TERMINATED
+            if status > Status.WARNING and not stopped:
+                return self._fault(pool.failure(0))
         self.after_end = self._ended
-        self._set_values(values)
-        self._update()
+        self._set_values()
+        if self._has_update:
+            self._update()
         done = self._is_done()
         if done is None:
             raise ConfigError("_is_done returned None, expected True or False")
-        self.done = terminated = bool(done) or stopped
-        truncated = self._reached_limit() or bool(self._is_truncated())
+        self.done = terminated = stopped or bool(done)
+        truncated = self.step_count >= self._step_limit
+        if self._has_truncation and not truncated:
+            truncated = bool(self._is_truncated())
         reward = self._reward_policy()
         if reward is None:
             raise ConfigError("_reward_policy returned None, expected a number")
-        observation, info = self._get_observation(), self._get_info()
+        observation = self._get_observation()
+        info = self._get_info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
-        self._ended = self._ended or terminated or truncated
+        if terminated or truncated:
+            self._ended = True
         return observation, float(reward), terminated, truncated, info
 
-    def _reached_limit(self) -> bool:
-        config = self.config
-        limit = config.max_episode_steps
-        if limit is not None and self.step_count >= limit:
-            return True
-        return config.stop_time is not None and self._next_step_exceeds(config.stop_time)
-
-    def _next_step_exceeds(self, stop_time: float) -> bool:
-        spec = self._spec
-        steps = spec.warm_up_steps + self.step_count + 1
-        return spec.communication_point(steps * spec.substeps) > stop_time + 1e-9 * spec.time_step
+    @property
+    def time(self) -> float:
+        """The FMU's time in seconds."""
+        steps = self._spec.warm_up_steps + self.step_count
+        return self._spec.communication_point(steps * self._spec.substeps)
 
     def _fault(self, reason: str) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self._ended = True
@@ -604,6 +584,15 @@ class FMI3CSEnv(FMUEnv):
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:
     return cls(*args, **kwargs)
+
+
+def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
+    """The number of steps after which an episode is truncated."""
+    limit = sys.maxsize if config.max_episode_steps is None else config.max_episode_steps
+    if config.stop_time is None:
+        return limit
+    span = (config.stop_time - spec.start_time) / spec.time_step
+    return min(limit, math.floor(span + 1e-9) - spec.warm_up_steps)
 
 
 def _elements(space: spaces.Space[Any]) -> range | None:

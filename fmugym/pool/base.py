@@ -61,7 +61,8 @@ class Pool(Protocol):
     """N instances of one FMU.
 
     Arrays have variables first, ``(k, N)``, so that a hook's ``x, v = state`` gives one row each.
-    Outputs and statuses that come out are the pool's own arrays, valid until the next call.
+    Outputs and statuses that come out are the pool's own arrays, always the same two, which the
+    next call writes again.
 
     A status is a ``fmugym.adapters.Status``. What an FMU does wrong is never raised, since it
     concerns one instance only: its status tells, ``failure`` gives the reason, its outputs stay
@@ -69,6 +70,12 @@ class Pool(Protocol):
     """
 
     num_instances: int
+    inputs: FloatArray
+    """Shape (k_in, N), for the caller to write to before a step."""
+    outputs: FloatArray
+    """Shape (k, N)."""
+    statuses: StatusArray
+    """Shape (N,)."""
 
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
@@ -88,14 +95,14 @@ class Pool(Protocol):
 
     def step(
         self,
-        inputs: FloatArray,
+        inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
         observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """Do one step with the instances.
 
         Args:
-            inputs: Shape (k_in, N), finite.
+            inputs: Shape (k_in, N), finite; None for what was written to ``self.inputs``.
             skip: Which instances not to step, shape (N,); their outputs and statuses stay.
             observations: Filled with the first ``num_observed`` outputs of all instances, shape
                 (N, num_observed), C-contiguous.

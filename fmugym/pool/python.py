@@ -34,11 +34,11 @@ class PythonPool:
     def __init__(self, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> None:
         self.num_instances = num_instances
         self._spec = spec
-        # One row an instance, so that the FMU reads this memory without a copy.
+        # One row an instance, so that the FMU reads and writes this memory without a copy.
         input_rows = np.zeros((num_instances, len(spec.inputs)))
         output_rows = np.zeros((num_instances, len(spec.outputs)))
-        self._inputs, self._outputs = input_rows.T, output_rows.T
-        self._status = np.zeros(num_instances, np.int8)
+        self.inputs, self.outputs = input_rows.T, output_rows.T
+        self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self._library = Library(fmu, log)
         try:
             self._slots = [
@@ -55,23 +55,24 @@ class PythonPool:
         """See ``Pool.reset``."""
         for index, slot in enumerate(self._slots):
             if mask is None or mask[index]:
-                self._status[index] = slot.reset(variables, values[:, index])
-        return self._outputs, self._status
+                self.statuses[index] = slot.reset(variables, values[:, index])
+        return self.outputs, self.statuses
 
     def step(
         self,
-        inputs: FloatArray,
+        inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
         observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
-        np.copyto(self._inputs, inputs)
+        if inputs is not None:
+            np.copyto(self.inputs, inputs)
         for index, slot in enumerate(self._slots):
             if skip is None or not skip[index]:
-                self._status[index] = slot.step()
+                self.statuses[index] = slot.step()
         if observations is not None:
-            np.copyto(observations, self._outputs[: self._spec.num_observed].T, casting="same_kind")
-        return self._outputs, self._status
+            np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
+        return self.outputs, self.statuses
 
     def save(self) -> list[_Snapshot]:
         """See ``Pool.save``."""
@@ -87,8 +88,8 @@ class PythonPool:
         for index in chosen:
             self._slots[index].require_own(snapshot[index])
         for index in chosen:
-            self._status[index] = self._slots[index].restore(snapshot[index])
-        return self._outputs, self._status
+            self.statuses[index] = self._slots[index].restore(snapshot[index])
+        return self.outputs, self.statuses
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
@@ -110,6 +111,14 @@ class _Snapshot:
     count: int
 
 
+_STEPPING = Phase.STEPPING
+_WARNING = int(Status.WARNING)
+
+
+def _is_fine(status: int) -> bool:
+    return 0 <= status <= _WARNING
+
+
 class _Slot:
     """One place of the pool: its instance, which is replaced when it is past mending."""
 
@@ -126,12 +135,13 @@ class _Slot:
     def _build(self) -> None:
         self._instance = self._library.instantiate()
         self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
-        self._outputs = Access(self._instance, self._spec.outputs)
+        self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
         self._start_variables: tuple[Variable, ...] = ()
         self._start = Access(self._instance, ())
         self._start_key: tuple[tuple[Variable, ...], bytes] | None = None
         self._saved: SavedState | None = None
         self._count = 0
+        self._good_outputs = self._output_row.tolist()
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
         """Start anew by the cheapest way that gives the same as a fresh instance.
@@ -191,50 +201,53 @@ class _Slot:
     def _warm_up(self) -> None:
         self._count = 0
         for _ in range(self._spec.warm_up_steps):
-            if self._advance() > Status.WARNING:
+            if not _is_fine(self._advance()):
                 raise SimulationError(f"the warm-up failed: {self.failure}")
 
     def step(self) -> int:
         """Set the inputs, step, get the outputs."""
-        if self._instance.phase is not Phase.STEPPING:
+        if self._instance.phase is not _STEPPING:
             return self._failed("a step was asked for before a reset has mended the instance")
         status = self._inputs.set()
-        if status > Status.WARNING or status < 0:
+        if status and not _is_fine(status):
             return self._failed_call("setting the inputs", status)
         status = self._advance()
-        if status <= Status.WARNING or status == Status.TERMINATED:
-            return self._read_outputs(status)
-        return status
+        if status and not _is_fine(status) and status != Status.TERMINATED:
+            return status
+        return self._read_outputs(status)
 
     def _advance(self) -> int:
-        status = 0
-        for _ in range(self._spec.substeps):
-            time = self._spec.communication_point(self._count)
+        spec, status = self._spec, 0
+        for _ in range(spec.substeps):
+            time = spec.communication_point(self._count)
             status = self._instance.step(time, self._step_size)
             self._count += 1
-            if status > Status.WARNING:
+            if status and not _is_fine(status):
                 doing = f"the step at t = {time:g} s"
                 self.failure = self._instance.describe_failure(doing, status)
                 break
         return status
 
     def _read_outputs(self, status: int) -> int:
-        access = self._outputs
-        got = access.get()
-        if got > Status.WARNING or got < 0:
+        """Read into the row; what is not finite is replaced by what was there before."""
+        got = self._outputs.get()
+        if got and not _is_fine(got):
             return self._failed_call("reading the outputs", got)
-        total = sum(access.values.tolist())
-        if total - total != 0.0 and not np.isfinite(access.values).all():
-            named = zip(self._spec.outputs, access.values.tolist(), strict=True)
+        values = self._output_row.tolist()
+        total = sum(values)
+        if total - total != 0.0 and not all(map(math.isfinite, values)):
+            named = zip(self._spec.outputs, values, strict=True)
             bad = ", ".join(f"{v.name} = {value}" for v, value in named if not math.isfinite(value))
             self.failure = f"the outputs are not finite: {bad}"
+            self._output_row[:] = self._good_outputs
             return Status.NOT_FINITE
-        self._output_row[:] = access.values
+        self._good_outputs = values
         return status
 
     def _failed_call(self, doing: str, status: int) -> int:
         status = self._instance.judge(status)
         self.failure = self._instance.describe_failure(doing, status)
+        self._output_row[:] = self._good_outputs
         return status
 
     def _failed(self, reason: str) -> int:
