@@ -10,33 +10,26 @@ FMU or a file cannot be used (one line on the error stream says why), or 2 where
 wrong.
 
 The JSON of ``info --json`` is one object. Keys are added at times; when one goes or changes its
-meaning, ``schema`` is raised.
+meaning, ``schema`` is raised. What the FMU does not give is null, or ``""`` for a text.
 
-=============================  ===================================================================
-key                            value
-=============================  ===================================================================
-``schema``                     1
-``path``                       absolute path of the FMU
-``fmi_version``                as in the XML, for example ``"2.0"``
-``model_name``, ``model_identifier``, ``instantiation_token``, ``description``,
-``generation_tool``            strings, ``""`` where not given
-``interfaces``                 of ``co-simulation``, ``model exchange``, ``scheduled execution``
-``platforms``                  the folders under ``binaries/``
-``platform``, ``library``      the folder and the file that this machine needs
-``runs_here``                  whether the FMU has that file
-``capabilities``               flags by name, see ``fmugym.model_description.Capabilities``
-``default_experiment``         ``start_time``, ``stop_time``, ``step_size`` in s, ``tolerance``; or
-                               null
-``fixed_internal_step_size``   in s, or null
-``findings``                   what is not valid in the model description, strings
-``variable_counts``            number of all variables by causality
-``variables``                  those asked for, in the order of the XML: ``name``, ``causality``,
-                               ``variability``, ``initial`` (or null), ``type``, ``shape``, ``unit``
-                               (or null), ``min``, ``max``, ``nominal`` (null where there is none),
-                               ``start`` (in the variable's type; text for arrays; or null),
-                               ``items`` (``name``, ``value``), ``description``,
-                               ``settable_at_start``, ``settable_in_step``
-=============================  ===================================================================
+- ``schema``: 1
+- ``path``: absolute path of the FMU
+- ``fmi_version``, ``model_name``, ``model_identifier``, ``instantiation_token``, ``description``,
+  ``generation_tool``: texts of the XML
+- ``interfaces``: of ``co-simulation``, ``model exchange``, ``scheduled execution``
+- ``platforms``: the folders under ``binaries/``
+- ``platform``, ``library``: the folder and the file that this machine needs
+- ``runs_here``: whether the FMU has that file
+- ``capabilities``: flags by name, those of ``fmugym.model_description.Capabilities``
+- ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
+- ``fixed_internal_step_size``: in s
+- ``findings``: texts, what is not valid in the model description
+- ``variable_counts``: number of all variables by causality
+- ``variables``: those asked for, in the order of the XML, each with ``name``, ``causality``,
+  ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``, ``nominal``,
+  ``start`` (in the variable's type; a text for arrays and what is malformed or not finite),
+  ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
+  ``settable_in_step``
 """
 
 from __future__ import annotations
@@ -52,7 +45,7 @@ from pathlib import Path
 from fmugym.archive import FMU
 from fmugym.errors import FMUGymError
 from fmugym.overview import as_text, overview, plain
-from fmugym.skeleton import placeholders, skeleton
+from fmugym.skeleton import Skeleton
 
 __all__ = ["main"]
 
@@ -124,14 +117,13 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _skeleton(arguments: argparse.Namespace) -> None:
-    fmu = FMU(arguments.fmu)
-    text = skeleton(fmu)
+    skeleton = Skeleton(FMU(arguments.fmu))
     if arguments.output is None:
-        print(text, end="")
+        print(skeleton.text(), end="")
     else:
         with arguments.output.open("x", encoding="ascii", newline="\n") as file:
-            file.write(text)
-    for note in placeholders(fmu):
+            file.write(skeleton.text())
+    for note in skeleton.notes():
         print(f"fmugym: note: {plain(note)}", file=sys.stderr)
 
 

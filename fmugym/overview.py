@@ -222,7 +222,7 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
         row["type"] + shape,
         row["unit"] or "-",
         _range(row),
-        "-" if start is None else f"{start:g}" if isinstance(start, float) else start,
+        "-" if start is None else f"{start:.10g}" if isinstance(start, float) else start,
         row["variability"],
         row["description"],
     )

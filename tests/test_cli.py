@@ -1,0 +1,327 @@
+"""The command line: what it says of FMUs, and that the skeletons it writes run."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+import zlib
+
+import pytest
+
+import fmugym
+from fmugym.bundled import FMI_VERSIONS, MODELS
+from fmugym.cli import main
+
+BUNDLED = [(model, version) for model in MODELS for version in FMI_VERSIONS]
+
+XML = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{1}}" description="{description}">
+  <CoSimulation modelIdentifier="odd" {flags}/>
+  <ModelVariables>{variables}</ModelVariables>
+  <ModelStructure/>
+</fmiModelDescription>
+"""
+
+
+def run(*arguments, **options):
+    command = [sys.executable, "-m", "fmugym", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+
+
+def variable(name, inner, causality="input", variability="continuous", **attributes):
+    attributes |= {"name": name, "valueReference": zlib.crc32(name.encode())}
+    attributes |= {"causality": causality, "variability": variability}
+    listing = " ".join(f'{key}="{value}"' for key, value in attributes.items())
+    return f"<ScalarVariable {listing}>{inner}</ScalarVariable>"
+
+
+INPUT = variable("u", '<Real start="0"/>')
+OUTPUT = variable("y", "<Real/>", "output", initial="calculated")
+
+
+def parameter(name, inner):
+    return variable(name, inner, "parameter", "fixed", initial="exact")
+
+
+@pytest.fixture
+def make_fmu(tmp_path):
+    def make(*variables, model="odd", description="", flags=""):
+        path = tmp_path / "odd.fmu"
+        xml = XML.format(
+            model=model, description=description, flags=flags, variables="".join(variables)
+        )
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("modelDescription.xml", xml)
+            archive.writestr("binaries/plan9/odd.so", "")
+        return path
+
+    return make
+
+
+@pytest.fixture
+def info(capsys):
+    def call(path, *options):
+        assert main(["info", str(path), *options]) == 0
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def facts(info):
+    return lambda path, *options: json.loads(info(path, "--json", *options))
+
+
+@pytest.fixture
+def skeleton(capsys):
+    def call(path):
+        assert main(["skeleton", str(path)]) == 0
+        return capsys.readouterr()
+
+    return call
+
+
+class TestInfo:
+    @pytest.mark.parametrize(("model", "fmi_version"), BUNDLED)
+    def test_says_what_the_fmu_is(self, info, model, fmi_version):
+        text = info(fmugym.bundled_fmu(model, fmi_version))
+        assert text.startswith(f"{model} (FMI {fmi_version})\n")
+        for heading in ("Inputs (1)", "Outputs (", "Parameters (1"):
+            assert heading in text
+        assert "Locals" not in text
+        assert text.isascii()
+        assert ": runs here" in text
+
+    @pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
+    def test_variables_have_type_unit_range_start(self, facts, fmi_version):
+        found = facts(fmugym.bundled_fmu("Pendulum", fmi_version))
+        variables = {v["name"]: v for v in found["variables"]}
+        tau = variables["tau"]
+        assert tau["type"] == ("Float64" if fmi_version == "3.0" else "Real")
+        assert (tau["causality"], tau["unit"], tau["start"]) == ("input", "N.m", 0.0)
+        assert (tau["min"], tau["max"], tau["nominal"]) == (-100.0, 100.0, 0.1)
+        assert variables["theta"]["min"] is None
+        assert variables["q_0"]["start"] == pytest.approx(3.141592653589793, abs=0)
+        assert variables["solver"]["start"] == 3
+        assert variables["solver"]["items"][2] == {"name": "rk4", "value": 3}
+
+    def test_json_has_platforms_capabilities_and_experiment(self, facts):
+        found = facts(fmugym.bundled_fmu("Pendulum"))
+        assert found["schema"] == 1
+        assert found["platforms"] == ["darwin64", "linux64", "win64"]
+        assert found["runs_here"] is True
+        assert found["capabilities"]["can_get_and_set_fmu_state"] is True
+        assert found["capabilities"]["needs_execution_tool"] is False
+        assert found["default_experiment"] == {
+            "start_time": 0.0,
+            "stop_time": 10.0,
+            "step_size": 0.01,
+            "tolerance": None,
+        }
+        assert found["findings"] == []
+        assert sum(found["variable_counts"].values()) == 22
+
+    def test_locals_are_counted_and_listed_when_asked_for(self, info):
+        path = fmugym.bundled_fmu("Pendulum")
+        assert info(path).endswith("Not listed: 1 independent, 1 local\n")
+        everything = info(path, "--all")
+        assert "Locals (1)" in everything
+        assert "theta_ddot" in everything
+        assert "Not listed" not in everything
+
+    def test_filter_finds_names_of_every_causality(self, facts):
+        found = facts(fmugym.bundled_fmu("Pendulum"), "--filter", "theta_d?*")
+        names = [v["name"] for v in found["variables"]]
+        assert names == ["theta_dot", "theta_ddot", "theta_dot_max", "theta_dot_0"]
+
+    def test_brackets_in_a_filter_stand_for_themselves(self, facts, make_fmu):
+        path = make_fmu(*(variable(name, "<Real/>", "local") for name in ("x[1]", "x1", "x[2]")))
+        names = [v["name"] for v in facts(path, "--filter", "x[1]")["variables"]]
+        assert names == ["x[1]"]
+
+    def test_a_foreign_platform_and_findings_are_told(self, info, make_fmu):
+        text = info(make_fmu(variable("u", "<Real/>"), OUTPUT))
+        assert "does NOT run here" in text
+        assert "platforms           plan9" in text
+        assert "Findings in the model description" in text
+
+    def test_texts_of_a_foreign_file_are_made_harmless(self, info, make_fmu):
+        path = make_fmu(INPUT, description="25 \u00b0C\u2028and &#x85; \u202e more")
+        text = info(path)
+        assert text.isascii()
+        assert r"25 \xb0C and" in text
+        assert r"\u202e more" in text
+
+    def test_malformed_start_values_are_shown_as_text(self, facts, make_fmu):
+        path = make_fmu(
+            parameter("a", '<Real start="INF"/>'),
+            parameter("b", '<Integer start="x"/>'),
+            parameter("c", '<Boolean start="true"/>'),
+            parameter("d", '<String start="007"/>'),
+        )
+        starts = [v["start"] for v in facts(path)["variables"]]
+        assert starts == ["INF", "x", True, "007"]
+
+
+class TestSkeleton:
+    @pytest.mark.parametrize(("model", "fmi_version"), BUNDLED)
+    def test_runs_and_keeps_the_contract(self, tmp_path, model, fmi_version):
+        fmu = fmugym.bundled_fmu(model, fmi_version)
+        assert run("skeleton", fmu, "--output", tmp_path / "made.py").returncode == 0
+        command = [sys.executable, "-W", "error", "made.py"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        assert "keeps the contract" in done.stdout
+
+    @pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
+    def test_base_class_and_names_are_those_of_the_fmu(self, skeleton, fmi_version):
+        text = skeleton(fmugym.bundled_fmu("Pendulum", fmi_version)).out
+        assert f"class PendulumEnv(fmugym.FMI{fmi_version[0]}CSEnv):" in text
+        assert '"tau",  # [N.m] Torque' in text
+        assert '"g": 9.81,  # [m/s2]' in text
+        assert '"solver": "rk4",' in text
+        assert '"bounds"' not in text  # the FMU has limits for its input
+
+    def test_output_is_a_new_file_only(self, tmp_path, capsys):
+        target = tmp_path / "mine.py"
+        target.write_text("precious")
+        fmu = str(fmugym.bundled_fmu("Pendulum"))
+        assert main(["skeleton", fmu, "--output", str(target)]) == 1
+        assert "exists" in capsys.readouterr().err
+        assert target.read_text() == "precious"
+
+    def test_unbounded_inputs_get_placeholders_and_a_note(self, skeleton, make_fmu):
+        half = variable("v", '<Real start="0" min="2"/>')
+        scaled = variable("w", '<Real start="0" nominal="300"/>')
+        made = skeleton(make_fmu(INPUT, half, scaled, OUTPUT))
+        config = config_of(made.out)
+        assert config["bounds"] == {"u": (-1.0, 1.0), "v": (2.0, 3.0), "w": (-300.0, 300.0)}
+        assert "limits of input 'u'" in made.err
+        assert "no step size" in made.err
+        assert "does not run on this machine" in made.err
+
+    def test_what_a_number_cannot_carry_is_left_out(self, skeleton, make_fmu):
+        made = skeleton(
+            make_fmu(
+                INPUT,
+                variable("file", '<String start="a"/>', variability="discrete"),
+                OUTPUT,
+                parameter("good", '<Integer start="3"/>'),
+                parameter("endless", '<Real start="INF"/>'),
+                parameter("text", '<String start="it\'s"/>'),
+            )
+        )
+        config = config_of(made.out)
+        assert config["model_input_names"] == ["u"]
+        assert config["model_parameters"] == {"good": 3, "text": "it's"}
+        assert "# 1 more are listed by: fmugym info" in made.out
+
+    def test_no_text_of_the_fmu_becomes_code(self, skeleton, make_fmu):
+        evil = "&quot;&quot;&quot;&#10;raise SystemExit(9)&#10;#'"
+        made = skeleton(
+            make_fmu(
+                variable(evil, '<Real start="0"/>', description=evil),
+                OUTPUT,
+                parameter("p", f'<String start="{evil}"/>'),
+                model=f"a.b-1 {evil}",
+                description=evil,
+            )
+        )
+        assert made.out.isascii()
+        names = config_of(made.out)["model_input_names"]
+        assert names[0].startswith('"""')
+        assert "class B1RaiseSystemExit9Env(" in made.out
+
+    def test_without_inputs_and_outputs(self, skeleton, make_fmu):
+        made = skeleton(make_fmu(variable("x", "<Real/>", "local", initial="calculated")))
+        assert config_of(made.out)["model_input_names"] == []
+        assert config_of(made.out)["model_output_names"] == ["x"]
+        assert "spaces.Discrete(1)" in made.out
+        assert "no input" in made.err
+        assert "locals stand in" in made.err
+
+    def test_nothing_to_observe_is_an_error(self, make_fmu, capsys):
+        assert main(["skeleton", str(make_fmu(INPUT))]) == 1
+        assert "to observe" in capsys.readouterr().err
+
+    def test_runs_for_an_fmu_without_inputs_of_another_exporter(self, tmp_path):
+        (tmp_path / "decay.py").write_text(DECAY)
+        builder = shutil.which("pythonfmu", path=os.path.dirname(sys.executable))
+        command = [builder, "build", "-f", "decay.py", "--no-external-tool"]
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
+        made = run("skeleton", tmp_path / "Decay.fmu", "--output", tmp_path / "made.py")
+        assert "no input" in made.stderr
+        command = [sys.executable, "made.py"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert "DecayEnv keeps the contract" in done.stdout, done.stderr
+
+
+DECAY = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
+
+
+class Decay(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.x = 1.0
+        self.rate = 0.5
+        self.register_variable(Real("x", causality=Fmi2Causality.output))
+        kind = dict(causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed)
+        self.register_variable(Real("rate", **kind))
+
+    def do_step(self, current_time, step_size):
+        self.x -= self.rate * self.x * step_size
+        return True
+"""
+
+
+def config_of(text):
+    """The config that a skeleton hands to its base class; the FMU is not loaded."""
+    namespace = {"__name__": "made"}
+    program = text.replace("super().__init__(FMU_PATH, config, log_level)", "self.given = config")
+    exec(compile(program, "made.py", "exec"), namespace)
+    (cls,) = (c for name, c in namespace.items() if name.endswith("Env"))
+    return cls().given
+
+
+class TestCommand:
+    def test_an_error_is_one_line(self, tmp_path):
+        done = run("info", tmp_path / "none.fmu")
+        assert done.returncode == 1
+        assert done.stdout == ""
+        assert done.stderr.startswith("fmugym: error: there is no FMU at")
+        assert done.stderr.count("\n") == 1
+
+    @pytest.mark.parametrize("arguments", [[], ["info"], ["inof", "x.fmu"], ["info", "x", "-y"]])
+    def test_wrong_arguments_exit_with_2(self, arguments, capsys):
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 2
+        assert "error" in capsys.readouterr().err
+
+    def test_version(self, capsys):
+        with pytest.raises(SystemExit) as caught:
+            main(["--version"])
+        assert caught.value.code == 0
+        assert capsys.readouterr().out.strip()[0].isdigit()
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="head and its pipe")
+    def test_a_reader_that_stops_early_is_no_error(self, make_fmu):
+        many = (variable(f"p{n}", "<Real/>", "local") for n in range(4_000))
+        command = [sys.executable, "-m", "fmugym", "info", str(make_fmu(*many)), "--all"]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            process.stdout.readline()
+            process.stdout.close()
+            assert process.stderr.read() == ""
+        assert process.returncode == 0
+
+    def test_output_fits_the_narrowest_console(self, make_fmu):
+        path = make_fmu(INPUT, OUTPUT, description="25 \u00b0C")
+        environment = {"PYTHONIOENCODING": "ascii:strict"}
+        for command in (["info", path], ["info", path, "--json"], ["skeleton", path]):
+            done = run(*command, env={**os.environ, **environment})
+            assert done.returncode == 0, done.stderr
