@@ -422,6 +422,7 @@ class Instance(ABC):
         """
         if self.phase is Phase.DEAD:
             raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
+        self._log.recent.clear()
         set_state = self._function(self._state_function("Set"))
         self.check("restoring the FMU state", set_state(self._component, state.pointer))
         self.phase = Phase.STEPPING

@@ -21,7 +21,12 @@ from typing import Final
 import fmpy
 
 from fmugym.errors import FMULoadError
-from fmugym.model_description import ModelDescription, Variable, read_model_description
+from fmugym.model_description import (
+    ZIP_ERRORS,
+    ModelDescription,
+    Variable,
+    read_model_description,
+)
 
 __all__ = ["FMU"]
 
@@ -137,7 +142,7 @@ class FMU:
         try:
             with zipfile.ZipFile(self.path) as archive:
                 archive.extractall(folder, wanted)
-        except (OSError, zipfile.BadZipFile, EOFError, RuntimeError) as error:
+        except ZIP_ERRORS as error:
             raise FMULoadError(f"{self.path.name} cannot be extracted: {error}") from None
         (folder / "resources").mkdir(exist_ok=True)  # tools pass its path even where it is absent
 
@@ -160,7 +165,7 @@ def _checked_entries(path: Path) -> tuple[str, ...]:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
-    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+    except ZIP_ERRORS as error:
         raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
     _check_sizes(path, entries)
     for entry in entries:
@@ -188,6 +193,8 @@ def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     name = PurePosixPath(entry.filename)
+    if not name.parts:
+        raise FMULoadError(f"{path.name} has a file without a name: {entry.filename!r}")
     if name.is_absolute() or ".." in name.parts or "\\" in entry.filename or ":" in entry.filename:
         raise FMULoadError(f"{path.name} has a file outside of its own folder: {entry.filename!r}")
     if stat.S_ISLNK(entry.external_attr >> 16):

@@ -8,12 +8,17 @@ from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any
 
+import numpy as np
+
 from fmugym.distributions import is_distribution
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.model_description import ModelDescription, Variable
 from fmugym.pool.base import PoolSpec, whole_number_of_steps
 
 __all__ = ["EnvConfig"]
+
+_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
+_LARGEST_EXACT_INTEGER = 2.0**53
 
 ON_FAULT = ("truncate", "terminate", "raise")
 
@@ -276,17 +281,26 @@ def checked_value(variable: Variable, value: Any) -> float:
         ConfigError: If the value is not finite, not of the variable's kind, or out of its type's
             range.
     """
-    if variable.kind == "real" and isinstance(value, float) and math.isfinite(value):
+    if variable.type in {"Real", "Float64"} and isinstance(value, float) and math.isfinite(value):
         return value
-    if isinstance(value, str) and value in dict(variable.items):
-        return dict(variable.items)[value]
+    if isinstance(value, str) and variable.items:
+        return _item_value(variable, value)
     _check_number(repr(variable.name), value)
     number = float(value)
+    if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
+        raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {value!r}")
     if variable.kind == "boolean" and number not in {0.0, 1.0}:
         raise ConfigError(f"{variable.name!r} is a Boolean, got {value!r}")
     if variable.kind in {"integer", "enumeration"}:
         _check_integer(variable, number)
     return number
+
+
+def _item_value(variable: Variable, name: str) -> float:
+    items = dict(variable.items)
+    if name not in items:
+        raise unknown_name(f"item of {variable.name!r}", name, items)
+    return float(items[name])
 
 
 def _check_integer(variable: Variable, number: float) -> None:
@@ -296,6 +310,8 @@ def _check_integer(variable: Variable, number: float) -> None:
             f"{variable.name!r} is of type {variable.type}: expected an integer from {low} to "
             f"{high}, got {number}"
         )
+    if abs(number) > _LARGEST_EXACT_INTEGER:
+        raise ConfigError(f"{variable.name!r}: integers beyond 2**53 are not exact, got {number}")
     values = [value for _, value in variable.items]
     if values and number not in values:
         listing = ", ".join(f"{value} ({name})" for name, value in variable.items)
@@ -324,14 +340,21 @@ def _check_value(what: str, value: Any) -> None:
 def _check_number(
     what: str, value: Any, minimum: float = -math.inf, *, positive: bool = False
 ) -> None:
-    if not isinstance(value, Real) and not hasattr(value, "__float__"):
-        raise ConfigError(f"{what} must be a number, got {value!r}")
-    number = float(value)
+    number = _number(what, value)
     if not math.isfinite(number) or number < minimum or (positive and number <= 0):
         wanted = "positive and finite" if positive else "finite and not negative"
         raise ConfigError(
             f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {value!r}"
         )
+
+
+def _number(what: str, value: Any) -> float:
+    if isinstance(value, Real) or (hasattr(value, "__float__") and np.shape(value) == ()):
+        try:
+            return float(value)
+        except (TypeError, ValueError, OverflowError):
+            pass
+    raise ConfigError(f"{what} must be a number, got {value!r}")
 
 
 def _check_count(what: str, value: Any) -> None:
@@ -340,5 +363,9 @@ def _check_count(what: str, value: Any) -> None:
 
 
 def _check_bounds(name: str, limits: Any) -> None:
-    if not isinstance(limits, Sequence) or len(limits) != 2 or not limits[0] < limits[1]:
+    try:
+        low, high = (_number("limit", limit) for limit in limits)
+    except (ConfigError, TypeError, ValueError):
+        low = high = math.nan
+    if not low < high:
         raise ConfigError(f"bounds of {name!r} must be (low, high) with low < high, got {limits!r}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,9 +76,18 @@ class Normal:
             raise ConfigError(f"{self}: std must not be negative")
         if not self.low <= self.mean <= self.high:
             raise ConfigError(f"{self}: mean must lie between low and high")
+        if self._probability_within() < 0.01:
+            raise ConfigError(f"{self}: low and high are too close for redraws; use Uniform")
+
+    def _probability_within(self) -> float:
+        if self.std == 0:
+            return 1.0
+        limits = (self.low, self.high)
+        low, high = (math.erf((limit - self.mean) / self.std / math.sqrt(2)) for limit in limits)
+        return (high - low) / 2
 
     def sample(self, rng: np.random.Generator) -> float:
-        """Draw one value; the mean lies within the bounds, so that a redraw soon succeeds."""
+        """Draw one value; at least every hundredth draw lies within the bounds."""
         while True:
             value = float(rng.normal(self.mean, self.std))
             if self.low <= value <= self.high:
@@ -92,12 +102,13 @@ class Choice:
     probabilities: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        if len(self.values) == 0:
-            raise ConfigError("Choice needs at least one value")
+        if not hasattr(self.values, "__len__") or len(self.values) == 0:
+            raise ConfigError(f"{self}: expected a list of at least one value")
         weights = self.probabilities
         if weights is None:
             return
-        if len(weights) != len(self.values) or min(weights) < 0 or abs(sum(weights) - 1) > 1e-9:
+        fits = len(weights) == len(self.values) and min(weights) >= 0
+        if not (fits and abs(sum(weights) - 1) <= 1e-9):
             raise ConfigError(f"{self}: expected one probability per value, adding up to 1")
 
     def sample(self, rng: np.random.Generator) -> float:
@@ -108,7 +119,7 @@ class Choice:
 
 def is_distribution(value: object) -> bool:
     """Whether a value of a config is to be drawn anew at each reset."""
-    return hasattr(value, "sample") or hasattr(value, "rvs")
+    return not isinstance(value, type) and (hasattr(value, "sample") or hasattr(value, "rvs"))
 
 
 def draw(value: Any, rng: np.random.Generator) -> Any:
@@ -129,5 +140,5 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
 
 
 def _require_finite(distribution: object, *numbers: float) -> None:
-    if not all(math.isfinite(number) for number in numbers):
-        raise ConfigError(f"{distribution}: every number must be finite")
+    if not all(isinstance(number, Real) and math.isfinite(number) for number in numbers):
+        raise ConfigError(f"{distribution}: every number must be one, and finite")

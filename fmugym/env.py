@@ -53,10 +53,10 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         config: The checked config.
         state: The outputs in the order of the config, floats.
         out: The outputs and the monitored variables by name.
-        action: The action of this step as it was given; None after a reset.
+        action: The action of this step as it was given; zeros after a reset.
         inputs: What was written to the FMU's inputs in this step, floats.
         previous_state: ``state`` before this step.
-        previous_action: The action of the step before; None in the first.
+        previous_action: The action of the step before; zeros in the first.
         step_count: Steps since the reset.
         done: What ``_is_done`` said in this step.
         after_end: Whether this step began after the end of the episode.
@@ -150,8 +150,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.out = NamedValues("output", names, lambda: self._values)
         self.state: Any = self._values[: self._output_count]
         self.previous_state: Any = self.state
-        self._start_inputs = (0.0,) * len(interface.inputs)
-        self.inputs: Any = self._start_inputs
+        self._start_inputs = [(v.name, v.start_number) for v in interface.inputs]
+        self.inputs: Any = tuple(start for _, start in self._start_inputs)
         self.action: Any = None
         self.previous_action: Any = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
@@ -182,6 +182,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._action_values = values
         if cls._get_observation is FMUEnv._get_observation:
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
+        self._no_action = _no_action(self.action_space)
         self._elements = _elements(self.action_space) if cls.step is FMUEnv.step else None
         self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
         self._has_update = cls._update is not FMUEnv._update
@@ -338,8 +339,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.parameters = episode.parameters
         self.variables.update(episode.variables)
         self.step_count = 0
-        self.action = self.previous_action = None
-        self.inputs = self._start_inputs
+        self.action = self.previous_action = self._no_action
+        self.inputs = tuple(self.parameters.get(n, start) for n, start in self._start_inputs)
         self.done = self.after_end = False
         self._set_values()
         self.previous_state = self.state
@@ -421,7 +422,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
 
     def _write_inputs(self, values: Any) -> None:
         if self._takes_one_real and isinstance(values, float):
-            self.inputs = (values,)
+            self.inputs = (float(values),)
             self._input_row[0] = values
         else:
             flat = self._flat_inputs(values)
@@ -514,7 +515,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             title = type(self).__name__
             scene = self._get_scene()
             self._renderer = Renderer(scene, self.render_size, fps, self.render_mode, title)
-        action = "" if self.action is None else self._describe_action()
+        action = self._describe_action() if self.step_count else ""
         overlay = Overlay(self.time, action, self._last_reward, self._return)
         return self._renderer.render(self._get_frame(), overlay)
 
@@ -592,7 +593,22 @@ def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
     if config.stop_time is None:
         return limit
     span = (config.stop_time - spec.start_time) / spec.time_step
-    return min(limit, math.floor(span + 1e-9) - spec.warm_up_steps)
+    steps = math.floor(span + 1e-9) - spec.warm_up_steps
+    if steps < 1:
+        raise ConfigError(
+            f"stop_time = {config.stop_time} s leaves no time for a step of {spec.time_step} s "
+            f"after start_time = {spec.start_time} s and the warm-up"
+        )
+    return min(limit, steps)
+
+
+def _no_action(space: spaces.Space[Any]) -> Any:
+    """What hooks read where there was no action yet; None for spaces that have no zero."""
+    if isinstance(space, spaces.Discrete):
+        return space.dtype.type(space.start)
+    if isinstance(space, spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete):
+        return np.zeros(space.shape, space.dtype)
+    return None
 
 
 def _elements(space: spaces.Space[Any]) -> range | None:

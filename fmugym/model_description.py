@@ -7,9 +7,11 @@ leaves out, and holds the rules for which variable may be set when.
 from __future__ import annotations
 
 import io
+import lzma
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +25,17 @@ from lxml import etree
 from fmugym.errors import FMULoadError, unknown_name
 
 __all__ = ["Capabilities", "ModelDescription", "Variable", "read_model_description"]
+
+ZIP_ERRORS = (
+    OSError,
+    EOFError,
+    RuntimeError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
+"""What Python's zipfile raises for a damaged archive."""
 
 MAX_XML_BYTES = 64 * 2**20
 """Largest ``modelDescription.xml`` that is read, in bytes."""
@@ -90,6 +103,13 @@ class Variable:
         """Whether a value may be set between two steps."""
         tunable = self.causality == "parameter" and self.variability == "tunable"
         return self.causality == "input" or tunable
+
+    @property
+    def start_number(self) -> float:
+        """The start value of a numeric variable; 0 where there is none."""
+        if self.start is None:
+            return 0.0
+        return float({"true": "1", "false": "0"}.get(self.start, self.start))
 
     @property
     def integer_limits(self) -> tuple[int, int]:
@@ -204,14 +224,20 @@ def _read_xml(path: Path) -> bytes:
             xml = archive.read(info)
     except KeyError:
         raise FMULoadError(f"{path.name} is not an FMU: it has no modelDescription.xml") from None
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except ZIP_ERRORS as error:
         raise FMULoadError(f"{path.name}: modelDescription.xml cannot be read: {error}") from None
     if re.search(rb"<!\s*DOCTYPE", xml, re.IGNORECASE):
-        raise FMULoadError(f"{path.name}: modelDescription.xml has a DOCTYPE, which FMI forbids")
+        raise _doctype_error(path)
     return xml
 
 
+def _doctype_error(path: Path) -> FMULoadError:
+    return FMULoadError(f"{path.name}: modelDescription.xml has a DOCTYPE, which FMI forbids")
+
+
 def _check_root(path: Path, root: Any) -> None:
+    if root.getroottree().docinfo.doctype:  # in an encoding in which it was not seen before
+        raise _doctype_error(path)
     version = root.get("fmiVersion", "")
     if root.tag != "fmiModelDescription" or not re.fullmatch(r"1\.0|2\.0(\.\d+)?|3\.\d.*", version):
         raise FMULoadError(
@@ -239,6 +265,7 @@ def _convert(source: Any, root: Any) -> ModelDescription:
             "export the model for co-simulation (model exchange is not supported)"
         )
     experiment = source.defaultExperiment
+    _read_unsigned_limits(source, root)
     variables = {v.name: _convert_variable(v) for v in source.modelVariables}
     return ModelDescription(
         fmi_version=source.fmiVersion,
@@ -317,6 +344,15 @@ def _fmi1_capabilities(root: Any) -> Capabilities:
         can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
         needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
     )
+
+
+def _read_unsigned_limits(source: Any, root: Any) -> None:
+    """Read min and max of unsigned integers, which FMPy leaves out."""
+    elements = {element.get("name"): element for element in root.find("ModelVariables")}
+    for variable in source.modelVariables:
+        if variable.type.startswith("UInt"):
+            element = elements[variable.name]
+            variable.min, variable.max = element.get("min"), element.get("max")
 
 
 def _convert_variable(source: Any) -> Variable:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import gymnasium
-from gymnasium.envs.registration import EnvCreator
 
 __all__ = ["register"]
 
 
 def register(
-    env_id: str, env: EnvCreator | str, max_episode_steps: int | None = None, **spec: Any
+    env_id: str,
+    env: Callable[..., gymnasium.Env[Any, Any]] | str,
+    max_episode_steps: int | None = None,
+    **spec: Any,
 ) -> None:
     """Register an environment, so that ``gymnasium.make(env_id)`` makes it.
 
@@ -21,4 +24,6 @@ def register(
         max_episode_steps: Steps after which ``make``'s time limit truncates an episode.
         spec: More fields of Gymnasium's ``EnvSpec``, for example ``reward_threshold``.
     """
-    gymnasium.register(env_id, entry_point=env, max_episode_steps=max_episode_steps, **spec)
+    gymnasium.register(
+        env_id, entry_point=cast(Any, env), max_episode_steps=max_episode_steps, **spec
+    )

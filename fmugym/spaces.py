@@ -20,7 +20,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.config import Interface, checked_value
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, SimulationError
 from fmugym.model_description import Variable
 
 __all__ = [
@@ -58,7 +58,7 @@ def observation_space(interface: Interface) -> spaces.Space[Any]:
     return _space(interface, interface.outputs)
 
 
-def discrete_values(interface: Interface, variables: Sequence[Variable]) -> list[int] | None:
+def discrete_values(interface: Interface, variables: Sequence[Variable]) -> Sequence[int] | None:
     """The values that the elements of a ``Discrete`` made here stand for.
 
     Returns:
@@ -71,7 +71,7 @@ def discrete_values(interface: Interface, variables: Sequence[Variable]) -> list
         return sorted(value for _, value in variable.items)
     if variable.kind in {"integer", "enumeration"} and _bounded(interface, variable):
         low, high = interface.bounds(variable)
-        return list(range(math.ceil(low), math.floor(high) + 1))
+        return range(math.ceil(low), math.floor(high) + 1)  # not a list: it may be long
     return None
 
 
@@ -101,7 +101,7 @@ def _bounded(interface: Interface, variable: Variable) -> bool:
 def to_input_types(
     variables: Sequence[Variable], values: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Make values fit their inputs' types: Booleans from 0.5 on, integers rounded.
+    """Make values fit their inputs' types: Booleans from 0.5 on, others to the nearest value.
 
     Args:
         variables: The inputs.
@@ -111,15 +111,24 @@ def to_input_types(
         The values as the FMU is to get them, still as float64.
 
     Raises:
-        ConfigError: If an integer is out of its type's range.
+        ConfigError: If a value is out of its type's range.
     """
     result = values.copy()
     for index, variable in enumerate(variables):
-        if variable.kind == "boolean":
-            result[index] = result[index] >= 0.5 if math.isfinite(result[index]) else math.nan
-        elif variable.kind in {"integer", "enumeration"} and math.isfinite(result[index]):
-            result[index] = checked_value(variable, np.rint(result[index]))
+        if math.isfinite(values[index]) and variable.type not in {"Real", "Float64"}:
+            result[index] = _to_input_type(variable, float(values[index]))
     return result
+
+
+def _to_input_type(variable: Variable, value: float) -> float:
+    if variable.kind == "boolean":
+        return float(value >= 0.5)
+    if variable.kind in {"integer", "enumeration"}:
+        value = round(value)
+    items = [item for _, item in variable.items]
+    if items and min(items) <= value <= max(items):  # there may be gaps between them
+        value = min(items, key=lambda item: abs(item - value))
+    return checked_value(variable, value)
 
 
 def default_observation(
@@ -160,5 +169,14 @@ def _discrete_observation(
     values = discrete_values(interface, interface.outputs)
     if values is None or space.n != len(values):
         return lambda state: np.int64(state[0])
-    element = {value: index + int(space.start) for index, value in enumerate(values)}
-    return lambda state: np.int64(element[int(state[0])])
+    (variable,) = interface.outputs
+
+    def observe(state: Sequence[float]) -> np.int64:
+        try:
+            return np.int64(values.index(int(state[0])) + int(space.start))
+        except ValueError:
+            raise SimulationError(
+                f"output {variable.name!r} is {state[0]:g}, which is none of its declared values"
+            ) from None
+
+    return observe

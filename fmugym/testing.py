@@ -80,7 +80,9 @@ def _rollout(env: FMUEnv, actions: list[Any], seed: int) -> list[_Transition]:
     observation, _ = env.reset(seed=seed)
     transitions = [_Transition(observation, 0.0, False, False)]
     for action in actions:
-        observation, reward, terminated, truncated, _ = env.step(action)
+        observation, reward, terminated, truncated, info = env.step(action)
+        if "fault" in info:
+            raise ContractError(f"a step with a sampled action failed: {info['fault']}")
         transitions.append(_Transition(observation, reward, terminated, truncated))
         if terminated or truncated:
             observation, _ = env.reset()
@@ -166,7 +168,9 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
                 raise ContractError(f"parameter {name!r} was set to {value}, but is {read[name]}")
         before = _trace(tried, actions, seed, {})
         for name, value in given.items():
-            changed = _changed(tried, name, value)
+            changed = (
+                None if name in tried.config.model_input_names else _changed(tried, name, value)
+            )
             if changed is not None and _trace(tried, actions, seed, {name: changed}) == before:
                 logger.warning(
                     "parameter %r has no effect on the outputs: %g gives the same as %g",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from fmugym.errors import unknown_name
+from fmugym.errors import ConfigError, unknown_name
 
 __all__ = ["EpisodeVariables", "NamedValues"]
 
@@ -63,3 +63,25 @@ class EpisodeVariables(dict[str, Any]):
         if name not in self:
             raise unknown_name("episode variable", name, self)
         super().__setitem__(name, value)
+
+    def update(self, *args: Any, **kwargs: Any) -> None:
+        """Write several; as in a dict."""
+        for name, value in dict(*args, **kwargs).items():
+            self[name] = value
+
+    def __ior__(self, other: Any) -> EpisodeVariables:  # type: ignore[misc, override]
+        self.update(other)
+        return self
+
+    def setdefault(self, name: str, default: Any = None) -> Any:
+        """Read one: all are there from the start."""
+        return self[name]
+
+    def _keep(self, *_: Any) -> Any:
+        raise ConfigError("episode variables are those of the config: none can be removed")
+
+    __delitem__ = pop = popitem = clear = _keep
+
+    def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
+        """A copy is a dict like any other."""
+        return dict, (dict(self),)

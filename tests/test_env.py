@@ -79,6 +79,19 @@ def test_start_time_and_stop_time():
     env.close()
 
 
+def test_no_time_for_a_step():
+    with pytest.raises(ConfigError, match="leaves no time for a step"):
+        Swing(stop_time=0.01)
+
+
+def test_inputs_after_a_reset_are_their_start_values():
+    env = Swing(model_parameters={"tau": 0.01})
+    env.reset()
+    assert env.inputs == (0.01,)
+    assert env.read_variables("tau") == {"tau": 0.01}
+    env.close()
+
+
 def test_substeps_divide_the_step():
     """With one internal step per communication step, ten substeps are ten Euler steps."""
     euler = {"solver": "explicit_euler", "max_step": 1.0, "q_0": 1.0}
@@ -192,7 +205,8 @@ def test_what_hooks_read():
     env.reset()
     start = env.state
     assert start == (1.0, 0.0)
-    assert (env.action, env.previous_action, env.previous_state) == (None, None, start)
+    assert env.action.tolist() == env.previous_action.tolist() == [0.0]
+    assert env.previous_state == start
     assert (env.time, env.step_count, env.done) == (0.0, 0, False)
     env.step(0.01)
     env.step(0.02)

@@ -61,6 +61,15 @@ class SameArray(Sound):
         return self.kept
 
 
+class Failing(Sound):
+    def _get_inputs(self):
+        return 0.0 if self.step_count < 5 else 1e300
+
+    def __init__(self):
+        config = {"model_input_names": "f", "model_output_names": "x", "time_step": 0.02}
+        fmugym.FMUEnv.__init__(self, fmugym.bundled_fmu("CartPole"), config)
+
+
 class Infinite(Sound):
     def _reward_policy(self):
         return float("inf")
@@ -73,6 +82,7 @@ class Infinite(Sound):
         (Forgetful, "reset does not restore everything: at step 1 reward"),
         (TooNarrow, "is not in Box"),
         (SameArray, "returns the same array again|reset does not|differ"),
+        (Failing, "a step with a sampled action failed: .* returned Discard"),
         (Infinite, "a reward is inf"),
     ],
 )
