@@ -11,6 +11,7 @@ from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
 from fmugym.errors import ConfigError, ContractError, FMUGymError, FMULoadError, SimulationError
 from fmugym.registration import register
+from fmugym.vector import FMUVectorEnv
 
 __all__ = [
     "FMU",
@@ -24,6 +25,7 @@ __all__ = [
     "FMUEnv",
     "FMUGymError",
     "FMULoadError",
+    "FMUVectorEnv",
     "LogUniform",
     "Normal",
     "SimulationError",

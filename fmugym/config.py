@@ -125,6 +125,9 @@ class EnvConfig:
                 raise ConfigError(f"{key}: {twice[0]!r} is named twice")
         if not self.model_output_names:
             raise ConfigError("config key 'model_output_names' names no output")
+        for name in self.episode_variables:
+            if name in self.model_parameters:
+                raise ConfigError(f"{name!r} is both a model parameter and an episode variable")
         for name, limits in self.bounds.items():
             _check_bounds(name, limits)
 

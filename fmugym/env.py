@@ -9,7 +9,9 @@ import operator
 import os
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -25,13 +27,31 @@ from fmugym.archive import FMU
 from fmugym.config import EnvConfig, checked, output_variable, start_variable
 from fmugym.episode import Episode, EpisodePlan
 from fmugym.errors import ConfigError, SimulationError, unknown_name
-from fmugym.pool import Pool, PoolSpec, PythonPool
+from fmugym.pool import Pool, PoolSpec, make_pool
 from fmugym.values import EpisodeVariables, NamedValues
 
 if TYPE_CHECKING:
     from fmugym.rendering import Renderer, Scene
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
+
+
+_pool_request: ContextVar[tuple[int, dict[str, Any]]] = ContextVar("request", default=(1, {}))
+
+
+@contextmanager
+def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
+    """Let environments that are made in this context have a pool of this size.
+
+    Args:
+        num_instances: Number of FMU instances; a vector environment's prototype has all of them.
+        options: Passed to ``fmugym.pool.make_pool``.
+    """
+    token = _pool_request.set((num_instances, options))
+    try:
+        yield
+    finally:
+        _pool_request.reset(token)
 
 
 class FMUEnv(gymnasium.Env[Any, Any], ABC):
@@ -80,9 +100,21 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters",)
     """The keys that ``reset`` takes in its options."""
 
+    state: Any
+    previous_state: Any
+    inputs: Any
+    action: Any
+    previous_action: Any
+    step_count: Any
+    done: Any
+    after_end: Any
+    _values: Any
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
     render_size: ClassVar[tuple[int, int]] = (600, 400)
     """Width and height of the pictures in pixels."""
+
+    _per_env_attributes: Mapping[str, Any] = MappingProxyType({})
+    """In a vector environment: attributes that hold one value for each environment."""
 
     _pool: Pool | None = None
     _renderer: Renderer[Any] | None = None
@@ -112,7 +144,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._warn_of_small_steps()
         self._prepare_values()
         self._prepare_spaces()
-        self._pool = PythonPool(self.fmu, self._spec, 1, self.logger)
+        num_instances, pool_options = _pool_request.get()
+        self._pool = make_pool(self.fmu, self._spec, num_instances, self.logger, **pool_options)
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
 
     def _checked_render_mode(self, mode: str | None) -> str | None:
@@ -146,14 +179,14 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / interface.time_step))}
         self._output_count = len(interface.outputs)
         self._no_monitors = not interface.monitors
-        self._values: tuple[float, ...] = (math.nan,) * len(names)
+        self._values = (math.nan,) * len(names)
         self.out = NamedValues("output", names, lambda: self._values)
-        self.state: Any = self._values[: self._output_count]
-        self.previous_state: Any = self.state
+        self.state = self._values[: self._output_count]
+        self.previous_state = self.state
         self._start_inputs = [(v.name, v.start_number) for v in interface.inputs]
-        self.inputs: Any = tuple(start for _, start in self._start_inputs)
-        self.action: Any = None
-        self.previous_action: Any = None
+        self.inputs = tuple(start for _, start in self._start_inputs)
+        self.action = None
+        self.previous_action = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
         self.variables = EpisodeVariables(config.episode_variables)
         self._plan = self._plan_episode({})
@@ -179,7 +212,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         interface, cls = self._interface, type(self)
         derived = cls._get_action_space is FMUEnv._get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
-        self._action_values = values
+        self._action_values = None if values is None else np.array(values, np.float64)
         if cls._get_observation is FMUEnv._get_observation:
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
         self._no_action = _no_action(self.action_space)
@@ -188,6 +221,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._has_update = cls._update is not FMUEnv._update
         self._has_truncation = cls._is_truncated is not FMUEnv._is_truncated
         self._has_info = cls._get_info is not FMUEnv._get_info
+        self._real_inputs = all(v.kind == "real" for v in interface.inputs)
         self._takes_one_real = [v.kind for v in interface.inputs] == ["real"]
 
     # Hooks, in the order of a step.
@@ -201,7 +235,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """
         if self._action_values is None:
             return self.action
-        return self._action_values[int(self.action)]
+        return self._action_values[self.action]
 
     def _update(self) -> None:
         """Advance what the task itself integrates or filters; called once after each FMU step."""
@@ -214,18 +248,26 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """Whether the episode is to be cut short for a reason outside of the task."""
         return False
 
-    def _reward_policy(self) -> float:
+    def _reward_policy(self) -> Any:
         """The reward of this step.
 
         Returns:
             By default ``negative_reward`` where the task has ended and ``positive_reward``
             otherwise; for a goal task ``_goal_reward`` of this observation.
         """
+        positive, negative = self.config.positive_reward, self.config.negative_reward
         if self._is_goal_task:
-            observation = self._get_observation()
-            achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-            return float(self._goal_reward(achieved, desired))
-        return self.config.negative_reward if self.done else self.config.positive_reward
+            return self._reward_for_goals(self._get_observation())
+        if isinstance(self.done, bool):
+            return negative if self.done else positive
+        return np.where(self.done, negative, positive)
+
+    def _reward_for_goals(self, observation: Mapping[str, Any]) -> Any:
+        """Goals have environments first, as whoever calls ``compute_reward`` has them."""
+        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        if not isinstance(self.done, bool):
+            achieved, desired = np.moveaxis(achieved, -1, 0), np.moveaxis(desired, -1, 0)
+        return self._goal_reward(achieved, desired)
 
     def _get_observation(self) -> Any:
         """The observation, a new array (or dict of new arrays).
@@ -444,7 +486,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
                 f"action {self.action!r} makes {flat.size} values, "
                 f"expected {len(variables)}, one for each input ({names})"
             )
-        return flat if self._takes_one_real else fmu_spaces.to_input_types(variables, flat)
+        return flat if self._real_inputs else fmu_spaces.to_input_types(variables, flat)
 
     def _raise_for_inputs(self, why: str) -> None:
         pairs = zip(self.config.model_input_names, self.inputs, strict=True)

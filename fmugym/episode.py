@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.config import checked_value
 from fmugym.distributions import Uniform, draw, is_distribution
 from fmugym.model_description import Variable
-from fmugym.pool import FloatArray
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Episode", "EpisodePlan", "Sampler"]
 
@@ -42,6 +42,11 @@ class EpisodePlan:
         parameters: Constants (checked) or distributions by name, in the same order.
         episode_variables: Constants or distributions by name.
         overridden: The parameters that are told as drawn although they may be constants.
+
+    Attributes:
+        model_variables: As given.
+        constants: The parameters' values, 0 where they are drawn, shape (P,).
+        told: The overridden parameters and their values.
     """
 
     def __init__(
@@ -54,7 +59,11 @@ class EpisodePlan:
         self.model_variables = model_variables
         self._parameters = dict(parameters)
         self._variables = dict(episode_variables)
-        self._told = {name: parameters[name] for name in overridden}
+        self.constants = np.array(
+            [0.0 if is_distribution(value) else value for value in parameters.values()],
+            dtype=np.float64,
+        )
+        self.told = {name: parameters[name] for name in overridden}
         self._random_parameters = [
             (index, name, not _always_fits(value, model_variables[index]))
             for index, (name, value) in enumerate(parameters.items())
@@ -65,8 +74,37 @@ class EpisodePlan:
         distributions = [parameters[name] for name in names]
         distributions += [episode_variables[name] for name in self._random_variables]
         self._sampler = Sampler(distributions)
-        constants = [0.0 if is_distribution(value) else value for value in parameters.values()]
-        self._start_values = np.array(constants, dtype=np.float64).reshape(-1, 1)
+        limits = np.array(self._sampler.limits).reshape(-1, 2)
+        self._low, self._width = limits[:, :1], limits[:, 1:]
+        self._start_values = self.constants.reshape(-1, 1).copy()
+
+    @property
+    def drawn_names(self) -> list[str]:
+        """The names of what is drawn, in the order of the draws."""
+        return [name for _, name, _ in self._random_parameters] + self._random_variables
+
+    @property
+    def constant_parameters(self) -> dict[str, Any]:
+        """The parameters that are not drawn."""
+        drawn = set(self.drawn_names)
+        return {name: value for name, value in self._parameters.items() if name not in drawn}
+
+    @property
+    def constant_variables(self) -> dict[str, Any]:
+        """The episode variables that are not drawn."""
+        drawn = set(self.drawn_names)
+        return {name: value for name, value in self._variables.items() if name not in drawn}
+
+    @property
+    def num_uniform(self) -> int | None:
+        """The number of draws where all are uniform ones of Reals, None otherwise."""
+        if any(may_not_fit for *_, may_not_fit in self._random_parameters):
+            return None
+        return len(self._sampler.limits) if self._sampler.all_uniform else None
+
+    def scaled(self, fractions: FloatArray) -> FloatArray:
+        """Turn uniform numbers of [0, 1), shape (draws, M), into the drawn values."""
+        return self._low + self._width * fractions
 
     def draw(self, rng: np.random.Generator) -> Episode:
         """Draw one episode.
@@ -96,8 +134,8 @@ class EpisodePlan:
     def _episode(
         self, parameters: dict[str, Any], variables: dict[str, Any], drawn: dict[str, Any]
     ) -> Episode:
-        if self._told:
-            drawn = self._told | drawn
+        if self.told:
+            drawn = self.told | drawn
         return Episode(self._start_values, MappingProxyType(parameters), variables, drawn)
 
 
@@ -110,19 +148,23 @@ class Sampler:
 
     Successive uniform draws are made in one call, with the result of single ones:
     ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
+
+    Attributes:
+        limits: Lower end and width of the uniform distributions.
+        all_uniform: Whether there are no others.
     """
 
     def __init__(self, distributions: Sequence[Any]) -> None:
         self._distributions = list(distributions)
-        self._limits = [(d.low, d.high - d.low) for d in distributions if isinstance(d, Uniform)]
-        self._all_uniform = len(self._limits) == len(distributions)
+        self.limits = [(d.low, d.high - d.low) for d in distributions if isinstance(d, Uniform)]
+        self.all_uniform = len(self.limits) == len(distributions)
 
     def draw(self, rng: np.random.Generator) -> list[float]:
         """Draw one value from each distribution."""
-        if not self._all_uniform:
+        if not self.all_uniform:
             return [draw(distribution, rng) for distribution in self._distributions]
-        fractions = rng.random(len(self._limits)).tolist()
+        fractions = rng.random(len(self.limits)).tolist()
         return [
             low + width * fraction
-            for (low, width), fraction in zip(self._limits, fractions, strict=True)
+            for (low, width), fraction in zip(self.limits, fractions, strict=True)
         ]

@@ -7,6 +7,8 @@ from typing import Any, cast
 
 import gymnasium
 
+from fmugym.vector import vectorized
+
 __all__ = ["register"]
 
 
@@ -16,7 +18,7 @@ def register(
     max_episode_steps: int | None = None,
     **spec: Any,
 ) -> None:
-    """Register an environment, so that ``gymnasium.make(env_id)`` makes it.
+    """Register an environment for ``gymnasium.make`` and, natively, ``gymnasium.make_vec``.
 
     Args:
         env_id: ``[namespace/]Name-vN``, for example ``"me/Boiler-v0"``.
@@ -25,5 +27,9 @@ def register(
         spec: More fields of Gymnasium's ``EnvSpec``, for example ``reward_threshold``.
     """
     gymnasium.register(
-        env_id, entry_point=cast(Any, env), max_episode_steps=max_episode_steps, **spec
+        env_id,
+        entry_point=cast(Any, env),
+        vector_entry_point=cast(Any, spec.pop("vector_entry_point", None) or vectorized(env)),
+        max_episode_steps=max_episode_steps,
+        **spec,
     )

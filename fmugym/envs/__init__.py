@@ -8,6 +8,7 @@ from fmugym.envs.modelica_cart_pole import (
 )
 from fmugym.envs.pendulum import PendulumEnv
 from fmugym.registration import register
+from fmugym.vector import vectorized
 
 __all__ = [
     "CartPoleEnv",
@@ -17,6 +18,20 @@ __all__ = [
     "PendulumEnv",
 ]
 
-register("fmugym/CartPole-v0", "fmugym.envs:CartPoleEnv", 500, reward_threshold=475.0)
-register("fmugym/Pendulum-v0", "fmugym.envs:PendulumEnv", 200)
-register("fmugym/ModelicaCartPole-v0", "fmugym.envs:ModelicaCartPoleEnv", 200)
+# By name, so that the specs can be written as JSON.
+CartPoleVectorEnv = vectorized(CartPoleEnv)
+PendulumVectorEnv = vectorized(PendulumEnv)
+ModelicaCartPoleVectorEnv = vectorized(ModelicaCartPoleEnv)
+
+for name, steps, threshold in (
+    ("CartPole", 500, 475.0),
+    ("Pendulum", 200, None),
+    ("ModelicaCartPole", 200, None),
+):
+    register(
+        f"fmugym/{name}-v0",
+        f"fmugym.envs:{name}Env",
+        steps,
+        vector_entry_point=f"fmugym.envs:{name}VectorEnv",
+        reward_threshold=threshold,
+    )

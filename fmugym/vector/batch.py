@@ -1,0 +1,328 @@
+"""N environments whose hooks are evaluated once, on arrays."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym import spaces as fmu_spaces
+from fmugym.adapters import Status
+from fmugym.env import FMUEnv
+from fmugym.episode import EpisodePlan
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.vector.streams import EpisodeStreams
+from fmugym.vector.views import batched, envs_first
+
+__all__ = ["BatchEngine", "StepResult"]
+
+IndexArray = npt.NDArray[np.intp]
+
+
+class StepResult(NamedTuple):
+    """What a step of N environments gives; all arrays are new ones."""
+
+    observations: Any
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    infos: dict[str, Any]
+
+
+class BatchEngine:
+    """Turns a prototype into N environments: what its hooks read holds arrays from now on.
+
+    Args:
+        env: The prototype, made with a pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+    """
+
+    def __init__(self, env: FMUEnv, num_envs: int, max_episode_steps: int | None) -> None:
+        self.env = env
+        self._n = num_envs
+        self._pool = env._open_pool("a vector environment")
+        self._streams = EpisodeStreams(num_envs, env._plan)
+        self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
+        self._longest = 0
+        self._pool_observes = _pool_observes(env)
+        batched(env, num_envs)
+        env._values, env.inputs = self._pool.outputs, self._pool.inputs
+        env.state = self._pool.outputs[: env._output_count]
+        env._was_reset = True  # for the views of single environments
+        self._make_parameters(env._plan)
+
+    def _make_parameters(self, plan: EpisodePlan) -> None:
+        self.given: dict[str, npt.NDArray[Any]] = {}
+        self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
+        names = [variable.name for variable in plan.model_variables]
+        self._parameters = dict(zip(names, self._start_values, strict=True))
+        self._overridden = False
+        self.env.parameters = MappingProxyType(self._parameters)
+
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """Give a parameter one value for each environment, from its next episode on."""
+        self.given[name] = values
+
+    # Episodes.
+
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes; the observations are those of all environments."""
+        indices = np.flatnonzero(mask)
+        self._streams.seed(seeds, indices)
+        drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
+        self.env._in_hooks = True
+        try:
+            return self._observe(None), self._infos(mask) | _masked(drawn, mask)
+        finally:
+            self.env._in_hooks = False
+
+    def _begin(
+        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
+    ) -> dict[str, FloatArray]:
+        """Draw and start episodes; returns what is to be told of the draws."""
+        env = self.env
+        values = self._draw(indices, plan)
+        _, statuses = self._pool.reset(plan.model_variables, values, mask)
+        if np.count_nonzero(statuses):
+            self._require_started(indices, statuses)
+        env.step_count[indices] = 0
+        env.action[..., indices] = 0
+        env.previous_action[..., indices] = 0
+        told = [*plan.told, *plan.drawn_names, *self.given]
+        return {name: self._row(name).copy() for name in told}
+
+    def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
+        for index in indices.tolist():
+            if statuses[index] > Status.WARNING:
+                raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+
+    def _draw(self, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
+        """Draw episodes into the rows of the parameters and variables.
+
+        Returns:
+            The parameters in the order of the plan, shape (P, N).
+        """
+        default = plan is self.env._plan
+        uniform = plan.num_uniform is not None and plan.num_uniform == self._streams.num_draws
+        if uniform:
+            drawn = plan.scaled(self._streams.fractions(indices))
+            self._place(plan.drawn_names, drawn, indices)
+        if not uniform:
+            self._place_each(indices, plan)
+        if not default or self._overridden:
+            constants = plan.constant_parameters
+            self._place(constants, constants.values(), indices)
+            self._overridden = True
+        self._place(plan.constant_variables, plan.constant_variables.values(), indices)
+        self._place(self.given, (given[indices] for given in self.given.values()), indices)
+        if default:
+            return self._start_values
+        return np.stack([self._parameters[variable.name] for variable in plan.model_variables])
+
+    def _place_each(self, indices: IndexArray, plan: EpisodePlan) -> None:
+        episodes = [plan.draw(self._streams.generator(index)) for index in indices.tolist()]
+        for name in plan.drawn_names:
+            values = [{**e.parameters, **e.variables}[name] for e in episodes]
+            self._place([name], [values], indices)
+
+    def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
+        for name, value in zip(names, values, strict=True):
+            self._row(name)[indices] = value
+
+    def _row(self, name: str) -> FloatArray:
+        """The values of a parameter or an episode variable, one for each environment."""
+        variables = self.env.variables
+        if name in variables:
+            if np.shape(variables[name]) != (self._n,) or not variables[name].flags.writeable:
+                variables[name] = np.array(np.broadcast_to(variables[name], self._n))
+            row: FloatArray = variables[name]
+            return row
+        return self._parameters.setdefault(name, np.full(self._n, np.nan))
+
+    # Steps.
+
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """Step all environments, but start episodes of those in the mask instead."""
+        env, pool = self.env, self._pool
+        env.previous_action, env.action = env.action, self._checked(actions)
+        np.copyto(env.previous_state, env.state)
+        env._in_hooks = True
+        try:
+            self._write_inputs(env._get_inputs())
+            drawn: dict[str, FloatArray] = {}
+            if resetting is not None:
+                drawn = self._begin(resetting, np.flatnonzero(resetting), env._plan)
+            observed = self._new_observations()
+            pool.step(None, resetting, observed)
+            env.step_count += 1
+            if resetting is None:
+                return self._evaluate(observed, None)
+            env.step_count[resetting] = 0
+            result = self._evaluate(observed, resetting)
+            result.infos.update(_masked(drawn, resetting))
+            return result
+        finally:
+            env._in_hooks = False
+
+    def _checked(self, actions: Any) -> npt.NDArray[Any]:
+        """Copy the actions, environments last as hooks want them."""
+        space: Any = self.env.action_space
+        try:
+            array = np.array(actions, dtype=space.dtype if space.dtype.kind == "f" else None)
+        except (TypeError, ValueError):
+            raise ConfigError(f"the actions do not make an array: {actions!r}") from None
+        if array.shape != (self._n, *space.shape):
+            raise ConfigError(
+                f"the actions have shape {array.shape}, expected {(self._n, *space.shape)}"
+            )
+        if space.dtype.kind != "f":
+            self._check_elements(space, array)
+        return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
+
+    def _check_elements(self, space: Any, array: npt.NDArray[Any]) -> None:
+        if array.dtype.kind not in "iub":
+            raise ConfigError(f"the actions are of type {array.dtype}, expected integers")
+        if isinstance(space, spaces.Discrete):
+            low, high = int(space.start), int(space.start + space.n - 1)
+            if array.min() < low or array.max() > high:
+                index = int(np.flatnonzero((array < low) | (array > high))[0])
+                raise ConfigError(f"action {array[index]} of environment {index} is not in {space}")
+
+    def _write_inputs(self, values: Any) -> None:
+        inputs = self._pool.inputs
+        if len(inputs) == 1 and not isinstance(values, list | tuple) and np.ndim(values) < 2:
+            values = [values]
+        if len(values) != len(inputs):
+            raise ConfigError(f"_get_inputs returned {len(values)} values, expected {len(inputs)}")
+        for row, value in zip(inputs, values, strict=True):
+            row[:] = value
+        if not self.env._real_inputs:
+            for index in range(self._n):
+                inputs[:, index] = fmu_spaces.to_input_types(
+                    self.env._interface.inputs, inputs[:, index]
+                )
+        if self.env.action.dtype.kind == "f" and not np.isfinite(inputs).all():
+            index = int(np.flatnonzero(~np.isfinite(inputs).all(axis=0))[0])
+            raise ConfigError(f"an input of environment {index} is not finite: {inputs[:, index]}")
+
+    def _new_observations(self) -> npt.NDArray[np.float32] | None:
+        if not self._pool_observes:
+            return None
+        return np.empty((self._n, self.env._output_count), np.float32)
+
+    def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
+        env = self.env
+        if env._has_update:
+            self._update(resetting)
+        terminated = self._flags("_is_done", env._is_done())
+        statuses = self._pool.statuses
+        has_faults = bool(np.count_nonzero(statuses))
+        if has_faults:
+            terminated |= statuses == Status.TERMINATED
+        env.done = terminated
+        truncated = self._reached_limit()
+        if env._has_truncation:
+            truncated |= self._flags("_is_truncated", env._is_truncated())
+        rewards = self._rewards(env._reward_policy())
+        if resetting is not None:
+            terminated[resetting] = truncated[resetting] = False
+            rewards[resetting] = 0.0
+        infos = self._infos(np.ones(self._n, np.bool_)) if env._has_info else {}
+        result = StepResult(self._observe(observed), rewards, terminated, truncated, infos)
+        if has_faults:
+            self._take_faults(result, statuses)
+        return result
+
+    def _update(self, resetting: MaskArray | None) -> None:
+        env = self.env
+        if resetting is None:
+            env._update()
+            return
+        before = {name: self._row(name).copy() for name in env.variables}
+        env._update()
+        for name, values in before.items():
+            self._row(name)[resetting] = values[resetting]
+
+    def _flags(self, hook: str, values: Any) -> MaskArray:
+        if values is None:
+            raise ConfigError(f"{hook} returned None, expected True or False")
+        flags = np.empty(self._n, np.bool_)
+        flags[:] = values
+        return flags
+
+    def _rewards(self, values: Any) -> FloatArray:
+        if values is None:
+            raise ConfigError("_reward_policy returned None, expected a number")
+        rewards = np.empty(self._n)
+        rewards[:] = values
+        return rewards
+
+    def _reached_limit(self) -> MaskArray:
+        """Compare only when the longest episode may have got there."""
+        self._longest += 1
+        if self._longest < self._limit:
+            return np.zeros(self._n, np.bool_)
+        self._longest = int(self.env.step_count.max())
+        reached: MaskArray = self.env.step_count >= self._limit
+        return reached
+
+    def _observe(self, observed: Any) -> Any:
+        if observed is not None:
+            return observed
+        return envs_first(self.env._get_observation())
+
+    def _infos(self, mask: MaskArray) -> dict[str, Any]:
+        if not self.env._has_info:
+            return {}
+        values = {name: self._info_array(value) for name, value in self.env._get_info().items()}
+        return values | {f"_{name}": mask.copy() for name in values}
+
+    def _info_array(self, value: Any) -> Any:
+        if np.ndim(value) == 0:
+            return np.full(self._n, value)
+        return envs_first(value)
+
+    def _take_faults(self, result: StepResult, statuses: StatusArray) -> None:
+        env, config = self.env, self.env.config
+        stopped = statuses == Status.TERMINATED
+        if stopped.any():
+            result.infos["fmu_terminated"] = result.infos["_fmu_terminated"] = stopped
+        failed = (statuses > Status.WARNING) & ~stopped
+        indices = np.flatnonzero(failed).tolist()
+        if not indices:
+            return
+        reasons = {index: self._pool.failure(index) for index in indices}
+        if config.on_fault == "raise":
+            raise SimulationError(f"environment {indices[0]}: {reasons[indices[0]]}")
+        for index, reason in reasons.items():
+            env.logger.warning("environment %d: %s", index, reason)
+        texts = np.full(self._n, None, dtype=object)
+        texts[indices] = list(reasons.values())
+        result.infos.update({"fault": texts, "_fault": failed})
+        result.rewards[failed] = config.fault_reward
+        result.terminated[failed] = config.on_fault == "terminate"
+        result.truncated[failed] = config.on_fault == "truncate"
+
+
+def _pool_observes(env: FMUEnv) -> bool:
+    """Whether the default observation is what the pool writes in the same pass."""
+    default = type(env)._get_observation is FMUEnv._get_observation
+    space = env.observation_space
+    return default and isinstance(space, spaces.Box) and space.dtype == np.float32
+
+
+def _masked(drawn: dict[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
+    """The info of a reset in the form of Gymnasium's vector environments."""
+    values: dict[str, Any] = {}
+    for name, value in drawn.items():
+        values[name], values[f"_{name}"] = value, mask.copy()
+    return {"drawn": values, "_drawn": mask.copy()}

@@ -1,0 +1,183 @@
+"""N environments whose hooks are evaluated one environment after another."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.model_description import Variable
+from fmugym.pool import Pool
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.values import EpisodeVariables
+from fmugym.vector.batch import StepResult
+from fmugym.vector.views import light_copy
+
+__all__ = ["PerEnvEngine"]
+
+AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
+
+
+class PerEnvEngine:
+    """Calls ``step`` and ``reset`` of light copies of a prototype, which share its pool.
+
+    Args:
+        env: The prototype, made with a pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+        action_space: The space of the actions of all environments.
+        add_info: Merges the info of one environment into that of all.
+    """
+
+    def __init__(
+        self,
+        env: FMUEnv,
+        num_envs: int,
+        max_episode_steps: int | None,
+        action_space: Any,
+        add_info: AddInfo,
+    ) -> None:
+        pool = env._open_pool("a vector environment")
+        self.envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
+        self._limit = max_episode_steps
+        self._action_space = action_space
+        self._add_info = add_info
+        self._space = env.observation_space
+        self._observations: list[Any] = [None] * num_envs
+
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """Give a parameter one value for each environment, from its next episode on."""
+        for env, value in zip(self.envs, values.tolist(), strict=True):
+            env._plan = env._plan_episode({name: value})
+
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``BatchEngine.reset``."""
+        infos: dict[str, Any] = {}
+        for index in np.flatnonzero(mask).tolist():
+            observation, info = self.envs[index].reset(seed=seeds[index], options=dict(options))
+            self._observations[index] = observation
+            infos = self._add_info(infos, info, index)
+        return self._stacked(), infos
+
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """See ``BatchEngine.step``."""
+        count = len(self.envs)
+        rewards = np.zeros(count)
+        terminated, truncated = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+        infos: dict[str, Any] = {}
+        for index, action in enumerate(self._actions(actions)):
+            if resetting is not None and resetting[index]:
+                self._observations[index], info = self.envs[index].reset()
+            else:
+                result = self.envs[index].step(action)
+                self._observations[index], rewards[index], terminated[index] = result[:3]
+                truncated[index] = result[3] or self._reached_limit(self.envs[index])
+                info = result[4]
+            infos = self._add_info(infos, info, index)
+        return StepResult(self._stacked(), rewards, terminated, truncated, infos)
+
+    def _actions(self, actions: Any) -> list[Any]:
+        items = list(iterate(self._action_space, actions))
+        if len(items) != len(self.envs):
+            raise ConfigError(f"there are {len(items)} actions, expected {len(self.envs)}")
+        return items
+
+    def _reached_limit(self, env: FMUEnv) -> bool:
+        return self._limit is not None and env.step_count >= self._limit
+
+    def _stacked(self) -> Any:
+        empty: Any = create_empty_array(self._space, n=len(self.envs), fn=np.zeros)
+        return concatenate(self._space, self._observations, empty)
+
+
+def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
+    """Share what is costly, and copy whatever else the subclass has put into its attributes."""
+    single = light_copy(env)
+    shared = {id(value): value for value in _shared(env)}
+    for name, value in env.__dict__.items():
+        if name not in {"out", "_pool"} and not callable(value):
+            single.__dict__[name] = _copied(value, dict(shared))
+    single.variables = EpisodeVariables(env.config.episode_variables)
+    single._pool = _Column(pool, index)
+    single._input_row = single._pool.inputs[:, 0]
+    single._output_row = single._pool.outputs[:, 0]
+    single._np_random = None
+    return single
+
+
+def _shared(env: FMUEnv) -> tuple[Any, ...]:
+    return (env.fmu, env.config, env._interface, env._spec, env._plan, env.logger, env.spec)
+
+
+def _copied(value: Any, memo: dict[int, Any]) -> Any:
+    try:
+        return copy.deepcopy(value, memo)
+    except Exception:  # an attribute of the user's that cannot be copied is shared
+        return value
+
+
+class _Column:
+    """One instance of a pool, in the form of a pool of one."""
+
+    num_instances = 1
+
+    def __init__(self, pool: Pool, index: int) -> None:
+        self._pool, self._index = pool, index
+        self.inputs: FloatArray = pool.inputs[:, index : index + 1]
+        self.outputs: FloatArray = pool.outputs[:, index : index + 1]
+        self.statuses: StatusArray = pool.statuses[index : index + 1]
+
+    def _mask(self, value: bool) -> MaskArray:
+        mask = np.full(self._pool.num_instances, not value)
+        mask[self._index] = value
+        return mask
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``."""
+        all_values = np.repeat(values, self._pool.num_instances, axis=1)
+        self._pool.reset(variables, all_values, self._mask(True))
+        return self.outputs, self.statuses
+
+    def step(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.step``."""
+        if inputs is not None:
+            self.inputs[:] = inputs
+        self._pool.step(None, self._mask(False))
+        return self.outputs, self.statuses
+
+    def save(self) -> Any:
+        """See ``Pool.save``."""
+        return self._pool.save()
+
+    def restore(
+        self, snapshot: Any, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.restore``."""
+        self._pool.restore(snapshot, self._mask(True))
+        return self.outputs, self.statuses
+
+    def failure(self, index: int) -> str:
+        """See ``Pool.failure``."""
+        return self._pool.failure(self._index)
+
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
+        """See ``Pool.read``."""
+        return self._pool.read(variables)[:, self._index : self._index + 1]
+
+    def close(self) -> None:
+        """The pool is the vector environment's to close."""

@@ -1,0 +1,79 @@
+"""The random streams of N environments, each that of a single environment of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.utils import seeding
+
+from fmugym.episode import EpisodePlan
+from fmugym.pool.base import FloatArray
+
+__all__ = ["EpisodeStreams"]
+
+_BLOCK_BYTES = 16 * 2**20
+"""Memory for values drawn ahead, at most."""
+
+_LONGEST_BLOCK = 32
+"""Episodes drawn ahead for one environment, at most."""
+
+
+class EpisodeStreams:
+    """Draws the episodes of N environments from N generators.
+
+    Environment i started with seed s draws what a single environment with seed s + i draws,
+    episode after episode. Where all distributions are uniform, which takes one number of the
+    stream each, several episodes are drawn ahead in one call; the stream is taken back where
+    something else is to be drawn from it.
+
+    Args:
+        num_envs: N.
+        plan: The draws of an episode, without overrides.
+    """
+
+    def __init__(self, num_envs: int, plan: EpisodePlan) -> None:
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self.num_draws = plan.num_uniform
+        self._draws = plan.num_uniform or 0
+        row = 8 * num_envs * max(self._draws, 1)
+        self._length = max(1, min(_LONGEST_BLOCK, _BLOCK_BYTES // row))
+        self._block = np.empty((num_envs, self._length, self._draws))
+        self._used = np.full(num_envs, self._length)
+
+    def generator(self, index: int) -> np.random.Generator:
+        """The generator of one environment, at the place that the episodes have reached."""
+        generator = self._generators[index]
+        if generator is None:
+            generator, _ = seeding.np_random()
+            self._generators[index] = generator
+        ahead = int(self._length - self._used[index]) * self._draws
+        if ahead:
+            bits: Any = generator.bit_generator
+            bits.advance(-ahead)
+            self._used[index] = self._length
+        return generator
+
+    def seed(self, seeds: Sequence[int | None], indices: npt.NDArray[np.intp]) -> None:
+        """Seed some of the environments anew; None leaves a stream as it is."""
+        for index in indices.tolist():
+            if seeds[index] is not None:
+                self._generators[index], _ = seeding.np_random(seeds[index])
+                self._used[index] = self._length
+
+    def fractions(self, indices: npt.NDArray[np.intp]) -> FloatArray:
+        """Draw the uniform numbers of one episode for some environments, shape (draws, M)."""
+        used = self._used[indices]
+        if used.max() == self._length:
+            self._refill(indices[used == self._length])
+            used = self._used[indices]
+        self._used[indices] = used + 1
+        fractions: FloatArray = self._block[indices, used].T
+        return fractions
+
+    def _refill(self, indices: npt.NDArray[np.intp]) -> None:
+        for index in indices.tolist():
+            self.generator(index).random(out=self._block[index])
+            self._used[index] = 0

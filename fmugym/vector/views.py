@@ -1,0 +1,79 @@
+"""Two views of a prototype: as N environments at once, and as one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.values import EpisodeVariables, NamedValues
+
+__all__ = ["batched", "column", "envs_first", "light_copy", "take"]
+
+
+def light_copy(env: FMUEnv) -> FMUEnv:
+    """Copy an environment without loading the FMU again: all attributes are shared."""
+    copied = type(env).__new__(type(env))
+    copied.__dict__.update(env.__dict__)
+    copied.out = NamedValues("output", list(env.out), lambda: copied._values)
+    return copied
+
+
+def batched(env: FMUEnv, count: int) -> None:
+    """Let what hooks read of an environment be arrays of a batch, all zero."""
+    outputs = np.zeros((len(env.out), count))
+    env._values = outputs
+    env.state = outputs[: env._output_count]
+    env.previous_state = np.zeros((env._output_count, count))
+    env.inputs = np.zeros((len(env._start_inputs), count))
+    space: Any = env.action_space
+    env.action = np.zeros((*space.shape, count), space.dtype)
+    env.previous_action = env.action.copy()
+    env.step_count = np.zeros(count, np.int64)
+    env.done = np.zeros(count, np.bool_)
+    env.after_end = np.zeros(count, np.bool_)
+    env.variables = EpisodeVariables(env.config.episode_variables)
+    for name in env.variables:
+        env.variables[name] = np.zeros(count)
+
+
+def column(env: FMUEnv, index: int) -> FMUEnv:
+    """Environment number ``index`` of a batch as a single one, for calling its hooks only."""
+    single = light_copy(env)
+    single._values = tuple(env._values[:, index].tolist())
+    single.state = single._values[: env._output_count]
+    single.previous_state = tuple(env.previous_state[:, index].tolist())
+    single.inputs = tuple(env.inputs[:, index].tolist())
+    single.action = take(env.action, index)
+    single.previous_action = take(env.previous_action, index)
+    single.step_count = int(env.step_count[index])
+    single.done, single.after_end = bool(env.done[index]), bool(env.after_end[index])
+    parameters = {name: take(value, index) for name, value in env.parameters.items()}
+    single.parameters = MappingProxyType(parameters)
+    single.variables = EpisodeVariables(env.variables)
+    for name, value in env.variables.items():
+        single.variables[name] = take(value, index)
+    for name, value in env._per_env_attributes.items():
+        setattr(single, name, take(value, index))
+    return single
+
+
+def take(values: Any, index: int) -> Any:
+    """One environment's part of an array whose last axis is that of the environments."""
+    part = np.asarray(values)[..., index]
+    return part.item() if part.ndim == 0 and part.dtype.kind == "f" else part[()]
+
+
+def envs_first(values: Any) -> Any:
+    """Turn arrays (or dicts of them) of a batch, envs last, into new ones with envs first."""
+    if isinstance(values, Mapping):
+        return {name: envs_first(value) for name, value in values.items()}
+    return _moved(np.asarray(values))
+
+
+def _moved(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.array(np.moveaxis(values, -1, 0), order="C")
