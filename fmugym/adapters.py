@@ -112,6 +112,8 @@ class Access:
         worst = 0
         for indices, buffer, (get, _, arguments) in self._groups:
             worst = max(worst, _sane(get(*arguments)))
+            if worst > Status.WARNING:
+                break
             if buffer is not self.values:
                 self.values[indices] = buffer
         return worst
@@ -123,6 +125,8 @@ class Access:
             if buffer is not self.values:
                 np.copyto(buffer, self.values[indices], casting="unsafe")
             worst = max(worst, _sane(set_(*arguments)))
+            if worst > Status.WARNING:
+                break
         return worst
 
 
@@ -332,7 +336,12 @@ class Instance(ABC):
             SimulationError: If the FMU fails.
         """
         self._require(Phase.INSTANTIATED, "initialize")
-        self._initialize(start_time, stop_time, tolerance, set_start_values)
+        try:
+            self._initialize(start_time, stop_time, tolerance, set_start_values)
+        except BaseException:  # half-way: whatever the status, only a reset is legal now
+            if self.phase is Phase.INSTANTIATED:
+                self.phase = Phase.FAILED
+            raise
         self.phase = Phase.STEPPING
 
     def reset(self) -> None:
@@ -364,7 +373,8 @@ class Instance(ABC):
 
     def discard(self) -> None:
         """Free the instance now instead of with its library."""
-        self._native.instances.remove(self)
+        if self in self._native.instances:
+            self._native.instances.remove(self)
         self.free()
 
     def check(self, doing: str, status: int) -> None:

@@ -141,7 +141,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._require_fmi_version()
         self._interface = self.config.resolve(self.fmu.description)
         self._spec = self._interface.pool_spec()
-        self._warn_of_small_steps()
+        self._warn_of_peculiarities()
         self._prepare_values()
         self._prepare_spaces()
         num_instances, pool_options = _pool_request.get()
@@ -162,7 +162,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
                 f"derive from FMI{found}CSEnv instead"
             )
 
-    def _warn_of_small_steps(self) -> None:
+    def _warn_of_peculiarities(self) -> None:
         internal = self.fmu.description.fixed_internal_step_size
         if internal is not None and self._spec.communication_step_size < 0.999999 * internal:
             self.logger.warning(
@@ -172,6 +172,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
                 internal,
                 self.fmu.path.name,
             )
+        if self.fmu.description.capabilities.needs_execution_tool:
+            self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
 
     def _prepare_values(self) -> None:
         interface, config = self._interface, self.config
@@ -212,7 +214,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         interface, cls = self._interface, type(self)
         derived = cls._get_action_space is FMUEnv._get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
-        self._action_values = None if values is None else np.array(values, np.float64)
+        self._action_values = values
         if cls._get_observation is FMUEnv._get_observation:
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
         self._no_action = _no_action(self.action_space)
@@ -233,9 +235,12 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             One number for each input. By default the action's own elements; for a ``Discrete``
             made from an Enumeration or Integer, the value that the element stands for.
         """
-        if self._action_values is None:
+        values = self._action_values
+        if values is None:
             return self.action
-        return self._action_values[self.action]
+        if isinstance(values, range):  # of an Integer; it may be a wide one
+            return values[0] + self.action
+        return np.array(values)[self.action]
 
     def _update(self) -> None:
         """Advance what the task itself integrates or filters; called once after each FMU step."""
@@ -357,6 +362,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
         if not options:
             return self._plan
+        if not isinstance(options, Mapping):
+            raise ConfigError(f"the options of reset must be a dict, got {options!r}")
         for name in options:
             if name not in self.reset_options:
                 raise unknown_name("reset option", name, self.reset_options)
@@ -397,7 +404,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
         self._in_hooks = True
         try:
-            return self._get_observation(), self._get_info()
+            observation = _given(self._get_observation(), "_get_observation")
+            return observation, _given(self._get_info(), "_get_info")
         finally:
             self._in_hooks = False
 
@@ -464,21 +472,24 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
 
     def _write_inputs(self, values: Any) -> None:
         if self._takes_one_real and isinstance(values, float):
-            self.inputs = (float(values),)
-            self._input_row[0] = values
+            inputs: tuple[float, ...] = (float(values),)
         else:
-            flat = self._flat_inputs(values)
-            self.inputs = tuple(flat.tolist())
-            self._input_row[:] = flat
-        for value in self.inputs:
+            inputs = tuple(self._flat_inputs(values).tolist())
+        for value in inputs:
             if value - value != 0.0:
-                self._raise_for_inputs("every input must be finite")
+                self._raise_for_inputs(inputs, "every input must be finite")
+        self._input_row[:] = inputs
+        self.inputs = inputs
 
     def _flat_inputs(self, values: Any) -> npt.NDArray[np.float64]:
+        if values is None:
+            raise ConfigError("_get_inputs returned None, expected a number for each input")
         try:
-            flat = np.asarray(values, dtype=np.float64).ravel()
-        except (TypeError, ValueError):
+            raw = np.asarray(values)
+            flat = raw.astype(np.float64, casting="unsafe" if raw.dtype == object else "same_kind")
+        except (TypeError, ValueError, OverflowError):
             raise ConfigError(f"action {self.action!r} does not make numbers") from None
+        flat = flat.ravel()
         variables = self._interface.inputs
         if flat.size != len(variables):
             names = ", ".join(variable.name for variable in variables)
@@ -488,8 +499,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             )
         return flat if self._real_inputs else fmu_spaces.to_input_types(variables, flat)
 
-    def _raise_for_inputs(self, why: str) -> None:
-        pairs = zip(self.config.model_input_names, self.inputs, strict=True)
+    def _raise_for_inputs(self, inputs: tuple[float, ...], why: str) -> None:
+        pairs = zip(self.config.model_input_names, inputs, strict=True)
         listing = ", ".join(f"{name} = {value}" for name, value in pairs)
         raise ConfigError(f"action {self.action!r} makes {listing}; {why}")
 
@@ -503,18 +514,14 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._set_values()
         if self._has_update:
             self._update()
-        done = self._is_done()
-        if done is None:
-            raise ConfigError("_is_done returned None, expected True or False")
+        done = _given(self._is_done(), "_is_done")
         self.done = terminated = stopped or bool(done)
         truncated = self.step_count >= self._step_limit
         if self._has_truncation and not truncated:
-            truncated = bool(self._is_truncated())
-        reward = self._reward_policy()
-        if reward is None:
-            raise ConfigError("_reward_policy returned None, expected a number")
-        observation = self._get_observation()
-        info = self._get_info() if self._has_info else {}
+            truncated = bool(_given(self._is_truncated(), "_is_truncated"))
+        reward = _given(self._reward_policy(), "_reward_policy")
+        observation = _given(self._get_observation(), "_get_observation")
+        info = _given(self._get_info(), "_get_info") if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
         if terminated or truncated:
@@ -623,6 +630,12 @@ class FMI3CSEnv(FMUEnv):
     """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 3
+
+
+def _given(value: Any, hook: str) -> Any:
+    if value is None:
+        raise ConfigError(f"{hook} returned None; is its return statement missing?")
+    return value
 
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:

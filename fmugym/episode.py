@@ -79,6 +79,16 @@ class EpisodePlan:
         self._start_values = self.constants.reshape(-1, 1).copy()
 
     @property
+    def parameter_names(self) -> list[str]:
+        """The names of the parameters, in the order of ``constants``."""
+        return list(self._parameters)
+
+    @property
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lower ends and widths of the uniform distributions, each of shape (draws,)."""
+        return self._low[:, 0].copy(), self._width[:, 0].copy()
+
+    @property
     def drawn_names(self) -> list[str]:
         """The names of what is drawn, in the order of the draws."""
         return [name for _, name, _ in self._random_parameters] + self._random_variables

@@ -120,7 +120,7 @@ class CartPoleEnv(FMUEnv):
     def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
         parameters = dict(super()._get_episode_parameters(options))
         if "low" in options or "high" in options:
-            start = Uniform(float(options.get("low", -0.05)), float(options.get("high", 0.05)))
+            start = Uniform(options.get("low", -0.05), options.get("high", 0.05))
             parameters |= dict.fromkeys(START_VALUES, start)
         return parameters
 

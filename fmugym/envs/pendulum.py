@@ -113,7 +113,7 @@ class PendulumEnv(FMUEnv):
         parameters = dict(super()._get_episode_parameters(options))
         for option, name in (("x_init", "theta_0"), ("y_init", "theta_dot_0")):
             if option in options:
-                limit = float(options[option])
+                limit = Uniform(0.0, options[option]).high  # which checks it
                 parameters[name] = Uniform(-limit, limit)
         return parameters
 

@@ -102,7 +102,7 @@ class Pool(Protocol):
         """Do one step with the instances.
 
         Args:
-            inputs: Shape (k_in, N), finite; None for what was written to ``self.inputs``.
+            inputs: Shape (k_in, N), finite, copied to ``self.inputs``; None for what is there.
             skip: Which instances not to step, shape (N,); their outputs and statuses stay.
             observations: Filled with the first ``num_observed`` outputs of all instances, shape
                 (N, num_observed), C-contiguous.

@@ -162,8 +162,11 @@ class _Slot:
     def _restored(self, key: tuple[tuple[Variable, ...], bytes]) -> bool:
         if self._saved is None or key != self._start_key or self._instance.phase is Phase.DEAD:
             return False
-        self._instance.restore_state(self._saved)
-        return True
+        try:
+            self._instance.restore_state(self._saved)
+        except SimulationError:  # a reset and an initialization may still do
+            self._saved = None
+        return self._saved is not None
 
     def _keep_state(self, key: tuple[tuple[Variable, ...], bytes]) -> None:
         again = key == self._start_key

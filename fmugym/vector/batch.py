@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, envs_first
 
-__all__ = ["BatchEngine", "StepResult"]
+__all__ = ["BatchEngine", "Engine", "StepResult"]
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -35,7 +36,44 @@ class StepResult(NamedTuple):
     infos: dict[str, Any]
 
 
-class BatchEngine:
+class Engine(ABC):
+    """What drives N environments, without the question of when an ended one starts again.
+
+    Attributes:
+        ended: Whether the last step ended the episode, shape (N,); always the same array.
+        any_ended: Whether it did so for any.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self.ended = np.zeros(num_envs, np.bool_)
+        self.any_ended = False
+
+    def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
+        """Keep which episodes a step has ended."""
+        np.logical_or(terminated, truncated, out=self.ended)
+        self.any_ended = bool(np.count_nonzero(self.ended))
+
+    def note_starts(self, mask: MaskArray) -> None:
+        """Keep which episodes have been started again."""
+        self.ended[mask] = False
+        self.any_ended = bool(np.count_nonzero(self.ended))
+
+    @abstractmethod
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes of those in the mask; the observations are those of all."""
+
+    @abstractmethod
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """Step all environments, but start episodes of those in the mask instead."""
+
+    @abstractmethod
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """Give a parameter one value for each environment, from its next episode on."""
+
+
+class BatchEngine(Engine):
     """Turns a prototype into N environments: what its hooks read holds arrays from now on.
 
     Args:
@@ -45,6 +83,7 @@ class BatchEngine:
     """
 
     def __init__(self, env: FMUEnv, num_envs: int, max_episode_steps: int | None) -> None:
+        super().__init__(num_envs)
         self.env = env
         self._n = num_envs
         self._pool = env._open_pool("a vector environment")
@@ -67,7 +106,7 @@ class BatchEngine:
         self.env.parameters = MappingProxyType(self._parameters)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
-        """Give a parameter one value for each environment, from its next episode on."""
+        """See ``Engine.set_parameter``."""
         self.given[name] = values
 
     # Episodes.
@@ -75,7 +114,7 @@ class BatchEngine:
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; the observations are those of all environments."""
+        """See ``Engine.reset``."""
         indices = np.flatnonzero(mask)
         self._streams.seed(seeds, indices)
         drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
@@ -84,6 +123,7 @@ class BatchEngine:
             return self._observe(None), self._infos(mask) | _masked(drawn, mask)
         finally:
             self.env._in_hooks = False
+            self.note_starts(mask)
 
     def _begin(
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
@@ -151,7 +191,7 @@ class BatchEngine:
     # Steps.
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
-        """Step all environments, but start episodes of those in the mask instead."""
+        """See ``Engine.step``."""
         env, pool = self.env, self._pool
         env.previous_action, env.action = env.action, self._checked(actions)
         np.copyto(env.previous_state, env.state)
@@ -227,7 +267,7 @@ class BatchEngine:
         statuses = self._pool.statuses
         has_faults = bool(np.count_nonzero(statuses))
         if has_faults:
-            terminated |= statuses == Status.TERMINATED
+            terminated |= self._stopped(statuses)
         env.done = terminated
         truncated = self._reached_limit()
         if env._has_truncation:
@@ -240,6 +280,7 @@ class BatchEngine:
         result = StepResult(self._observe(observed), rewards, terminated, truncated, infos)
         if has_faults:
             self._take_faults(result, statuses)
+        self.note_ends(terminated, truncated)
         return result
 
     def _update(self, resetting: MaskArray | None) -> None:
@@ -291,9 +332,13 @@ class BatchEngine:
             return np.full(self._n, value)
         return envs_first(value)
 
+    def _stopped(self, statuses: StatusArray) -> MaskArray:
+        stopped: MaskArray = statuses == Status.TERMINATED
+        return stopped
+
     def _take_faults(self, result: StepResult, statuses: StatusArray) -> None:
         env, config = self.env, self.env.config
-        stopped = statuses == Status.TERMINATED
+        stopped = self._stopped(statuses)
         if stopped.any():
             result.infos["fmu_terminated"] = result.infos["_fmu_terminated"] = stopped
         failed = (statuses > Status.WARNING) & ~stopped

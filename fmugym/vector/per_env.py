@@ -16,7 +16,7 @@ from fmugym.model_description import Variable
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.values import EpisodeVariables
-from fmugym.vector.batch import StepResult
+from fmugym.vector.batch import Engine, StepResult
 from fmugym.vector.views import light_copy
 
 __all__ = ["PerEnvEngine"]
@@ -24,7 +24,7 @@ __all__ = ["PerEnvEngine"]
 AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
 
 
-class PerEnvEngine:
+class PerEnvEngine(Engine):
     """Calls ``step`` and ``reset`` of light copies of a prototype, which share its pool.
 
     Args:
@@ -43,6 +43,7 @@ class PerEnvEngine:
         action_space: Any,
         add_info: AddInfo,
     ) -> None:
+        super().__init__(num_envs)
         pool = env._open_pool("a vector environment")
         self.envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
         self._limit = max_episode_steps
@@ -52,23 +53,24 @@ class PerEnvEngine:
         self._observations: list[Any] = [None] * num_envs
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
-        """Give a parameter one value for each environment, from its next episode on."""
+        """See ``Engine.set_parameter``."""
         for env, value in zip(self.envs, values.tolist(), strict=True):
             env._plan = env._plan_episode({name: value})
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        """See ``BatchEngine.reset``."""
+        """See ``Engine.reset``."""
         infos: dict[str, Any] = {}
         for index in np.flatnonzero(mask).tolist():
             observation, info = self.envs[index].reset(seed=seeds[index], options=dict(options))
             self._observations[index] = observation
             infos = self._add_info(infos, info, index)
+        self.note_starts(mask)
         return self._stacked(), infos
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
-        """See ``BatchEngine.step``."""
+        """See ``Engine.step``."""
         count = len(self.envs)
         rewards = np.zeros(count)
         terminated, truncated = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
@@ -82,6 +84,7 @@ class PerEnvEngine:
                 truncated[index] = result[3] or self._reached_limit(self.envs[index])
                 info = result[4]
             infos = self._add_info(infos, info, index)
+        self.note_ends(terminated, truncated)
         return StepResult(self._stacked(), rewards, terminated, truncated, infos)
 
     def _actions(self, actions: Any) -> list[Any]:

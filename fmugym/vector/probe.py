@@ -16,7 +16,7 @@ from fmugym.adapters import Status
 from fmugym.env import FMUEnv
 from fmugym.vector.views import batched, column, light_copy
 
-__all__ = ["find_difference"]
+__all__ = ["find_difference", "sample_states"]
 
 _HOOKS = (
     "_get_inputs",
@@ -51,7 +51,7 @@ def find_difference(env: FMUEnv) -> str | None:
             return f"{method} is overridden"
     if not _is_array_space(env.action_space):
         return f"actions of {env.action_space} do not make one array"
-    batch = _states(env)
+    batch = sample_states(env)
     with np.errstate(all="ignore"):
         for name in _HOOKS:
             difference = _compare(name, batch)
@@ -65,7 +65,7 @@ def _is_array_space(space: spaces.Space[Any]) -> bool:
     return isinstance(space, kinds)
 
 
-def _states(env: FMUEnv) -> FMUEnv:
+def sample_states(env: FMUEnv) -> FMUEnv:
     """A batch of states that the FMU takes under random actions, and of scaled ones."""
     rng = np.random.default_rng(0)
     count = _STATES * len(_SCALES)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from fmugym.episode import EpisodePlan
-from fmugym.pool.base import FloatArray
+from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = ["EpisodeStreams"]
 
@@ -32,6 +32,11 @@ class EpisodeStreams:
     Args:
         num_envs: N.
         plan: The draws of an episode, without overrides.
+
+    Attributes:
+        num_draws: Numbers of the stream that an episode takes, None where they are not uniform.
+        block: Uniform numbers drawn ahead, shape (N, episodes, draws).
+        used: How many episodes of its block an environment has used, shape (N,).
     """
 
     def __init__(self, num_envs: int, plan: EpisodePlan) -> None:
@@ -40,8 +45,8 @@ class EpisodeStreams:
         self._draws = plan.num_uniform or 0
         row = 8 * num_envs * max(self._draws, 1)
         self._length = max(1, min(_LONGEST_BLOCK, _BLOCK_BYTES // row))
-        self._block = np.empty((num_envs, self._length, self._draws))
-        self._used = np.full(num_envs, self._length)
+        self.block = np.empty((num_envs, self._length, self._draws))
+        self.used = np.full(num_envs, self._length)
 
     def generator(self, index: int) -> np.random.Generator:
         """The generator of one environment, at the place that the episodes have reached."""
@@ -49,11 +54,11 @@ class EpisodeStreams:
         if generator is None:
             generator, _ = seeding.np_random()
             self._generators[index] = generator
-        ahead = int(self._length - self._used[index]) * self._draws
+        ahead = int(self._length - self.used[index]) * self._draws
         if ahead:
             bits: Any = generator.bit_generator
             bits.advance(-ahead)
-            self._used[index] = self._length
+            self.used[index] = self._length
         return generator
 
     def seed(self, seeds: Sequence[int | None], indices: npt.NDArray[np.intp]) -> None:
@@ -61,19 +66,24 @@ class EpisodeStreams:
         for index in indices.tolist():
             if seeds[index] is not None:
                 self._generators[index], _ = seeding.np_random(seeds[index])
-                self._used[index] = self._length
+                self.used[index] = self._length
 
     def fractions(self, indices: npt.NDArray[np.intp]) -> FloatArray:
         """Draw the uniform numbers of one episode for some environments, shape (draws, M)."""
-        used = self._used[indices]
+        used = self.used[indices]
         if used.max() == self._length:
-            self._refill(indices[used == self._length])
-            used = self._used[indices]
-        self._used[indices] = used + 1
-        fractions: FloatArray = self._block[indices, used].T
+            self.refill(indices[used == self._length])
+            used = self.used[indices]
+        self.used[indices] = used + 1
+        fractions: FloatArray = self.block[indices, used].T
         return fractions
 
-    def _refill(self, indices: npt.NDArray[np.intp]) -> None:
+    def refill_used_up(self, mask: MaskArray) -> None:
+        """Draw ahead for those of some environments that have nothing left."""
+        self.refill(np.flatnonzero(mask & (self.used == self._length)))
+
+    def refill(self, indices: npt.NDArray[np.intp]) -> None:
+        """Draw ahead for some environments whose blocks are used up."""
         for index in indices.tolist():
-            self.generator(index).random(out=self._block[index])
-            self._used[index] = 0
+            self.generator(index).random(out=self.block[index])
+            self.used[index] = 0

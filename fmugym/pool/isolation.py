@@ -1,0 +1,117 @@
+"""Whether instances of an FMU disturb each other.
+
+By the standard they do not. Some FMUs keep part of their state in global variables of their library
+all the same, so that each instance needs a library of its own (``private_libraries`` of
+``NativePool``).
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from fmugym.archive import FMU
+from fmugym.errors import FMULoadError, SimulationError
+from fmugym.model_description import Variable
+from fmugym.pool import make_pool
+from fmugym.pool.base import FloatArray, Pool, PoolSpec
+
+__all__ = ["shares_globals"]
+
+logger = logging.getLogger(__name__)
+
+_DEFAULT_STEP_SIZE = 0.01
+"""Where the FMU names none, in seconds."""
+
+_MOST_OUTPUTS = 1000
+
+
+def shares_globals(fmu: FMU, spec: PoolSpec | None = None, steps: int = 10) -> bool:
+    """Compare an instance run alone with one run beside another, which gets other inputs.
+
+    Each trial loads a copy of the FMU's library of its own. FMUs may still share what lies outside
+    of their library: files, other libraries, licences.
+
+    Args:
+        fmu: The FMU; neither extracted nor closed.
+        spec: What to do in a step; by default all inputs are written and all outputs read.
+        steps: How many steps to do.
+
+    Returns:
+        Whether the two instances are not independent of each other.
+
+    Raises:
+        FMULoadError: If not even one instance can be made.
+        SimulationError: If an instance alone fails.
+    """
+    spec = _default_spec(fmu) if spec is None else spec
+    alone = _run(fmu, spec, 1, steps)
+    try:
+        beside = _run(fmu, spec, 2, steps)
+    except (FMULoadError, SimulationError) as error:
+        logger.info("%s: a second instance fails: %s", fmu.path.name, error)
+        return True
+    return alone.tobytes() != beside.tobytes()
+
+
+def _default_spec(fmu: FMU) -> PoolSpec:
+    description = fmu.description
+    numeric = [v for v in description.variables.values() if v.numeric]
+    outputs = [v for v in numeric if v.causality == "output"] or [
+        v for v in numeric if v.causality == "local"
+    ]
+    return PoolSpec(
+        inputs=tuple(v for v in numeric if v.causality == "input"),
+        outputs=tuple(outputs[:_MOST_OUTPUTS]),
+        time_step=description.step_size or _DEFAULT_STEP_SIZE,
+        start_time=description.start_time,
+    )
+
+
+def _run(fmu: FMU, spec: PoolSpec, count: int, steps: int) -> FloatArray:
+    """Step ``count`` instances of a new copy; returns what the first one did."""
+    log = logging.getLogger(__name__)
+    pool = make_pool(FMU(fmu.path), spec, count, log, threads=1, private_libraries=False)
+    try:
+        return _trajectory(pool, spec, steps)
+    finally:
+        pool.close()
+
+
+def _trajectory(pool: Pool, spec: PoolSpec, steps: int) -> FloatArray:
+    count = pool.num_instances
+    rows = []
+    for step in range(steps + 1):
+        if step == 0:
+            outputs, statuses = pool.reset((), np.zeros((0, count)))
+        else:
+            outputs, statuses = pool.step(_inputs(spec, count))
+        if statuses[0] > 1:
+            raise SimulationError(pool.failure(0))
+        rows.append(outputs[:, 0].copy())
+    return np.array(rows)
+
+
+def _inputs(spec: PoolSpec, count: int) -> FloatArray:
+    """Start values for the first instance, the other end of the range for the second."""
+    values = [[_start(variable), _other(variable)] for variable in spec.inputs]
+    return np.array(values, np.float64).reshape(-1, 2)[:, :count]
+
+
+def _start(variable: Variable) -> float:
+    text = variable.start
+    if variable.kind == "boolean":
+        return float(text in {"true", "1"})
+    return float(text or 0.0)
+
+
+def _other(variable: Variable) -> float:
+    if variable.kind == "boolean":
+        return 1.0 - _start(variable)
+    if variable.items:
+        return float(next((v for _, v in variable.items if v != _start(variable)), 0))
+    for bound in (variable.maximum, variable.minimum):
+        if np.isfinite(bound) and bound != _start(variable):
+            return bound
+    return _start(variable) + 1.0

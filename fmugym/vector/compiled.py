@@ -1,0 +1,172 @@
+"""N environments whose hooks run as programs in the native pool's own pass."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.vector.batch import BatchEngine, StepResult
+from fmugym.vector.probe import sample_states
+from fmugym.vector.trace import Program, UntraceableError, evaluate, trace_hooks
+
+__all__ = ["CompiledEngine", "Drawn", "find_programs"]
+
+logger = logging.getLogger(__name__)
+
+
+def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program] | None:
+    """Compile the hooks of an environment and compare them with what they are on arrays.
+
+    Args:
+        env: A prototype whose hooks work on arrays.
+        required: Whether it is an error if they cannot be compiled.
+
+    Returns:
+        The programs for the inputs and for the judgement, or None.
+
+    Raises:
+        ConfigError: If they are required and there are none.
+    """
+    try:
+        if not hasattr(env._open_pool("a vector environment"), "prepare_play"):
+            raise UntraceableError("the pool is not the native one")
+        programs = trace_hooks(env)
+        _require_same(env, programs)
+    except UntraceableError as reason:
+        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
+        if required:
+            raise ConfigError(text) from None
+        logger.debug("%s", text)
+        return None
+    return programs
+
+
+def _require_same(env: FMUEnv, programs: tuple[Program, Program]) -> None:
+    batch = sample_states(env)
+    with np.errstate(all="ignore"):
+        inputs = np.array(evaluate(programs[0], batch))
+        batch.inputs = inputs
+        done, truncated, reward = evaluate(programs[1], batch)
+        batch.done = done != 0.0
+        hooks = (batch._is_done(), batch._is_truncated(), batch._reward_policy())
+        expected_inputs = batch._get_inputs()
+    for value, expected in zip((done, truncated, reward), hooks, strict=True):
+        if not np.array_equal(value, np.broadcast_to(expected, value.shape)):
+            raise UntraceableError("the program gives other values than the hooks")
+    if not np.array_equal(inputs, np.broadcast_to(expected_inputs, inputs.shape)):
+        raise UntraceableError("the program gives other inputs than the hook")
+
+
+class Drawn(Mapping[str, Any]):
+    """The values drawn in a step, by name, with their masks as ``_name``.
+
+    Args:
+        names: What was drawn.
+        values: Shape (draws, N).
+        mask: Which environments drew, shape (N,).
+    """
+
+    def __init__(self, names: list[str], values: FloatArray, mask: MaskArray) -> None:
+        self._names, self._values, self._mask = names, values, mask
+
+    def __getitem__(self, key: str) -> npt.NDArray[Any]:
+        if key in self._names:
+            row: FloatArray = self._values[self._names.index(key)]
+            return row
+        if key[:1] == "_" and key[1:] in self._names:
+            return self._mask
+        raise KeyError(key)
+
+    def __iter__(self) -> Iterator[str]:
+        return (key for name in self._names for key in (name, f"_{name}"))
+
+    def __len__(self) -> int:
+        return 2 * len(self._names)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+
+class CompiledEngine(BatchEngine):
+    """A ``BatchEngine`` that leaves a step as a whole to the native pool.
+
+    Resets, and steps after parameters were set for single environments or overridden, go the way
+    of ``BatchEngine``, whose arrays are the same ones.
+
+    Args:
+        env: The prototype, made with a native pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+        programs: From ``find_programs``.
+    """
+
+    def __init__(
+        self,
+        env: FMUEnv,
+        num_envs: int,
+        max_episode_steps: int | None,
+        programs: tuple[Program, Program],
+    ) -> None:
+        super().__init__(env, num_envs, max_episode_steps)
+        plan, streams = env._plan, self._streams
+        space: Any = env.action_space
+        self._names = plan.drawn_names
+        self._rows = np.array([plan.parameter_names.index(n) for n in self._names], np.intp)
+        pool: Any = self._pool
+        self._play = pool.prepare_play(
+            plan.model_variables,
+            programs,
+            (int(space.start), int(space.start + space.n - 1)),
+            self._start_values,
+            (streams.block, streams.used, *plan.limits, self._rows),
+            (env.step_count, self.ended, self._limit),
+        )
+
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """See ``Engine.step``."""
+        if self.given or self._overridden or self._streams.num_draws is None:
+            return super().step(actions, resetting)
+        result = StepResult(
+            np.empty((self._n, self.env._output_count), np.float32),
+            np.empty(self._n),
+            np.empty(self._n, np.bool_),
+            np.empty(self._n, np.bool_),
+            {},
+        )
+        troubled, ended, used_up = self._play_checked(actions, result)
+        self.any_ended = ended > 0
+        if resetting is not None:
+            drawn = Drawn(self._names, self._start_values[self._rows], resetting)
+            result.infos["drawn"], result.infos["_drawn"] = drawn, resetting
+        if troubled:
+            self._mend(result, resetting)
+        if used_up:
+            self._streams.refill_used_up(self.ended)
+        return result
+
+    def _play_checked(self, actions: Any, result: StepResult) -> tuple[int, int, int]:
+        try:
+            return self._play(actions, *result[:4])  # type: ignore[no-any-return]
+        except (TypeError, ValueError, BufferError):
+            actions = np.ascontiguousarray(self._checked(actions), np.int64)
+        return self._play(actions, *result[:4])  # type: ignore[no-any-return]
+
+    def _mend(self, result: StepResult, resetting: MaskArray | None) -> None:
+        """Deal with FMUs that failed, or asked to stop: rare, and so left to numpy."""
+        statuses = self._pool.statuses
+        if resetting is not None:
+            self._require_started(np.flatnonzero(resetting), statuses)
+        stopped = self._stopped(statuses)
+        if stopped.any():
+            result.terminated[stopped] = True
+            self.env.done = result.terminated
+            result.rewards[stopped] = self._rewards(self.env._reward_policy())[stopped]
+        self._take_faults(result, statuses)
+        self.note_ends(result.terminated, result.truncated)

@@ -1,0 +1,52 @@
+"""Fixtures for the tests of several modules."""
+
+import functools
+import os
+import tempfile
+
+import fmu_tools
+import pytest
+
+
+@pytest.fixture(scope="session")
+def probe(tmp_path_factory):
+    """Make the path of the probe FMU of an FMI version, compiled once a session."""
+
+    @functools.cache
+    def make(version=2):
+        return fmu_tools.probe_fmu(tmp_path_factory.mktemp(f"probe{version}"), version)
+
+    return make
+
+
+@pytest.fixture
+def make_env(probe):
+    """Make environments over the probe that are closed after the test."""
+    envs = []
+
+    def make(version=2, *, cls=fmu_tools.PlainEnv, path=None, render_mode=None, **config):
+        env = cls(path or probe(version), fmu_tools.probe_config(**config), render_mode=render_mode)
+        envs.append(env)
+        return env
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture
+def temp_root(tmp_path, monkeypatch):
+    """An empty folder in which all temporary folders are made."""
+    root = tmp_path / "temporary"
+    root.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(root))
+    monkeypatch.setenv("TMPDIR", str(root))  # for child processes
+    return root
+
+
+@pytest.fixture
+def same_working_directory():
+    """Fail if the test leaves another working directory."""
+    before = os.getcwd()
+    yield
+    assert os.getcwd() == before

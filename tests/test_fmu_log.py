@@ -1,0 +1,133 @@
+"""Messages of FMUs arrive at Python's logging: level, text and sender, for each FMI version."""
+
+import gc
+import logging
+import subprocess
+import sys
+import threading
+
+import pytest
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, probe_config
+
+from fmugym import FMULoadError, fmu_log
+from fmugym.fmu_log import MessageLog
+
+LEVELS = {0: "INFO", 1: "WARNING", 2: "WARNING", 3: "ERROR", 4: "CRITICAL"}
+
+
+@pytest.fixture(autouse=True)
+def all_levels(caplog):
+    with caplog.at_level(logging.DEBUG):
+        yield
+
+
+def records(caplog, name="fmugym.PlainEnv"):
+    return [(r.levelname, r.getMessage()) for r in caplog.records if r.name == name]
+
+
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+@pytest.mark.parametrize(("status", "level"), LEVELS.items())
+def test_level_and_text(probe, caplog, version, status, level):
+    config = probe_config(model_parameters={"log_status": status, "label": "Träger"})
+    env = PlainEnv(probe(version), config, logging.INFO)
+    env.reset()
+    env.step(0.0)
+    ((found, text),) = records(caplog)
+    env.close()
+    assert found == level
+    assert text.endswith("[probe] step 1 of Träger is 100%")
+    assert text.startswith("Probe_")
+
+
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+def test_messages_below_the_level_are_not_asked_for(probe, caplog, version):
+    env = PlainEnv(probe(version), probe_config(model_parameters={"log_status": 0}))
+    env.reset()
+    env.step(0.0)
+    env.close()
+    assert records(caplog) == []
+
+
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+def test_every_instance_has_its_own_name_and_receiver(probe, caplog, version):
+    """FMPy's own logger gives all messages to the instance made last, and crashes after it."""
+    envs = []
+    for index in range(3):
+        cls = type(f"Env{index}", (PlainEnv,), {})
+        parameters = {"log_status": 1, "label": f"env {index}"}
+        envs.append(cls(probe(version), probe_config(model_parameters=parameters)))
+        envs[-1].reset()
+    envs.pop(1).close()
+    gc.collect()
+    for env in envs:
+        env.step(0.0)
+    for index in (0, 2):
+        ((level, text),) = records(caplog, f"fmugym.Env{index}")
+        assert level == "WARNING"
+        assert text.endswith(f"step 1 of env {index} is 100%")
+    for env in envs:
+        env.close()
+
+
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+def test_threads(probe, caplog, version):
+    def run(index):
+        cls = type(f"Thread{index}", (PlainEnv,), {})
+        parameters = {"log_status": 1, "label": f"thread {index}"}
+        env = cls(probe(version), probe_config(model_parameters=parameters))
+        env.reset()
+        for _ in range(20):
+            env.step(0.0)
+        env.close()
+
+    threads = [threading.Thread(target=run, args=(index,)) for index in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for index in range(4):
+        texts = [text for _, text in records(caplog, f"fmugym.Thread{index}")]
+        ends = [text.partition("[probe] ")[2] for text in texts]
+        assert ends == [f"step {i} of thread {index} is 100%" for i in range(1, 21)]
+
+
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+def test_what_the_fmu_said_is_in_the_error(probe, tmp_path, version):
+    path = edited_fmu(probe(version), tmp_path, {"{probe-": "{other-"})
+    with pytest.raises(FMULoadError, match=r"refused to be instantiated.*the FMU said: step 0 of"):
+        PlainEnv(path, probe_config())
+
+
+def test_a_message_of_nobody_is_logged_too(caplog):
+    fmu_log._deliver(None, 3, b"late", b"after the end\n")
+    assert records(caplog, "fmugym.fmu_log") == [("INFO", "[late] after the end")]
+    fmu_log._by_name(None, b"a name of its own", 0, None, None)
+    assert records(caplog, "fmugym.fmu_log")[1] == ("INFO", "[] ")
+
+
+def test_bytes_that_are_not_utf_8_and_odd_statuses(caplog):
+    log = MessageLog("Model", logging.getLogger("fmugym.odd"))
+    fmu_log._by_name(None, log.instance_name.encode(), 9, b"caf\xe9", b"100%s \xff")
+    log.close()
+    log.close()
+    assert records(caplog, "fmugym.odd") == [
+        ("INFO", f"{log.instance_name}: [caf\ufffd] 100%s \ufffd")
+    ]
+    assert log.said() == "; the FMU said: 100%s \ufffd"
+
+
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+def test_nothing_reaches_stdout(probe, version):
+    code = (
+        "import sys, fmugym\n"
+        "class Env(fmugym.FMUEnv):\n"
+        "    def _is_done(self): return False\n"
+        "config = {'model_input_names': 'a', 'model_output_names': 'sum', 'time_step': 0.1,\n"
+        "          'model_parameters': {'log_status': 1}}\n"
+        "env = Env(sys.argv[1], config, 10)\n"
+        "env.reset(); env.step(0.5); env.reset(); env.step(0.5); env.close()\n"
+    )
+    command = [sys.executable, "-W", "error", "-c", code, str(probe(version))]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == ""
+    assert done.stderr.count("step 1 of probe is 100%") == 2  # logging's last resort

@@ -1,0 +1,122 @@
+"""An FMU of another exporter: ``pythonfmu`` makes it of a class that is also stepped directly."""
+
+from pathlib import Path
+
+import foreign_tank
+import numpy as np
+import pytest
+from pythonfmu.builder import FmuBuilder
+
+import fmugym
+from fmugym.testing import check_fmu_env
+
+OUTPUTS = ("level", "overflowing", "switches")
+
+
+class TankEnv(fmugym.FMI2CSEnv):
+    """Keep the level of a tank at one metre."""
+
+    def __init__(self, fmu_path, **changes):
+        config = {
+            "model_input_names": ["inflow", "valve_open", "pump_stage"],
+            "model_output_names": OUTPUTS,
+            "model_parameters": {"area": fmugym.Uniform(1.0, 3.0), "leaks": True},
+            "time_step": 0.5,
+            "bounds": {"inflow": (0.0, 0.5), "pump_stage": (0, 3)},
+            "max_episode_steps": 40,
+        }
+        super().__init__(fmu_path, config | changes)
+
+    def _is_done(self):
+        return self.out["level"] < 0.2
+
+    def _reward_policy(self):
+        return -abs(self.out["level"] - 1.0)
+
+
+@pytest.fixture(scope="module")
+def tank_fmu(tmp_path_factory):
+    path = FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path_factory.mktemp("tank"))
+    if not fmugym.FMU(path).runs_here:
+        pytest.skip("pythonfmu has no binary for this platform")
+    return Path(path)
+
+
+@pytest.fixture
+def env(tank_fmu):
+    env = TankEnv(tank_fmu)
+    yield env
+    env.close()
+
+
+def directly(area):
+    """The same model without FMI."""
+    tank = foreign_tank.Tank(instance_name="direct")
+    tank.area, tank.leaks = area, True
+    return tank
+
+
+def outputs_of(tank):
+    return tuple(float(getattr(tank, name)) for name in OUTPUTS)
+
+
+def test_random_episodes_equal_the_class_itself(env):
+    env.action_space.seed(1)
+    lengths = []
+    for episode in range(6):
+        _, info = env.reset(seed=1 if episode == 0 else None)
+        tank = directly(info["drawn"]["area"])
+        assert env.state == outputs_of(tank)
+        ended = False
+        while not ended:
+            action = env.action_space.sample()
+            *_, terminated, truncated, _ = env.step(action)
+            tank.inflow, tank.pump_stage = float(action[0]), round(float(action[2]))
+            tank.valve_open = bool(action[1] >= 0.5)
+            tank.do_step(env.time - 0.5, 0.5)
+            assert env.state == outputs_of(tank)
+            assert terminated == (tank.level < 0.2)
+            ended = terminated or truncated
+        lengths.append(env.step_count)
+    assert max(lengths) <= 40
+
+
+def test_what_is_invalid_in_it_does_not_stop(env):
+    """Without a variability, Integers and Booleans are continuous, which the standard forbids."""
+    assert any("variability" in finding for finding in env.fmu.description.findings)
+
+
+def test_spaces(env):
+    assert env.action_space.low.tolist() == [0.0, 0.0, 0.0]
+    assert env.action_space.high.tolist() == [0.5, 1.0, 3.0]
+    assert env.observation_space.shape == (3,)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_contract_of_the_package(env, seed):
+    check_fmu_env(env, seed=seed, num_steps=60)
+
+
+def test_an_integer_action_alone(tank_fmu):
+    env = TankEnv(tank_fmu, model_input_names="pump_stage", bounds={"pump_stage": (1, 3)})
+    assert env.action_space.n == 3
+    env.reset(seed=0)
+    env.step(2)
+    assert env.inputs == (3.0,)
+    assert env.out["level"] > 1.0
+    env.close()
+
+
+def test_many_instances_and_lives(tank_fmu):
+    """The exporter embeds Python itself: instances come and go beside this interpreter."""
+    envs = [TankEnv(tank_fmu, model_parameters={"area": 1.0 + i}) for i in range(4)]
+    for env in envs:
+        env.reset()
+    envs.pop(1).close()
+    envs.append(TankEnv(tank_fmu, model_parameters={"area": 8.0}))
+    envs[-1].reset()
+    for env in envs:
+        env.step(np.array([0.4, 0.0, 0.0]))
+        expected = 1.0 + 0.5 * 0.4 / env.parameters["area"]
+        assert env.out["level"] == pytest.approx(expected, rel=1e-14)
+        env.close()

@@ -1,0 +1,366 @@
+"""From construction to the end: folders, files, output, copies, and the tutorial's own pattern."""
+
+import copy
+import gc
+import logging
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, library_name, probe_config, probe_fmu
+from gymnasium import spaces
+
+import fmugym
+from fmugym import FMI2CSEnv, FMULoadError, bundled_fmu
+
+every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
+HERE = Path(__file__).parent
+
+
+def run(code, *arguments):
+    """Run code in another interpreter; returns what it wrote to stdout and stderr."""
+    command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
+    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
+
+
+OPEN_AND_STEP = """
+import sys, logging
+from fmu_tools import PlainEnv, probe_config
+parameters = {"log_status": 1}
+env = PlainEnv(sys.argv[1], probe_config(model_parameters=parameters), logging.DEBUG)
+for _ in range(4):
+    env.reset()
+    env.step(0.5)
+"""
+
+
+class TestTemporaryFolders:
+    @every_version
+    def test_gone_after_close(self, make_env, version, temp_root):
+        env = make_env(version)
+        env.reset()
+        env.step(0.0)
+        assert len(list(temp_root.iterdir())) == 1
+        env.close()
+        assert list(temp_root.iterdir()) == []
+        env.close()
+
+    @every_version
+    def test_gone_at_garbage_collection(self, probe, version, temp_root):
+        env = PlainEnv(probe(version), probe_config())
+        for _ in range(3):
+            env.reset()
+        del env
+        gc.collect()
+        assert list(temp_root.iterdir()) == []
+
+    @every_version
+    @pytest.mark.parametrize(
+        "ending", ["", "del env", "env.close()", "raise SystemExit", "globals().clear()"]
+    )
+    def test_gone_at_the_end_of_the_interpreter(self, probe, version, temp_root, ending):
+        run(OPEN_AND_STEP + ending, probe(version))
+        assert list(temp_root.iterdir()) == []
+
+    def test_gone_after_an_uncaught_error(self, probe, temp_root):
+        code = "try:\n    " + (OPEN_AND_STEP + "1 / 0").strip().replace("\n", "\n    ")
+        run(code + "\nfinally:\n    raise SystemExit", probe(2))
+        assert list(temp_root.iterdir()) == []
+
+    @every_version
+    @pytest.mark.parametrize("stage", ["token", "library", "hook"])
+    def test_gone_after_a_failed_construction(
+        self, probe, tmp_path, version, temp_root, same_working_directory, stage
+    ):
+        path, cls, error = probe(version), PlainEnv, FMULoadError
+        if stage == "token":
+            path = edited_fmu(path, tmp_path, {"{probe-": "{other-"})
+        elif stage == "library":
+            path = edited_fmu(path, tmp_path, add={library_name(version): bytes(100)})
+        else:
+            error = ZeroDivisionError
+            cls = type("Broken", (PlainEnv,), {"_get_action_space": lambda self: 1 / 0})
+        with pytest.raises(error):
+            cls(path, probe_config())
+        assert list(temp_root.iterdir()) == []
+
+    def test_a_subclass_that_fails_after_the_base_class(self, probe, temp_root):
+        class Broken(PlainEnv):
+            def __init__(self, *args):
+                super().__init__(*args)
+                raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            Broken(probe(2), probe_config())
+        gc.collect()
+        assert list(temp_root.iterdir()) == []
+
+
+class TestManyLives:
+    @every_version
+    def test_200_times_open_and_close(self, probe, version, temp_root):
+        def live():
+            env = PlainEnv(probe(version), probe_config())
+            env.reset()
+            env.step(0.5)
+            env.close()
+
+        live()
+        gc.collect()
+        before = _resources()
+        for _ in range(200):
+            live()
+        gc.collect()
+        assert _resources() == before
+        assert list(temp_root.iterdir()) == []
+
+    def test_many_at_once(self, probe, temp_root):
+        envs = [PlainEnv(probe(2), probe_config()) for _ in range(30)]
+        for env in envs:
+            env.reset()
+        for env in envs[::2] + envs[1::2]:
+            env.step(1.0)
+            assert env.out["sum"] == 0.1
+            env.close()
+        assert list(temp_root.iterdir()) == []
+
+    def test_resets_take_no_memory(self, make_env):
+        """Each kind of reset: a saved state, and new parameters."""
+        env = make_env(2, model_output_names=["live", "instances", "illegal"])
+        for index in range(300):
+            env.reset(options={"model_parameters": {"gain": float(index // 3)}})
+            env.step(0.0)
+        assert env.out["live"] <= 1
+        assert (env.out["instances"], env.out["illegal"]) == (1, 0)
+
+
+def _resources():
+    """Open files and loaded copies of the FMU of this process; None where they are not told."""
+    if not Path("/proc/self/fd").exists():
+        return None
+    maps = Path("/proc/self/maps").read_text()
+    return len(os.listdir("/proc/self/fd")), maps.count("Probe.so")
+
+
+@every_version
+def test_nothing_on_stdout_and_messages_once(probe, version):
+    out, err = run(OPEN_AND_STEP + "env.close()", probe(version))
+    assert out == ""
+    assert err.count("step 1 of probe is 100%") == 4
+
+
+class TestCopies:
+    @pytest.fixture(
+        params=[copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
+        ids=["copy", "deepcopy", "pickle"],
+    )
+    def clone(self, request):
+        made = []
+
+        def clone(env):
+            made.append(request.param(env))
+            return made[-1]
+
+        yield clone
+        for env in made:
+            env.close()
+
+    def test_a_copy_is_an_environment_of_its_own(self, make_env, clone):
+        env = make_env(model_parameters={"gain": fmugym.Uniform(0.0, 1.0)}, max_episode_steps=3)
+        env.reset(seed=1)
+        env.step(1.0)
+        twin = clone(env)
+        first, info = twin.reset(seed=7)
+        twin.step(1.0)
+        assert env.step_count == 1
+        again, same = env.reset(seed=7)
+        env.step(1.0)
+        assert (info, first.tolist()) == (same, again.tolist())
+        assert twin.state == env.state
+        env.close()
+        twin.step(1.0)
+
+    def test_of_a_subclass_with_arguments_of_its_own(self, clone):
+        env = fmugym.envs.CartPoleEnv(True, fmi_version="3.0", model_parameters={"m_pole": 0.2})
+        twin = clone(env)
+        env.reset(seed=3)
+        twin.reset(seed=3)
+        for action in (0, 1, 1, 0):
+            assert env.step(action)[1] == twin.step(action)[1] == 0.0
+        assert twin.state == env.state
+        assert twin.parameters["m_pole"] == 0.2
+        assert twin.fmu.description.fmi_version == "3.0"
+        env.close()
+
+    def test_of_a_closed_environment(self, make_env, clone):
+        env = make_env()
+        env.close()
+        twin = clone(env)
+        twin.reset()
+        twin.step(0.0)
+
+    def test_through_wrappers(self):
+        env = gymnasium.make("fmugym/Pendulum-v0")
+        twin = copy.deepcopy(env)
+        one, other = env.reset(seed=5)[0], twin.reset(seed=5)[0]
+        np.testing.assert_array_equal(one, other)
+        env.close()
+        twin.close()
+
+    def test_in_a_child_process(self, probe, tmp_path):
+        env = PlainEnv(probe(2), probe_config(model_parameters={"gain": 3.0}))
+        file = tmp_path / "env.pickle"
+        file.write_bytes(pickle.dumps(env))
+        env.close()
+        code = (
+            "import pathlib, pickle, sys\n"
+            "env = pickle.loads(pathlib.Path(sys.argv[1]).read_bytes())\n"
+            "env.reset(); env.step(1.0); print(round(env.out['sum'], 12)); env.close()"
+        )
+        out, _ = run(code, file)
+        assert out == "0.3\n"
+
+
+logger = logging.getLogger("tutorial")
+NINETY_DEGREES_IN_RAD = np.pi / 2
+TWELVE_DEGREES_IN_RAD = np.pi / 15
+
+
+class TutorialCartPoleEnv(FMI2CSEnv):
+    """A subclass as ModelicaGym's tutorial has it, in our own words."""
+
+    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self, m_cart, m_pole, theta_0, theta_dot_0, time_step, good, bad, force, log_level
+    ):
+        logger.setLevel(log_level)
+        self.force = force
+        self.theta_threshold = TWELVE_DEGREES_IN_RAD
+        self.x_threshold = 2.4
+        self.viewer = None
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot", "theta", "theta_dot"],
+            "model_parameters": {
+                "m_cart": m_cart,
+                "m_pole": m_pole,
+                "theta_0": theta_0,
+                "theta_dot_0": theta_dot_0,
+            },
+            "time_step": time_step,
+            "positive_reward": good,
+            "negative_reward": bad,
+        }
+        super().__init__(str(bundled_fmu("CartPole")), config, log_level)
+
+    def _is_done(self):
+        x, x_dot, theta, theta_dot = self.state
+        logger.debug("x: %s, x_dot: %s, theta: %s, theta_dot: %s", x, x_dot, theta, theta_dot)
+        lean = abs(theta - NINETY_DEGREES_IN_RAD)
+        if abs(x) > self.x_threshold or lean > self.theta_threshold:
+            done = True
+        else:
+            done = False
+        return done
+
+    def _get_action_space(self):
+        return spaces.Discrete(2)
+
+    def _get_observation_space(self):
+        high = np.array([self.x_threshold, np.inf, self.theta_threshold, np.inf])
+        return spaces.Box(-high, high)
+
+    def step(self, action):
+        action = self.force if action > 0 else -self.force
+        return super().step(action)
+
+    def render(self, mode="human", close=False):
+        if close:
+            if self.viewer is not None:
+                self.viewer = None
+            return True
+        self.viewer = [mode, *self.state]
+        return self.viewer
+
+    def close(self):
+        return self.render(close=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*precision lowered by casting to float32")
+class TestTutorial:
+    def make(self, **changes):
+        arguments = {
+            "m_cart": 10.0,
+            "m_pole": 1.0,
+            "theta_0": np.radians(85),
+            "theta_dot_0": 0.0,
+            "time_step": 0.05,
+            "good": 1,
+            "bad": -100,
+            "force": 12.0,
+            "log_level": logging.WARNING,
+        }
+        return TutorialCartPoleEnv(**(arguments | changes))
+
+    def test_an_episode(self):
+        """The plant is that of the registered environment: so must be the trajectory."""
+        env, ours = self.make(), gymnasium.make("fmugym/ModelicaCartPole-v0")
+        observation, info = env.reset()
+        expected, _ = ours.reset()
+        np.testing.assert_array_equal(observation, expected)
+        assert info == {"drawn": {}}
+        terminated = False
+        while not terminated:
+            action = int(env.state[2] < NINETY_DEGREES_IN_RAD)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            expected, expected_reward, *ends, _ = ours.step(action)
+            np.testing.assert_array_equal(observation, expected)
+            assert (reward, [terminated, truncated]) == (expected_reward, ends)
+        assert reward == -100
+        assert env.step_count > 10
+        assert env.render()[1:] == list(env.state)
+        assert env.close() is True
+        ours.close()
+
+    def test_folders_go_though_close_does_not_call_the_base_class(self, temp_root):
+        env = self.make()
+        env.reset()
+        env.close()
+        env.close()
+        del env
+        gc.collect()
+        assert list(temp_root.iterdir()) == []
+
+    def test_its_log_level_reaches_its_loggers_only(self):
+        env = self.make(log_level=logging.ERROR)
+        assert env.logger.level == logging.ERROR
+        assert logging.getLogger("fmugym").level == logging.NOTSET
+        env.close()
+
+    def test_a_copy(self):
+        env = self.make(m_pole=2.0)
+        twin = copy.deepcopy(env)
+        twin.reset()
+        assert twin.parameters["m_pole"] == 2.0
+        env.close()
+        twin.close()
+
+
+def test_a_library_beside_the_fmu_is_found(tmp_path):
+    """FMUs bring data in their resources; the folder is there while the environment lives."""
+    path = probe_fmu(tmp_path, 2, add={"resources/table.csv": "1,2"})
+    env = PlainEnv(path, probe_config())
+    folder = env.fmu.extract()
+    assert (folder / "resources" / "table.csv").read_text() == "1,2"
+    env.close()
+    assert not folder.exists()

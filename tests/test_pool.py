@@ -1,0 +1,514 @@
+"""The contract of ``fmugym.pool.base``, for every implementation of it."""
+
+import logging
+
+import fmpy
+import numpy as np
+import pytest
+from fmu_tools import MAJOR_VERSIONS, edited_fmu
+
+from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
+from fmugym import pool as pools
+from fmugym.adapters import Status
+from fmugym.bundled import FMI_VERSIONS, MODELS
+from fmugym.pool import PoolSpec
+
+LOG = logging.getLogger("fmugym.test")
+
+PLANTS = {
+    "CartPole": ("f", ["x", "x_dot", "theta", "theta_dot"], "theta_0", 10.0),
+    "Pendulum": ("tau", ["theta", "theta_dot"], "q_0", 0.1),
+}
+all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
+with_state = pytest.mark.parametrize("version", [2, 3])
+
+
+@pytest.fixture(params=["python", "native"])
+def make_pool(request):
+    """Make pools of one implementation that are closed after the test."""
+    if request.param == "native" and not pools.has_native_pool():
+        pytest.skip("the C extension was not built")
+    made = []
+
+    def make(path, inputs, outputs, num_instances=1, time_step=0.1, strings=None, **spec):
+        fmu = FMU(path)
+        spec = PoolSpec(
+            inputs=tuple(map(fmu.variable, inputs)),
+            outputs=tuple(map(fmu.variable, outputs)),
+            time_step=time_step,
+            strings=tuple((fmu.variable(n), v) for n, v in (strings or {}).items()),
+            **spec,
+        )
+        pool = pools.make_pool(fmu, spec, num_instances, LOG, request.param)
+        pool.variable = fmu.variable
+        made.append(pool)
+        return pool
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+@pytest.fixture(
+    params=[(m, v) for m in MODELS for v in FMI_VERSIONS], ids=lambda p: f"{p[0]}-{p[1]}"
+)
+def plant(request, make_pool):
+    """Make pools over each of the bundled FMUs."""
+    return Plant(*request.param, make_pool)
+
+
+class Plant:
+    def __init__(self, model, version, make_pool):
+        self.model, self.version = model, version
+        self.path = bundled_fmu(model, version)
+        self.input, self.outputs, self.start, self.strength = PLANTS[model]
+        self._make_pool = make_pool
+
+    def pool(self, num_instances=1, time_step=0.05, **spec):
+        return self._make_pool(
+            self.path, [self.input], self.outputs, num_instances, time_step, **spec
+        )
+
+    def start_values(self, seed, num_instances):
+        return np.random.default_rng(seed).uniform(1.4, 1.7, (1, num_instances))
+
+    def inputs(self, seed, steps, num_instances):
+        rng = np.random.default_rng(seed)
+        return self.strength * rng.uniform(-1, 1, (steps, 1, num_instances))
+
+    def rollout(self, pool, values, inputs):
+        """The outputs after the reset and after each step, shape (steps + 1, k, N)."""
+        outputs, status = pool.reset((pool.variable(self.start),), values)
+        assert not status.any()
+        trajectory = [outputs.copy()]
+        for row in inputs:
+            outputs, status = pool.step(row)
+            assert not status.any()
+            trajectory.append(outputs.copy())
+        return np.array(trajectory)
+
+
+def set_up(pool, mask=None, **values):
+    """Reset with start values, numbers or one for each instance."""
+    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
+    array = np.array(rows, float).reshape(len(rows), pool.num_instances)
+    return pool.reset(tuple(map(pool.variable, values)), array, mask)
+
+
+def step(pool, value=0.0, **options):
+    return pool.step(np.full((1, pool.num_instances), value), **options)
+
+
+def held_constant(signal):
+    """A signal for FMPy, which would interpolate between the points."""
+    held = np.repeat(signal, 2)[:-1]
+    held["time"][1::2] = signal["time"][1:]
+    return held
+
+
+class TestDynamics:
+    def test_as_fmpy_simulates(self, plant):
+        """FMPy's own co-simulation loop is the reference."""
+        pool = plant.pool(start_time=0.0)
+        inputs = plant.inputs(0, 20, 1)
+        ours = plant.rollout(pool, np.array([[1.5]]), inputs)[:, :, 0]
+        times = np.arange(21) * 0.05
+        signal = np.array(
+            [(t, u) for t, u in zip(times, [*inputs[:, 0, 0], 0.0], strict=True)],
+            dtype=[("time", float), (plant.input, float)],
+        )
+        theirs = fmpy.simulate_fmu(
+            str(plant.path),
+            fmi_type="CoSimulation",
+            validate=False,
+            stop_time=1.0,
+            output_interval=0.05,
+            start_values={plant.start: 1.5},
+            input=held_constant(signal),
+            output=plant.outputs,
+        )
+        for index, name in enumerate(plant.outputs):
+            np.testing.assert_allclose(ours[:, index], theirs[name], rtol=1e-9, atol=1e-12)
+
+    def test_reset_restores_everything(self, plant):
+        """By initialization, and from the third time on, where the FMU can, from a saved state."""
+        pool = plant.pool(3)
+        values, inputs = plant.start_values(1, 3), plant.inputs(1, 15, 3)
+        fresh = plant.rollout(pool, values, inputs)
+        plant.rollout(pool, plant.start_values(2, 3), plant.inputs(2, 7, 3))
+        for _ in range(4):
+            np.testing.assert_array_equal(plant.rollout(pool, values, inputs), fresh)
+        other = plant.rollout(pool, plant.start_values(2, 3), inputs)
+        assert (other[0] != fresh[0]).any()
+
+    def test_n_instances_equal_n_single_ones(self, plant):
+        values, inputs = plant.start_values(3, 5), plant.inputs(3, 15, 5)
+        together = plant.rollout(plant.pool(5), values, inputs)
+        for i in range(5):
+            alone = plant.rollout(plant.pool(), values[:, i : i + 1], inputs[:, :, i : i + 1])
+            np.testing.assert_array_equal(together[:, :, i : i + 1], alone)
+
+    def test_masked_reset_leaves_the_others(self, plant):
+        pool = plant.pool(4)
+        values, inputs = plant.start_values(4, 4), plant.inputs(4, 20, 4)
+        undisturbed = plant.rollout(pool, values, inputs)
+        plant.rollout(pool, values, inputs[:10])
+        mask = np.array([False, True, False, True])
+        outputs, _ = pool.reset((pool.variable(plant.start),), values, mask)
+        np.testing.assert_array_equal(outputs[:, mask], undisturbed[0][:, mask])
+        np.testing.assert_array_equal(outputs[:, ~mask], undisturbed[10][:, ~mask])
+        for index in range(10):
+            row = np.where(mask, inputs[index], inputs[10 + index])
+            outputs, _ = pool.step(row)
+        np.testing.assert_array_equal(outputs[:, mask], undisturbed[10][:, mask])
+        np.testing.assert_array_equal(outputs[:, ~mask], undisturbed[20][:, ~mask])
+
+    def test_skipped_instances_stay(self, plant):
+        pool = plant.pool(3)
+        values, inputs = plant.start_values(5, 3), plant.inputs(5, 6, 3)
+        undisturbed = plant.rollout(pool, values, inputs)
+        plant.rollout(pool, values, inputs[:4])
+        skip = np.array([False, True, False])
+        outputs, status = pool.step(inputs[4], skip)
+        np.testing.assert_array_equal(outputs[:, ~skip], undisturbed[5][:, ~skip])
+        np.testing.assert_array_equal(outputs[:, skip], undisturbed[4][:, skip])
+        assert not status.any()
+        outputs, _ = pool.step(inputs[4], ~skip)
+        np.testing.assert_array_equal(outputs, undisturbed[5])
+
+    def test_substeps(self, plant):
+        inputs = plant.inputs(6, 5, 1)
+        coarse = plant.rollout(plant.pool(time_step=0.04, substeps=4), np.array([[1.5]]), inputs)
+        fine = plant.pool(time_step=0.01)
+        trajectory = plant.rollout(fine, np.array([[1.5]]), np.repeat(inputs, 4, axis=0))
+        np.testing.assert_array_equal(coarse, trajectory[::4])
+
+    def test_warm_up(self, plant):
+        """The inputs have their start values, also where a saved state is restored."""
+        inputs = plant.inputs(7, 5, 1)
+        warm = plant.pool(warm_up_steps=3)
+        rest = np.zeros((3, 1, 1))
+        expected = plant.rollout(plant.pool(), np.array([[1.5]]), np.concatenate([rest, inputs]))
+        for _ in range(4):
+            np.testing.assert_array_equal(
+                plant.rollout(warm, np.array([[1.5]]), inputs), expected[3:]
+            )
+
+    def test_observations(self, plant):
+        pool = plant.pool(3, num_observed=2)
+        plant.rollout(pool, plant.start_values(8, 3), [])
+        observations = np.full((3, 2), np.nan, np.float32)
+        outputs, _ = pool.step(plant.inputs(8, 1, 3)[0], observations=observations)
+        np.testing.assert_array_equal(observations, outputs[:2].T.astype(np.float32))
+
+    def test_read(self, plant):
+        pool = plant.pool(3)
+        values = plant.start_values(9, 3)
+        outputs = plant.rollout(pool, values, plant.inputs(9, 4, 3))[-1]
+        names = [plant.outputs[1], plant.start]
+        read = pool.read(tuple(map(pool.variable, names)))
+        np.testing.assert_array_equal(read, np.concatenate([outputs[1:2], values]))
+
+    def test_closing_twice(self, plant):
+        pool = plant.pool(2)
+        plant.rollout(pool, plant.start_values(0, 2), [])
+        pool.close()
+        pool.close()
+
+
+class TestArrays:
+    @all_versions
+    def test_inputs_may_be_written_in_place(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["b", "a"], ["mix", "sum"], 3)
+        set_up(pool)
+        pool.inputs[0], pool.inputs[1] = 0.5, [0.0, 0.25, 1.0]
+        outputs, status = pool.step()
+        assert outputs[0].tolist() == [5.0, 5.25, 6.0]
+        assert outputs is pool.outputs
+        assert status is pool.statuses
+        pool.inputs[0] = 0.0
+        assert pool.step()[0] is outputs
+        assert outputs[0].tolist() == [0.0, 0.25, 1.0]
+
+    def test_an_argument_is_copied(self, make_pool, probe):
+        pool = make_pool(probe(2), ["a"], ["mix"])
+        set_up(pool)
+        given = np.array([[0.5]])
+        pool.step(given)
+        given[:] = 9.0
+        assert pool.step()[0].tolist() == [[0.5]]
+
+
+class TestConstruction:
+    @all_versions
+    def test_that_fails_leaves_nothing(self, make_pool, probe, tmp_path, temp_root, version):
+        path = edited_fmu(probe(version), tmp_path, {"{probe-": "{other-"})
+        with pytest.raises(FMULoadError, match=r"refused to be instantiated.*the FMU said: step 0"):
+            make_pool(path, ["a"], ["mix"], 2)
+        assert list(temp_root.iterdir()) == []
+
+    def test_unknown_backend(self, probe):
+        fmu = FMU(probe(2))
+        with pytest.raises(ConfigError, match="unknown backend 'natvie'; did you mean 'native'"):
+            pools.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG, "natvie")
+
+
+class TestSnapshots:
+    @pytest.mark.parametrize("model", MODELS)
+    @pytest.mark.parametrize("version", ["2.0", "3.0"])
+    def test_restored_instances_go_on_as_before(self, make_pool, model, version):
+        plant = Plant(model, version, make_pool)
+        pool = plant.pool(3)
+        values, inputs = plant.start_values(1, 3), plant.inputs(1, 10, 3)
+        expected = plant.rollout(pool, values, inputs)
+        plant.rollout(pool, values, inputs[:5])
+        snapshot = pool.save()
+        mask = np.array([True, False, True])
+        for _ in range(2):
+            pool.step(inputs[7])
+            outputs, status = pool.restore(snapshot, mask)
+            np.testing.assert_array_equal(outputs[:, mask], expected[5][:, mask])
+            assert not status.any()
+        pool.restore(snapshot)
+        for row in inputs[5:]:
+            outputs, _ = pool.step(row)
+        np.testing.assert_array_equal(outputs, expected[-1])
+
+    @with_state
+    def test_time_is_part_of_it(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["end"])
+        set_up(pool)
+        step(pool)
+        snapshot = pool.save()
+        step(pool)
+        pool.restore(snapshot)
+        outputs, _ = step(pool)
+        assert outputs[0, 0] == pytest.approx(0.2, abs=1e-15)
+
+    @with_state
+    def test_snapshots_are_freed(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["live"], 2)
+        set_up(pool)
+        snapshots = [pool.save() for _ in range(3)]
+        assert step(pool)[0].tolist() == [[6, 6]]
+        del snapshots[1:]
+        assert step(pool)[0].tolist() == [[2, 2]]
+
+    @with_state
+    def test_only_into_the_same_instances(self, make_pool, probe, version):
+        pool, twin = (make_pool(probe(version), ["a"], ["sum"], 2) for _ in range(2))
+        alone = make_pool(probe(version), ["a"], ["sum"])
+        for each in (pool, twin, alone):
+            set_up(each)
+        for other in (twin.save(), alone.save()):
+            with pytest.raises(SimulationError, match="snapshot"):
+                pool.restore(other)
+
+    def test_not_in_fmi_1(self, make_pool, probe):
+        pool = make_pool(probe(1), ["a"], ["sum"])
+        set_up(pool)
+        with pytest.raises(SimulationError, match="cannot get and set its state"):
+            pool.save()
+
+
+class TestFaults:
+    """What goes wrong with one instance is told by its status and mended by the next reset."""
+
+    OUTPUTS = ("sum", "steps", "instances", "illegal")
+
+    @pytest.fixture
+    def pool(self, make_pool, probe):
+        def make(version, num_instances=1, **spec):
+            return make_pool(probe(version), ["a"], self.OUTPUTS, num_instances, 0.5, **spec)
+
+        return make
+
+    @staticmethod
+    def assert_sound(pool):
+        """After a good reset every instance works, and the FMU saw no illegal call."""
+        outputs, status = set_up(pool)
+        assert not status.any()
+        assert (outputs[1] == 0).all()
+        outputs, status = step(pool, 1.0)
+        assert not status.any()
+        assert (outputs[0] == 0.5).all()
+        assert (outputs[3] == 0).all()
+
+    @all_versions
+    @pytest.mark.parametrize(
+        ("fault", "expected"),
+        [
+            (2, Status.DISCARD),
+            (3, Status.ERROR),
+            (4, Status.FATAL),
+            (5, Status.ERROR),
+            (7, Status.NOT_FINITE),
+        ],
+    )
+    def test_of_one_instance_in_a_step(self, pool, version, fault, expected):
+        pool = pool(version, 3)
+        set_up(pool, fault=[0, fault, 0], fault_step=2)
+        before = step(pool, 1.0)[0].copy()
+        outputs, status = step(pool, 1.0)
+        assert status.tolist() == [Status.OK, expected, Status.OK]
+        assert outputs[0].tolist() == [1.0, 0.5, 1.0]
+        np.testing.assert_array_equal(outputs[:, 1], before[:, 1])
+        said = "sum = nan" if fault == 7 else f"t = 0.5 s returned {expected.name.capitalize()}"
+        assert said in pool.failure(1)
+        self.assert_sound(pool)
+
+    @all_versions
+    @pytest.mark.parametrize("fault", [3, 4])
+    def test_stepping_on_does_not_reach_a_failed_instance(self, pool, version, fault):
+        pool = pool(version, 2)
+        set_up(pool, fault=[fault, 0], fault_step=1)
+        for _ in range(3):
+            outputs, status = step(pool, 1.0)
+            assert status.tolist() == [fault, Status.OK]
+        assert outputs[0].tolist() == [0.0, 1.5]
+        self.assert_sound(pool)
+
+    @with_state
+    def test_an_fmu_that_asks_to_stop(self, pool, version):
+        pool = pool(version)
+        set_up(pool, fault=6, fault_step=2)
+        assert step(pool, 1.0)[1].tolist() == [Status.OK]
+        outputs, status = step(pool, 1.0)
+        assert status.tolist() == [Status.TERMINATED]
+        assert outputs[0].tolist() == [1.0]  # its outputs are valid
+        self.assert_sound(pool)
+
+    @all_versions
+    @pytest.mark.parametrize("name", ["set_status", "get_status"])
+    def test_in_setting_and_getting(self, pool, version, name):
+        pool = pool(version)
+        set_up(pool, **{name: 3})
+        doing = {"set_status": "setting the inputs", "get_status": "reading the outputs"}[name]
+        assert step(pool)[1].tolist() == [Status.ERROR]
+        assert f"{doing} returned Error" in pool.failure(0)
+        self.assert_sound(pool)
+
+    @all_versions
+    @pytest.mark.parametrize("status", [2, 3, 4])
+    def test_in_a_reset(self, pool, version, status):
+        pool = pool(version, 2)
+        _, statuses = set_up(pool, init_status=[0, status])
+        assert statuses[0] == Status.OK
+        assert statuses[1] > Status.WARNING
+        assert "initialization returned" in pool.failure(1)
+        self.assert_sound(pool)
+
+    @all_versions
+    def test_in_a_substep(self, pool, version):
+        pool = pool(version, substeps=5)
+        set_up(pool, fault=3, fault_step=3)
+        assert step(pool, 1.0)[1].tolist() == [Status.ERROR]
+        assert "t = 0.2 s" in pool.failure(0)
+
+    @all_versions
+    def test_in_the_warm_up(self, pool, version):
+        pool = pool(version, warm_up_steps=2)
+        _, status = set_up(pool, fault=3, fault_step=2)
+        assert status.tolist() == [Status.ERROR]
+        assert "the warm-up failed: Probe_" in pool.failure(0)
+        assert set_up(pool)[1].tolist() == [Status.OK]
+
+    @all_versions
+    @pytest.mark.parametrize("parameters", [{"reset_status": 3}, {"fault": 4, "fault_step": 1}])
+    def test_an_instance_past_mending_is_replaced(self, pool, version, parameters):
+        pool = pool(version)
+        set_up(pool, **parameters)
+        step(pool)
+        assert set_up(pool)[0][2, 0] == 2  # instances made so far
+        self.assert_sound(pool)
+        assert set_up(pool)[0][2, 0] == 2
+
+    @all_versions
+    def test_an_fmu_that_refuses_to_be_replaced_for_a_while(self, pool, version):
+        pool = pool(version)
+        set_up(pool, fault=4, fault_step=1, refusals=2)
+        step(pool)
+        for _ in range(2):
+            assert set_up(pool)[1].tolist() == [Status.FATAL]
+            assert "refused to be instantiated" in pool.failure(0)
+            assert step(pool)[1].tolist() == [Status.FATAL]
+        self.assert_sound(pool)
+
+    @with_state
+    def test_a_state_that_cannot_be_restored(self, pool, version):
+        pool = pool(version)
+        for _ in range(4):
+            outputs, status = set_up(pool, restore_status=3)
+            assert status.tolist() == [Status.OK]
+            assert outputs[1].tolist() == [0.0]
+            step(pool)
+        self.assert_sound(pool)
+
+    @with_state
+    def test_a_snapshot_that_cannot_be_restored(self, pool, version):
+        pool = pool(version)
+        set_up(pool, restore_status=3)
+        _, status = pool.restore(pool.save())
+        assert status.tolist() == [Status.ERROR]
+        assert "restoring the FMU state returned Error" in pool.failure(0)
+        self.assert_sound(pool)
+
+    @with_state
+    def test_a_snapshot_of_a_replaced_instance(self, pool, version):
+        pool = pool(version)
+        set_up(pool, fault=4, fault_step=1)
+        snapshot = pool.save()
+        step(pool)
+        set_up(pool)
+        with pytest.raises(SimulationError, match="snapshot"):
+            pool.restore(snapshot)
+
+    @all_versions
+    def test_a_step_before_the_first_reset(self, pool, version):
+        pool = pool(version, 2)
+        assert step(pool)[1].tolist() == [Status.ERROR] * 2
+        assert "before a reset" in pool.failure(0)
+        self.assert_sound(pool)
+
+
+class TestStartValues:
+    @all_versions
+    def test_other_variables_at_each_reset(self, make_pool, probe, version):
+        """What is not given is at the FMU's own start value again."""
+        pool = make_pool(probe(version), ["a"], ["sum", "mix"])
+        set_up(pool, gain=2.0, b=0.5)
+        assert step(pool, 1.0)[0].tolist() == [[0.2], [6.0]]
+        set_up(pool, b=0.25)
+        assert step(pool, 1.0)[0].tolist() == [[0.1], [3.5]]
+        set_up(pool)
+        assert step(pool, 1.0)[0].tolist() == [[0.1], [1.0]]
+
+    @all_versions
+    def test_strings_and_integers(self, make_pool, probe, version, caplog):
+        pool = make_pool(probe(version), ["a"], ["steps"], 2, strings={"label": "here"})
+        for _ in range(4):
+            caplog.clear()
+            set_up(pool, log_status=[-1, 1])
+            step(pool)
+            assert caplog.text.count("step 1 of here is 100%") == 1
+
+    @with_state
+    def test_saved_states_do_not_pile_up(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["live"])
+        for index in range(20):
+            set_up(pool, gain=index // 4)
+        assert step(pool)[0][0, 0] <= 1
+
+    @all_versions
+    def test_only_the_columns_in_the_mask_are_used(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["sum"], 2)
+        set_up(pool, gain=[1.0, 2.0])
+        set_up(pool, np.array([True, False]), gain=[3.0, np.nan])
+        assert step(pool, 1.0)[0].tolist() == [[pytest.approx(0.3), 0.2]]
+
+    @all_versions
+    def test_inputs_do_not_survive_a_reset(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["mix"])
+        for _ in range(4):
+            assert set_up(pool)[0].tolist() == [[0.0]]
+            step(pool, 1.0)

@@ -1,0 +1,449 @@
+"""Every mistake of a user: the class of the error, its text, and that nothing stays behind."""
+
+import math
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from fmu_tools import PlainEnv, edited_fmu, probe_config, probe_fmu, write_fmu
+from gymnasium import spaces
+
+import fmugym
+from fmugym import ConfigError, FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMULoadError, SimulationError
+
+
+def at_construction(error, match, **changes):
+    return pytest.param(changes, error, match, id="-".join([*changes, match[:30]]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "match"),
+    [
+        # Names
+        at_construction(ConfigError, "unknown variable of Probe 'aa'", model_input_names="aa"),
+        at_construction(ConfigError, "'mxi'; did you mean 'mix'", model_output_names=["mxi"]),
+        at_construction(ConfigError, "'stepss'; did you mean 'steps'", monitor_names="stepss"),
+        at_construction(
+            ConfigError, "'gainn'; did you mean 'gain'", model_parameters={"gainn": 1.0}
+        ),
+        at_construction(ConfigError, "unknown config key 'timestep'; did you mean", timestep=0.1),
+        at_construction(ConfigError, "in 'bounds' 'smu'; did you mean", bounds={"smu": (0, 1)}),
+        at_construction(ConfigError, "names no output", model_output_names=[]),
+        at_construction(ConfigError, "'a' is named twice", model_input_names=["a", "a"]),
+        # Causality and variability
+        at_construction(ConfigError, "it is a constant local", model_input_names="seven"),
+        at_construction(ConfigError, "it is a fixed parameter", model_input_names="gain"),
+        at_construction(ConfigError, "it is a continuous output", model_input_names="mix"),
+        at_construction(ConfigError, "it is a fixed calcul", model_input_names="double_gain"),
+        at_construction(
+            ConfigError, "'sum' cannot be set: it is a continuous", model_parameters={"sum": 1.0}
+        ),
+        at_construction(
+            ConfigError, "'seven' cannot be set: it is a const", model_parameters={"seven": 1.0}
+        ),
+        at_construction(
+            ConfigError, "'double_gain' cannot be set", model_parameters={"double_gain": 1.0}
+        ),
+        at_construction(ConfigError, "of type String", model_output_names="label"),
+        at_construction(ConfigError, "'label' is a String", model_parameters={"label": 1.0}),
+        # Values
+        at_construction(ConfigError, "must be finite", model_parameters={"gain": math.nan}),
+        at_construction(ConfigError, "must be finite", model_parameters={"gain": -math.inf}),
+        at_construction(ConfigError, "must be a number", model_parameters={"gain": "two"}),
+        at_construction(ConfigError, "must be a number", model_parameters={"gain": [1.0]}),
+        at_construction(ConfigError, "is a Boolean, got 0.5", model_parameters={"leaky": 0.5}),
+        at_construction(
+            ConfigError, "expected an integer .* got 1.5", model_parameters={"fault": 1.5}
+        ),
+        at_construction(
+            ConfigError, "from -2147483648 to 2147483647", model_parameters={"fault": 2**31}
+        ),
+        at_construction(
+            ConfigError, "must be a number, got <class", model_parameters={"gain": fmugym.Uniform}
+        ),
+        # Types in the config
+        at_construction(ConfigError, "must be a dict with names as keys", model_parameters=[1]),
+        at_construction(ConfigError, "time_step must be a number", time_step="0.1"),
+        at_construction(ConfigError, "time_step must be positive", time_step=0),
+        at_construction(ConfigError, "'time_step' is missing", time_step=None),
+        at_construction(ConfigError, "substeps must be a positive integer", substeps=2.0),
+        at_construction(ConfigError, "unknown on_fault policy", on_fault="panic"),
+        at_construction(ConfigError, "warm_up must be a multiple", warm_up=0.25),
+        at_construction(ConfigError, "low < high", bounds={"a": (1, 0)}),
+        # Spaces
+        at_construction(ConfigError, "'free' has no min and max", model_input_names="free"),
+        at_construction(ConfigError, "there are no inputs", model_input_names=[]),
+    ],
+)
+def test_config(probe, temp_root, same_working_directory, changes, error, match):
+    with pytest.raises(error, match=match):
+        PlainEnv(probe(2), probe_config(**changes))
+    assert list(temp_root.iterdir()) == []
+
+
+@pytest.mark.parametrize("key", ["model_input_names", "model_output_names"])
+def test_missing_key(probe, temp_root, key):
+    config = probe_config()
+    del config[key]
+    with pytest.raises(ConfigError, match=f"'{key}' is missing"):
+        PlainEnv(probe(2), config)
+
+
+def test_no_config(probe):
+    with pytest.raises(ConfigError, match="config must be a dict, got NoneType"):
+        PlainEnv(probe(2), None)
+
+
+def test_unknown_render_mode(probe, temp_root):
+    with pytest.raises(ConfigError, match="unknown render mode 'human'; known are: none"):
+        PlainEnv(probe(2), probe_config(), render_mode="human")
+    with pytest.raises(ConfigError, match="'rgb_aray'; did you mean 'rgb_array'"):
+        fmugym.envs.CartPoleEnv(render_mode="rgb_aray")
+    assert list(temp_root.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("base", "version", "match"),
+    [
+        (
+            FMI1CSEnv,
+            2,
+            r"made for FMI 1\.0, but Probe\.fmu is an FMU of FMI 2\.0; derive from FMI2",
+        ),
+        (FMI2CSEnv, 3, r"made for FMI 2\.0, but .* FMI 3\.0; derive from FMI3CSEnv instead"),
+        (FMI3CSEnv, 1, r"made for FMI 3\.0, but .* FMI 1\.0; derive from FMI1CSEnv instead"),
+    ],
+)
+def test_class_of_another_fmi_version(probe, temp_root, base, version, match):
+    cls = type("Mine", (base,), {"_is_done": lambda self: False})
+    with pytest.raises(ConfigError, match=f"Mine is {match}"):
+        cls(probe(version), probe_config())
+    assert list(temp_root.iterdir()) == []
+
+
+def without_binary(probe, folder):
+    return edited_fmu(probe(2), folder, drop=["binaries"], add={"binaries/amiga/Probe.so": ""})
+
+
+def other_token(probe, folder):
+    return edited_fmu(probe(2), folder, {"{probe-": "{other-"})
+
+
+def no_zip(probe, folder):
+    path = folder / "some.fmu"
+    path.write_text("hello")
+    return path
+
+
+def no_fmu(probe, folder):
+    return write_fmu(folder / "some.fmu", {"readme.txt": "hello"})
+
+
+def exchange_only(probe, folder):
+    return probe_fmu(folder, 2, {"CoSimulation": "ModelExchange"})
+
+
+def library_is_text(probe, folder):
+    return edited_fmu(probe(2), folder, add={fmugym.FMU(probe(2)).library: b"hello" * 99})
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (without_binary, "no library for this platform .* it was built for: amiga"),
+        (other_token, "refused to be instantiated.*; the FMU said"),
+        (no_zip, r"some\.fmu is not an FMU \(a zip archive\)"),
+        (no_fmu, r"some\.fmu is not an FMU: it has no modelDescription\.xml"),
+        (exchange_only, "has no co-simulation interface; export the model for co-simulation"),
+        (library_is_text, "is not a shared library of this system"),
+        (lambda _, folder: folder / "absent.fmu", r"there is no FMU at .*absent\.fmu"),
+        (lambda *_: "absent.fmu", r"there is no FMU at .*absent\.fmu"),
+    ],
+)
+def test_file(probe, tmp_path, temp_root, same_working_directory, make, match):
+    path = make(probe, tmp_path)
+    with pytest.raises(FMULoadError, match=match):
+        PlainEnv(path, probe_config())
+    assert list(temp_root.iterdir()) == []
+
+
+@pytest.mark.parametrize("path", [None, 3, ["a.fmu"]])
+def test_no_path(path):
+    with pytest.raises((ConfigError, TypeError)):
+        PlainEnv(path, probe_config())
+
+
+def test_a_class_without_is_done(probe):
+    class Unfinished(fmugym.FMUEnv):
+        pass
+
+    with pytest.raises(TypeError, match="_is_done"):
+        Unfinished(probe(2), probe_config())
+
+
+class TestActions:
+    @pytest.mark.parametrize(
+        ("names", "action", "match"),
+        [
+            ("a", math.nan, "makes a = nan; every input must be finite"),
+            ("a", [math.inf], "makes a = inf; every input must be finite"),
+            (["a", "b"], [0.0, -math.inf], r"makes a = 0\.0, b = -inf; every input must be finite"),
+            (["a", "on"], [0.0, math.nan], "on = nan; every input must be finite"),
+            ("a", [0.0, 0.0], r"makes 2 values, expected 1, one for each input \(a\)"),
+            (["b", "a"], [0.0], r"makes 1 values, expected 2, one for each input \(b, a\)"),
+            (["b", "a"], 0.0, "makes 1 values, expected 2"),
+            ("a", [], "makes 0 values, expected 1"),
+            ("a", "left", "action 'left' does not make numbers"),
+            ("a", {"a": 1.0}, "does not make numbers"),
+            ("a", 1j, "does not make numbers"),
+            ("a", 10**400, "number"),
+            ("a", None, "None"),
+            ("n", 11, r"action 11 is not in Discrete\(11\)"),
+            ("n", -1, r"action -1 is not in Discrete\(11\)"),
+            ("n", 1.0, r"action 1\.0 is not in Discrete"),
+            ("mode", "turbo", "action 'turbo' is not in Discrete"),
+            ("mode", None, "action None is not in Discrete"),
+            (["n", "a"], [3e9, 0.0], "'n' is of type Integer: expected an integer from"),
+            (["mode", "a"], [9.0, 0.0], "'mode': expected one of 1"),
+        ],
+    )
+    def test_that_do_not_fit(self, make_env, names, action, match):
+        env = make_env(model_input_names=names)
+        env.reset()
+        before, inputs = env.action, env.inputs
+        with pytest.raises(ConfigError, match=match):
+            env.step(action)
+        assert env.action is before
+        assert (env.step_count, env.time, env.inputs) == (0, 0.0, inputs)
+        env.step(env.action_space.sample())  # the episode goes on with a better action
+        assert env.step_count == 1
+
+    def test_text_is_no_number(self, make_env):
+        env = make_env()
+        env.reset()
+        with pytest.raises(ConfigError, match="does not make numbers"):
+            env.step("0.5")
+
+
+class TestOrder:
+    def test_step_before_reset(self, make_env):
+        with pytest.raises(SimulationError, match="step was called before the first reset"):
+            make_env().step(0.0)
+
+    def test_step_after_the_end(self, make_env):
+        env = make_env(max_episode_steps=2)
+        env.reset()
+        env.step(0.0)
+        assert env.step(0.0)[3]
+        for _ in range(2):
+            with pytest.raises(SimulationError, match="after the end of the episode; call reset"):
+                env.step(0.0)
+        env.reset()
+        env.step(0.0)
+
+    def test_after_close(self, make_env):
+        env = make_env()
+        env.reset()
+        env.close()
+        for method, call in [
+            ("step", lambda: env.step(0.0)),
+            ("reset", env.reset),
+            ("read_variables", lambda: env.read_variables("sum")),
+        ]:
+            with pytest.raises(SimulationError, match=f"{method} was called on a closed PlainEnv"):
+                call()
+
+    def test_reading_variables_before_reset(self, make_env):
+        with pytest.raises(SimulationError, match="read_variables was called before the first"):
+            make_env().read_variables("sum")
+
+    def test_reading_what_is_not_there(self, make_env):
+        env = make_env()
+        env.reset()
+        with pytest.raises(ConfigError, match="'sume'; did you mean 'sum'"):
+            env.read_variables("sume")
+        with pytest.raises(ConfigError, match="'label' cannot be an output"):
+            env.read_variables("label")
+
+    def test_render_before_reset(self):
+        env = fmugym.envs.CartPoleEnv(render_mode="rgb_array")
+        with pytest.raises(SimulationError, match="render was called before the first reset"):
+            env.render()
+        env.close()
+
+    def test_render_without_a_mode(self, make_env):
+        env = make_env()
+        env.reset()
+        with pytest.warns(UserWarning, match="no render_mode was given at construction"):
+            assert env.render() is None
+
+    def test_render_modes_without_a_scene(self, make_env):
+        class Drawn(PlainEnv):
+            metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+        env = make_env(cls=Drawn, render_mode="rgb_array")
+        env.reset()
+        with pytest.raises(SimulationError, match="Drawn has render modes, but no _get_scene"):
+            env.render()
+
+
+class TestResetOptions:
+    @pytest.mark.parametrize(
+        ("options", "match"),
+        [
+            ({"parameters": {}}, "unknown reset option 'parameters'; did you mean"),
+            ({"model_parameters": [1]}, "option 'model_parameters' must be a dict"),
+            ({"model_parameters": {"gian": 1.0}}, "'gian'; did you mean 'gain'"),
+            ({"model_parameters": {"seven": 1.0}}, "'seven' cannot be set"),
+            ({"model_parameters": {"sum": 1.0}}, "'sum' cannot be set"),
+            ({"model_parameters": {"double_gain": 1.0}}, "'double_gain' cannot be set"),
+            ({"model_parameters": {"gain": math.nan}}, "'gain' must be finite"),
+            ({"model_parameters": {"gain": None}}, "'gain' must be a number"),
+            ({"model_parameters": {"leaky": 0.3}}, "'leaky' is a Boolean"),
+            ({"model_parameters": {"fault": 2**31}}, "'fault' is of type Integer"),
+            ({"model_parameters": {"label": "x"}}, "it can be set in the config only"),
+            ({"model_parameters": {"leaky": fmugym.Uniform(0, 1)}}, "'leaky' is a Boolean, got 0"),
+        ],
+    )
+    def test_that_do_not_fit(self, make_env, options, match):
+        env = make_env()
+        env.reset()
+        with pytest.raises(ConfigError, match=match):
+            env.reset(options=options)
+        env.reset()
+        env.step(0.0)
+
+    @pytest.mark.parametrize("options", [3, "gain", ["gain"]])
+    def test_no_dict(self, make_env, options):
+        with pytest.raises(ConfigError, match=r"option"):
+            make_env().reset(options=options)
+
+    def test_an_fmu_that_cannot_be_initialized(self, make_env):
+        env = make_env()
+        env.reset()
+        with pytest.raises(SimulationError, match="initialization returned Error; the FMU said"):
+            env.reset(options={"model_parameters": {"init_status": 3}})
+        with pytest.raises(SimulationError, match="call reset"):
+            env.step(0.0)
+        env.reset()
+        env.step(0.0)
+
+
+def one_step(env):
+    env.reset(seed=1)
+    env.step(0.0)
+
+
+class TestHooks:
+    @pytest.mark.parametrize(
+        "hook",
+        [
+            "_is_done",
+            "_is_truncated",
+            "_reward_policy",
+            "_get_observation",
+            "_get_info",
+            "_get_inputs",
+        ],
+    )
+    def test_that_return_none(self, make_env, hook):
+        cls = type("Forgot", (PlainEnv,), {hook: lambda self: None})
+        env = make_env(cls=cls)
+        with pytest.raises(ConfigError, match=f"{hook} returned None"):
+            one_step(env)
+
+    @pytest.mark.parametrize(
+        "hook",
+        ["_is_done", "_reward_policy", "_get_observation", "_get_info", "_get_inputs", "_update"],
+    )
+    def test_that_draw_random_numbers(self, make_env, hook):
+        cls = type("Random", (PlainEnv,), {hook: lambda self: self.np_random.uniform()})
+        env = make_env(cls=cls)
+        with pytest.raises(
+            SimulationError, match="a hook drew random numbers; give a distribution"
+        ):
+            one_step(env)
+        assert 0 <= env.np_random.uniform() < 1  # outside of hooks it is there
+
+    def test_unknown_names_in_hooks(self, make_env):
+        class Misspelt(PlainEnv):
+            def _update(self):
+                self.variables["integrl"] += self.out["sum"]
+
+        env = make_env(cls=Misspelt, episode_variables={"integral": 0.0})
+        env.reset()
+        with pytest.raises(ConfigError, match="'integrl'; did you mean 'integral'"):
+            env.step(0.0)
+        with pytest.raises(ConfigError, match="unknown output 'summ'; did you mean 'sum'"):
+            env.out["summ"]
+
+    def test_a_goal_reward_that_is_not_there(self, make_env):
+        with pytest.raises(SimulationError, match="PlainEnv is no goal task"):
+            make_env().compute_reward(np.zeros(1), np.zeros(1), {})
+
+
+class TestBundled:
+    def test_unknown_model_and_version(self):
+        with pytest.raises(ConfigError, match="unknown bundled model 'Cartpole'; did you mean"):
+            fmugym.bundled_fmu("Cartpole")
+        with pytest.raises(ConfigError, match=r"unknown FMI version '4\.0'"):
+            fmugym.bundled_fmu("CartPole", 4)
+
+    def test_keywords_of_gym_make(self):
+        with pytest.raises(ConfigError, match=r"unknown FMI version '2\.1'; did you mean"):
+            gymnasium.make("fmugym/CartPole-v0", fmi_version="2.1")
+        with pytest.raises(ConfigError, match="unknown variable of CartPole 'mpole'"):
+            gymnasium.make("fmugym/CartPole-v0", model_parameters={"mpole": 1.0})
+
+    @pytest.mark.parametrize(
+        ("name", "options"),
+        [
+            ("CartPole", {"low": 1.0}),
+            ("CartPole", {"low": "x"}),
+            ("CartPole", {"high": None}),
+            ("CartPole", {"lo": 0.0}),
+            ("Pendulum", {"x_init": "x"}),
+            ("Pendulum", {"y_init": None}),
+            ("Pendulum", {"x_init": -1.0}),
+            ("Pendulum", {"y_int": 1.0}),
+        ],
+    )
+    def test_reset_options(self, name, options):
+        env = gymnasium.make(f"fmugym/{name}-v0", disable_env_checker=True)
+        with pytest.raises(ConfigError):
+            env.reset(options=options)
+        env.reset()
+        env.close()
+
+    def test_an_action_out_of_range(self):
+        env = fmugym.envs.CartPoleEnv()
+        env.reset()
+        with pytest.raises(ConfigError, match=r"action 2 is not in Discrete\(2\)"):
+            env.step(2)
+        env.close()
+
+
+def test_a_step_smaller_than_the_internal_one_is_warned_of(tmp_path, caplog):
+    flag = 'canHandleVariableCommunicationStepSize="true"'
+    path = probe_fmu(tmp_path, 3, {flag: flag + ' fixedInternalStepSize="0.2"'})
+    PlainEnv(path, probe_config(time_step=0.2)).close()
+    assert caplog.text == ""
+    PlainEnv(path, probe_config(time_step=0.2, substeps=2)).close()
+    assert "step of 0.1 s is smaller than the internal step of 0.2 s of Probe.fmu" in caplog.text
+
+
+def test_errors_survive_pickling():
+    for error in (ConfigError("a"), FMULoadError("b"), SimulationError("c")):
+        copy = pickle.loads(pickle.dumps(error))
+        assert (type(copy), str(copy)) == (type(error), str(error))
+        assert isinstance(copy, fmugym.FMUGymError)
+
+
+def test_spaces_are_checked_when_hooks_override_them(make_env):
+    class Odd(PlainEnv):
+        def _get_observation_space(self):
+            return spaces.Discrete(3)
+
+    with pytest.raises(ConfigError, match="2 outputs do not make an element of Discrete"):
+        make_env(cls=Odd)

@@ -1,0 +1,83 @@
+"""Reading outputs and writing episode variables by name."""
+
+import copy
+import pickle
+
+import pytest
+
+from fmugym import ConfigError
+from fmugym.values import EpisodeVariables, NamedValues
+
+
+class TestNamedValues:
+    def test_it_shows_the_present_values(self):
+        values = [1.0, 2.0]
+        named = NamedValues("output", ["x", "y"], lambda: values)
+        values[1] = 3.0
+        assert named["y"] == 3.0
+        assert dict(named) == {"x": 1.0, "y": 3.0}
+        assert list(named) == ["x", "y"]
+        assert len(named) == 2
+        assert repr(named) == "NamedValues({'x': 1.0, 'y': 3.0})"
+
+    def test_unknown_name(self):
+        named = NamedValues("output", ["theta"], lambda: [0.0])
+        with pytest.raises(ConfigError, match="unknown output 'thet'; did you mean 'theta'"):
+            named["thet"]
+
+    def test_it_cannot_be_written(self):
+        named = NamedValues("output", ["x"], lambda: [0.0])
+        with pytest.raises(TypeError):
+            named["x"] = 1.0
+
+
+class TestEpisodeVariables:
+    @pytest.fixture
+    def variables(self):
+        variables = EpisodeVariables({"target": 1.0, "integral": 0.0})
+        variables["target"], variables["integral"] = 1.0, 0.0
+        return variables
+
+    def test_read_and_write(self, variables):
+        variables["integral"] += 0.5
+        variables.update(target=2.0)
+        variables |= {"integral": 0.7}
+        assert variables == {"target": 2.0, "integral": 0.7}
+        assert variables.setdefault("target", 9.0) == 2.0
+
+    @pytest.mark.parametrize(
+        "write",
+        [
+            lambda v: v["targt"],
+            lambda v: v.__setitem__("targt", 1.0),
+            lambda v: v.update(targt=1.0),
+            lambda v: v.update({"targt": 1.0}),
+            lambda v: v.__ior__({"targt": 1.0}),
+            lambda v: v.setdefault("targt", 1.0),
+        ],
+    )
+    def test_misspelt_name(self, variables, write):
+        with pytest.raises(ConfigError, match="variable 'targt'; did you mean 'target'"):
+            write(variables)
+        assert set(variables) == {"target", "integral"}
+
+    @pytest.mark.parametrize(
+        "remove",
+        [
+            lambda v: v.pop("target"),
+            lambda v: v.popitem(),
+            lambda v: v.clear(),
+            lambda v: v.__delitem__("target"),
+        ],
+    )
+    def test_none_can_be_removed(self, variables, remove):
+        with pytest.raises(ConfigError, match="none can be removed"):
+            remove(variables)
+        assert set(variables) == {"target", "integral"}
+
+    @pytest.mark.parametrize(
+        "clone", [copy.copy, copy.deepcopy, lambda v: pickle.loads(pickle.dumps(v))]
+    )
+    def test_copies_are_dicts(self, variables, clone):
+        """For an info, for example, that is sent to another process."""
+        assert clone(variables) == {"target": 1.0, "integral": 0.0}
