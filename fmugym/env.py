@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
 
+_WARNING = int(Status.WARNING)
+_TERMINATED = int(Status.TERMINATED)
+
 _pool_request: ContextVar[tuple[int, dict[str, Any]]] = ContextVar("request", default=(1, {}))
 
 
@@ -146,7 +149,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._prepare_spaces()
         num_instances, pool_options = _pool_request.get()
         self._pool = make_pool(self.fmu, self._spec, num_instances, self.logger, **pool_options)
+        self._step_pool = self._pool.step_own
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
+        self._observation_row = self._pool.observations[0]
 
     def _checked_render_mode(self, mode: str | None) -> str | None:
         if mode is not None and mode not in self.metadata["render_modes"]:
@@ -215,7 +220,13 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         derived = cls._get_action_space is FMUEnv._get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
         self._action_values = values
-        if cls._get_observation is FMUEnv._get_observation:
+        default = cls._get_observation is FMUEnv._get_observation
+        space = self.observation_space
+        # Then the pool makes the observation in the same pass.
+        self._pool_observes = (
+            default and isinstance(space, spaces.Box) and space.dtype == np.float32
+        )
+        if default:
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
         self._no_action = _no_action(self.action_space)
         self._elements = _elements(self.action_space) if cls.step is FMUEnv.step else None
@@ -430,9 +441,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._in_hooks = True
         try:
             self._take_action(action)
-            pool.step()
+            troubled = self._step_pool()
             self.step_count += 1
-            result = self._evaluate(pool, pool.statuses.item(0))
+            result = self._evaluate(pool, pool.statuses.item(0) if troubled else 0)
         finally:
             self._in_hooks = False
         if self.render_mode is not None:
@@ -460,7 +471,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         return self._pool
 
     def _take_action(self, action: Any) -> None:
-        if self._elements is not None and not _is_element(action, self._elements):
+        elements = self._elements
+        if elements is not None and not _is_element(action, elements):
             raise ConfigError(f"action {action!r} is not in {self.action_space}")
         before = self.action, self.previous_action, self.previous_state
         self.previous_action, self.action, self.previous_state = self.action, action, self.state
@@ -471,13 +483,13 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             raise
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and isinstance(values, float):
-            inputs: tuple[float, ...] = (float(values),)
-        else:
-            inputs = tuple(self._flat_inputs(values).tolist())
-        for value in inputs:
-            if value - value != 0.0:
-                self._raise_for_inputs(inputs, "every input must be finite")
+        if self._takes_one_real and isinstance(values, float) and values - values == 0.0:
+            self._input_row[0] = values
+            self.inputs = (float(values),)
+            return
+        inputs = tuple(self._flat_inputs(values).tolist())
+        if not all(map(math.isfinite, inputs)):
+            self._raise_for_inputs(inputs, "every input must be finite")
         self._input_row[:] = inputs
         self.inputs = inputs
 
@@ -505,27 +517,31 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         raise ConfigError(f"action {self.action!r} makes {listing}; {why}")
 
     def _evaluate(self, pool: Pool, status: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        stopped = False
-        if status != 0:
-            stopped = status == Status.TERMINATED
-            if status > Status.WARNING and not stopped:
-                return self._fault(pool.failure(0))
+        stopped = status == _TERMINATED
+        if status > _WARNING and not stopped:
+            return self._fault(pool.failure(0))
         self.after_end = self._ended
         self._set_values()
         if self._has_update:
             self._update()
-        done = _given(self._is_done(), "_is_done")
+        done = self._is_done()
         self.done = terminated = stopped or bool(done)
         truncated = self.step_count >= self._step_limit
-        if self._has_truncation and not truncated:
-            truncated = bool(_given(self._is_truncated(), "_is_truncated"))
-        reward = _given(self._reward_policy(), "_reward_policy")
-        observation = _given(self._get_observation(), "_get_observation")
+        if self._has_truncation:
+            truncated = bool(_given(self._is_truncated(), "_is_truncated")) or truncated
+        reward = self._reward_policy()
+        if self._pool_observes:
+            observation: Any = self._observation_row.copy()
+        else:
+            observation = _given(self._get_observation(), "_get_observation")
         info = _given(self._get_info(), "_get_info") if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
         if terminated or truncated:
             self._ended = True
+        if done is None or reward is None:
+            _given(done, "_is_done")
+            _given(reward, "_reward_policy")
         return observation, float(reward), terminated, truncated, info
 
     @property
@@ -674,6 +690,8 @@ def _elements(space: spaces.Space[Any]) -> range | None:
 
 
 def _is_element(action: Any, elements: range) -> bool:
+    if type(action) is int:
+        return action in elements
     try:
         return operator.index(action) in elements
     except TypeError:

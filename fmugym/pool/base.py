@@ -76,6 +76,8 @@ class Pool(Protocol):
     """Shape (k, N)."""
     statuses: StatusArray
     """Shape (N,)."""
+    observations: npt.NDArray[np.float32]
+    """What ``step_own`` fills as ``step`` fills its argument, shape (N, num_observed)."""
 
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
@@ -109,6 +111,14 @@ class Pool(Protocol):
 
         Returns:
             The outputs, shape (k, N), and the statuses, shape (N,).
+        """
+        ...
+
+    def step_own(self) -> int:
+        """Do one step with what was written to ``inputs``, and fill ``observations``.
+
+        Returns:
+            How many of the instances have a status worse than a warning.
         """
         ...
 

@@ -39,6 +39,7 @@ class PythonPool:
         output_rows = np.zeros((num_instances, len(spec.outputs)))
         self.inputs, self.outputs = input_rows.T, output_rows.T
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
+        self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._library = Library(fmu, log)
         try:
             self._slots = [
@@ -73,6 +74,11 @@ class PythonPool:
         if observations is not None:
             np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
         return self.outputs, self.statuses
+
+    def step_own(self) -> int:
+        """See ``Pool.step_own``."""
+        self.step(None, None, self.observations)
+        return int(np.count_nonzero(self.statuses > Status.WARNING))
 
     def save(self) -> list[_Snapshot]:
         """See ``Pool.save``."""

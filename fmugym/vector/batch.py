@@ -90,7 +90,6 @@ class BatchEngine(Engine):
         self._streams = EpisodeStreams(num_envs, env._plan)
         self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
-        self._pool_observes = _pool_observes(env)
         batched(env, num_envs)
         env._values, env.inputs = self._pool.outputs, self._pool.inputs
         env.state = self._pool.outputs[: env._output_count]
@@ -185,8 +184,9 @@ class BatchEngine(Engine):
             if np.shape(variables[name]) != (self._n,) or not variables[name].flags.writeable:
                 variables[name] = np.array(np.broadcast_to(variables[name], self._n))
             row: FloatArray = variables[name]
-            return row
-        return self._parameters.setdefault(name, np.full(self._n, np.nan))
+        else:
+            row = self._parameters.setdefault(name, np.full(self._n, np.nan))
+        return row
 
     # Steps.
 
@@ -255,7 +255,7 @@ class BatchEngine(Engine):
             raise ConfigError(f"an input of environment {index} is not finite: {inputs[:, index]}")
 
     def _new_observations(self) -> npt.NDArray[np.float32] | None:
-        if not self._pool_observes:
+        if not self.env._pool_observes:
             return None
         return np.empty((self._n, self.env._output_count), np.float32)
 
@@ -356,13 +356,6 @@ class BatchEngine(Engine):
         result.rewards[failed] = config.fault_reward
         result.terminated[failed] = config.on_fault == "terminate"
         result.truncated[failed] = config.on_fault == "truncate"
-
-
-def _pool_observes(env: FMUEnv) -> bool:
-    """Whether the default observation is what the pool writes in the same pass."""
-    default = type(env)._get_observation is FMUEnv._get_observation
-    space = env.observation_space
-    return default and isinstance(space, spaces.Box) and space.dtype == np.float32
 
 
 def _masked(drawn: dict[str, FloatArray], mask: MaskArray) -> dict[str, Any]:

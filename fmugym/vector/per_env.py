@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from fmugym.adapters import Status
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.model_description import Variable
@@ -112,6 +113,8 @@ def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     single._pool = _Column(pool, index)
     single._input_row = single._pool.inputs[:, 0]
     single._output_row = single._pool.outputs[:, 0]
+    single._observation_row = single._pool.observations[0]
+    single._step_pool = single._pool.step_own
     single._np_random = None
     return single
 
@@ -137,6 +140,7 @@ class _Column:
         self.inputs: FloatArray = pool.inputs[:, index : index + 1]
         self.outputs: FloatArray = pool.outputs[:, index : index + 1]
         self.statuses: StatusArray = pool.statuses[index : index + 1]
+        self.observations = pool.observations[index : index + 1]
 
     def _mask(self, value: bool) -> MaskArray:
         mask = np.full(self._pool.num_instances, not value)
@@ -162,6 +166,12 @@ class _Column:
             self.inputs[:] = inputs
         self._pool.step(None, self._mask(False))
         return self.outputs, self.statuses
+
+    def step_own(self) -> int:
+        """See ``Pool.step_own``."""
+        self.step()
+        self.observations[0] = self.outputs[: self.observations.shape[1], 0]
+        return int(self.statuses[0] > Status.WARNING)
 
     def save(self) -> Any:
         """See ``Pool.save``."""
