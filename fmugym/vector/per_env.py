@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.values import EpisodeVariables
 from fmugym.vector.batch import Engine, StepResult
-from fmugym.vector.views import light_copy
+from fmugym.vector.views import copied_attributes, light_copy
 
 __all__ = ["PerEnvEngine"]
 
@@ -56,7 +56,9 @@ class PerEnvEngine(Engine):
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         for env, value in zip(self.envs, values.tolist(), strict=True):
-            env._plan = env._plan_episode({name: value})
+            parameters = {**env._interface.parameters, name: value}
+            env._interface = replace(env._interface, parameters=parameters)
+            env._plan = env._plan_episode({})
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
@@ -105,10 +107,7 @@ class PerEnvEngine(Engine):
 def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     """Share what is costly, and copy whatever else the subclass has put into its attributes."""
     single = light_copy(env)
-    shared = {id(value): value for value in _shared(env)}
-    for name, value in env.__dict__.items():
-        if name not in {"out", "_pool"} and not callable(value):
-            single.__dict__[name] = _copied(value, dict(shared))
+    single.__dict__.update(copied_attributes(env))
     single.variables = EpisodeVariables(env.config.episode_variables)
     single._pool = _Column(pool, index)
     single._input_row = single._pool.inputs[:, 0]
@@ -117,17 +116,6 @@ def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     single._step_pool = single._pool.step_own
     single._np_random = None
     return single
-
-
-def _shared(env: FMUEnv) -> tuple[Any, ...]:
-    return (env.fmu, env.config, env._interface, env._spec, env._plan, env.logger, env.spec)
-
-
-def _copied(value: Any, memo: dict[int, Any]) -> Any:
-    try:
-        return copy.deepcopy(value, memo)
-    except Exception:  # an attribute of the user's that cannot be copied is shared
-        return value
 
 
 class _Column:

@@ -56,8 +56,7 @@ class EpisodeStreams:
             self._generators[index] = generator
         ahead = int(self._length - self.used[index]) * self._draws
         if ahead:
-            bits: Any = generator.bit_generator
-            bits.advance(-ahead)
+            _take_back(generator.bit_generator, ahead)
             self.used[index] = self._length
         return generator
 
@@ -87,3 +86,11 @@ class EpisodeStreams:
         for index in indices.tolist():
             self.generator(index).random(out=self.block[index])
             self.used[index] = 0
+
+
+def _take_back(bits: Any, count: int) -> None:
+    """Go back in a stream, but keep the half of a number that an integer draw left over."""
+    before = bits.state
+    bits.advance(-count)
+    if before["has_uint32"]:
+        bits.state = {**before, "state": bits.state["state"]}

@@ -2,25 +2,59 @@
 
 from __future__ import annotations
 
+import copy
+import logging
 from collections.abc import Mapping
-from types import MappingProxyType
+from types import MappingProxyType, MethodType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 
+from fmugym.archive import FMU
+from fmugym.config import EnvConfig, Interface
 from fmugym.env import FMUEnv
+from fmugym.episode import EpisodePlan
+from fmugym.pool import PoolSpec
 from fmugym.values import EpisodeVariables, NamedValues
 
-__all__ = ["batched", "column", "envs_first", "light_copy", "take"]
+__all__ = ["batched", "column", "copied_attributes", "envs_first", "light_copy", "take"]
+
+_SHARED_TYPES = (
+    *(bool, int, float, complex, str, bytes, type(None), np.generic),
+    *(MappingProxyType, logging.Logger, spaces.Space),
+    *(FMU, EnvConfig, Interface, PoolSpec, EpisodePlan, NamedValues),
+)
+"""Types of attributes that do not change, and of what is too costly to be copied."""
 
 
 def light_copy(env: FMUEnv) -> FMUEnv:
     """Copy an environment without loading the FMU again: all attributes are shared."""
     copied = type(env).__new__(type(env))
     copied.__dict__.update(env.__dict__)
+    for name, value in env.__dict__.items():
+        if isinstance(value, MethodType) and value.__self__ is env:
+            copied.__dict__[name] = MethodType(value.__func__, copied)
     copied.out = NamedValues("output", list(env.out), lambda: copied._values)
     return copied
+
+
+def copied_attributes(env: FMUEnv) -> dict[str, Any]:
+    """Copies of the attributes that hooks might change, one by one, by name."""
+    memo = {id(env): env, id(env._pool): env._pool, id(env.spec): env.spec}
+    return {
+        name: _copied(value, memo)
+        for name, value in env.__dict__.items()
+        if not isinstance(value, _SHARED_TYPES) and not callable(value)
+    }
+
+
+def _copied(value: Any, memo: dict[int, Any]) -> Any:
+    try:
+        return copy.deepcopy(value, memo.copy())
+    except Exception:  # an attribute of the user's that cannot be copied is shared
+        return value
 
 
 def batched(env: FMUEnv, count: int) -> None:

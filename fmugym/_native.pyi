@@ -1,0 +1,163 @@
+"""Pools of FMU instances in C; ``fmugym.pool.native`` is the way to use them.
+
+Arrays may be anything with a buffer: float64 for values, bool for masks, float32 for observations,
+int8 for statuses. Those that are only read may have any strides.
+"""
+
+from collections.abc import Callable
+from typing import Any, final
+
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+@final
+class Access:
+    """A list of variables of one FMI version.
+
+    Args:
+        version: 1, 2 or 3.
+        types: One byte for each variable, the number of its C type; see ``fmi.h``.
+        references: Their value references, as bytes of native 32-bit integers.
+    """
+
+    def __new__(cls, version: int, types: bytes, references: bytes, /) -> Access: ...
+
+@final
+class Snapshot:
+    """The FMU states of a pool, freed with the last reference to this object."""
+
+@final
+class Pool:
+    """N instances of one FMU.
+
+    ``inputs``, ``outputs``, ``status`` and ``observations`` are the pool's own arrays. A call that
+    is given the very object ``inputs`` or ``observations`` uses it without a look at its buffer.
+
+    Raises:
+        OSError: If the FMU cannot be loaded or instantiated.
+    """
+
+    def __new__(
+        cls,
+        version: int,
+        model: bytes,
+        token: bytes,
+        resources: bytes,
+        paths: tuple[bytes, ...],
+        private_libraries: bool,
+        logging: bool,
+        can_save: bool,
+        start_time: float,
+        stop_time: float | None,
+        tolerance: float | None,
+        time_step: float,
+        substeps: int,
+        warm_up_steps: int,
+        strings: tuple[tuple[int, bytes], ...],
+        input_variables: Access,
+        output_variables: Access,
+        num_observed: int,
+        count: int,
+        threads: int,
+        inputs: Array,
+        outputs: Array,
+        status: Array,
+        observations: Array,
+        callback: Callable[[int, int, str, str], object],
+        /,
+    ) -> Pool: ...
+    def step_own(self) -> int:
+        """Step all with the pool's own inputs; writes the pool's own observations.
+
+        Returns:
+            How many of the instances have a status worse than a warning now; so do the others.
+        """
+
+    def step(self, inputs: Array | None, skip: Array | None, observations: Array | None, /) -> int:
+        """Step all but those in ``skip``; ``None`` for ``inputs`` means the pool's own."""
+
+    def reset(
+        self, start: Access, values: Array, mask: Array | None, observations: Array | None, /
+    ) -> int:
+        """Start those in the mask anew, and write their observations."""
+
+    def step_or_reset(
+        self,
+        inputs: Array | None,
+        start: Access,
+        values: Array,
+        mask: Array | None,
+        observations: Array | None,
+        /,
+    ) -> int:
+        """Start those in the mask anew and step the others, and write all observations."""
+
+    def prepare_play(
+        self,
+        start: Access,
+        inputs: tuple[bytes, bytes, bytes],
+        judgement: tuple[bytes, bytes, bytes],
+        lowest_action: int,
+        highest_action: int,
+        limit: int,
+        draws: int,
+        episodes: int,
+        start_values: Array,
+        block: Array,
+        used: Array,
+        low: Array,
+        width: Array,
+        rows: Array,
+        step_counts: Array,
+        ended: Array,
+        /,
+    ) -> None:
+        """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
+
+    def play(
+        self,
+        actions: Array,
+        observations: Array,
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        /,
+    ) -> tuple[int, int, int]:
+        """Do a step, with all that was taken over.
+
+        Raises:
+            TypeError: If the actions are no int64.
+            ValueError: If there is a wrong number of them, or one is out of range.
+        """
+
+    def save(self) -> Snapshot | int:
+        """Save the states of all; or tell which instance refuses."""
+
+    def restore(self, snapshot: Snapshot, mask: Array | None, /) -> int:
+        """Return to a snapshot.
+
+        Raises:
+            ValueError: If the snapshot is another pool's, or an instance was replaced since.
+        """
+
+    def read(self, variables: Access, values: Array, /) -> int:
+        """Read variables of all; returns the instance that refuses, or -1."""
+
+    def failure(self, index: int, /) -> tuple[str, bool, int, float, int, str, bytes | None] | None:
+        """Tell what failed last.
+
+        Returns:
+            The call (a whole sentence where the status is -1), whether in the warm-up, the status,
+            the time of a step (else NaN), the String that could not be set (else 2**32 - 1), what
+            the FMU logged, and the outputs where these are the reason.
+        """
+
+    def close(self) -> None:
+        """Free all instances; more than one call is fine."""
+
+    def costs(self) -> tuple[float, float, float]:
+        """The measured ns per instance of ``step``, ``reset``, ``step_or_reset``; 0 if unknown."""
+
+    def uses_states(self) -> bool:
+        """Whether resets restore saved initial states, as far as is known by now."""

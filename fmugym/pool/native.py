@@ -1,0 +1,489 @@
+"""The pool in C: a thousand instances stepped in one call, on several threads.
+
+It does what ``PythonPool`` does, bit for bit, whatever the number of threads. Beyond the contract
+of ``Pool`` it offers arrays of its own and calls without any conversion, for the vector
+environment:
+
+* write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
+  ``pool.observations``;
+* ``pool.step_into`` and ``pool.reset_into`` write the observations to memory of the caller and
+  return how many of the instances had trouble, so that statuses are looked at only if there is any;
+* ``pool.step_or_reset`` starts ended instances anew while the others are stepped.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import shutil
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym import _native
+from fmugym.adapters import Status
+from fmugym.archive import FMU
+from fmugym.errors import FMULoadError, SimulationError
+from fmugym.model_description import Variable
+from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+
+__all__ = ["NativePool"]
+
+_TYPES: Final = (
+    "Float64",
+    "Float32",
+    "Int8",
+    "Int16",
+    "Int32",
+    "Int64",
+    "UInt8",
+    "UInt16",
+    "UInt32",
+    "UInt64",
+    "Boolean",
+)
+"""The C types in the order of ``enum Type`` of ``native/fmi.h``."""
+
+_OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
+_LEVELS: Final = (
+    logging.INFO,
+    logging.WARNING,
+    logging.WARNING,
+    logging.ERROR,
+    logging.CRITICAL,
+)
+_MOST_CACHED: Final = 64
+_NO_STRING: Final = 2**32 - 1
+
+FloatArray32 = npt.NDArray[np.float32]
+IndexArray = npt.NDArray[np.int64]
+
+
+class NativePool:
+    """N instances stepped by the C extension; see ``Pool`` for the contract.
+
+    Args:
+        fmu: The FMU; closed with the pool.
+        spec: What to do at each reset and step.
+        num_instances: N.
+        log: The logger that gets the FMU's messages.
+        threads: The most threads to work on, the calling one included; by default one for each
+            processor that this process may use. Results do not depend on it.
+        private_libraries: Whether each instance gets a copy of the FMU's library, and so of its
+            global variables, of its own; by default only where the FMU says that it can be
+            instantiated only once per process. See ``fmugym.pool.isolation``.
+
+    Attributes:
+        inputs: The inputs of ``step_own``, shape (k_in, N), float64.
+        outputs: The outputs, shape (k, N), float64.
+        statuses: The statuses, shape (N,), int8.
+        observations: The observations of ``step_own``, shape (N, num_observed), float32.
+        threads: The most threads that work on a call.
+
+    Raises:
+        FMULoadError: If the FMU cannot be loaded or instantiated.
+    """
+
+    def __init__(
+        self,
+        fmu: FMU,
+        spec: PoolSpec,
+        num_instances: int,
+        log: logging.Logger,
+        *,
+        threads: int | None = None,
+        private_libraries: bool | None = None,
+    ) -> None:
+        capabilities = fmu.description.capabilities
+        if private_libraries is None:
+            once = capabilities.can_be_instantiated_only_once_per_process
+            private_libraries = once and num_instances > 1
+        self.num_instances = num_instances
+        self.threads = available_processors() if threads is None else max(1, threads)
+        self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))
+        self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
+        self.statuses: StatusArray = np.zeros(num_instances, np.int8)
+        self.observations: FloatArray32 = np.zeros((num_instances, spec.num_observed), np.float32)
+        self._result = self.outputs, self.statuses
+        self._fmu, self._spec = fmu, spec
+        self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
+        try:
+            self._pool = self._open(log, private_libraries)
+        except BaseException:
+            fmu.close()
+            raise
+        self._close = weakref.finalize(self, _close, self._pool, fmu)
+        self.step_own = self._pool.step_own
+
+    def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
+        fmu, spec, description = self._fmu, self._spec, self._fmu.description
+        folder = fmu.extract()
+        paths = [folder / fmu.library]
+        if private_libraries:
+            paths = _copy_library(folder, Path(fmu.library), self.num_instances)
+        try:
+            return _native.Pool(
+                description.fmi_major_version,
+                description.model_identifier.encode(),
+                description.instantiation_token.encode(),
+                _resources(folder, description.fmi_major_version),
+                tuple(os.fsencode(path) for path in paths),
+                private_libraries,
+                log.isEnabledFor(logging.INFO),
+                description.capabilities.can_get_and_set_fmu_state,
+                spec.start_time,
+                spec.stop_time,
+                spec.tolerance,
+                spec.time_step,
+                spec.substeps,
+                spec.warm_up_steps,
+                tuple((v.value_reference, text.encode()) for v, text in spec.strings),
+                self._access(spec.inputs),
+                self._access(spec.outputs),
+                spec.num_observed,
+                self.num_instances,
+                self.threads,
+                self.inputs,
+                self.outputs,
+                self.statuses,
+                self.observations,
+                _Receiver(log, description.model_identifier),
+            )
+        except OSError as error:
+            raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
+
+    def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
+        """Find or make the access to variables; one access stands for one list of variables."""
+        access = self._accesses.get(variables)
+        if access is None:
+            if len(self._accesses) >= _MOST_CACHED:
+                self._accesses.clear()
+            version = self._fmu.description.fmi_major_version
+            types = bytes(_type_number(variable, version) for variable in variables)
+            references = np.array([v.value_reference for v in variables], np.uint32)
+            access = _native.Access(version, types, references.tobytes())
+            self._accesses[variables] = access
+        return access
+
+    # The contract of Pool.
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``."""
+        self.reset_into(variables, values, mask)
+        return self._result
+
+    def step(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: FloatArray32 | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.step``."""
+        if inputs is not None:
+            np.copyto(self.inputs, inputs)
+        self.step_into(None, skip, observations)
+        return self._result
+
+    def save(self) -> _native.Snapshot:
+        """See ``Pool.save``."""
+        if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
+            name = self._fmu.description.model_name
+            raise SimulationError(f"{name} cannot get and set its state")
+        snapshot = self._open_pool().save()
+        if isinstance(snapshot, int):
+            raise SimulationError(self.failure(snapshot))
+        return snapshot
+
+    def restore(
+        self, snapshot: _native.Snapshot, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.restore``."""
+        pool = self._open_pool()
+        if not isinstance(snapshot, _native.Snapshot):
+            raise SimulationError("the snapshot was taken from another pool")
+        mask = None if mask is None else np.asarray(mask, np.bool_)
+        try:
+            pool.restore(snapshot, mask)
+        except ValueError as error:
+            raise SimulationError(str(error)) from None
+        return self._result
+
+    def failure(self, index: int) -> str:
+        """See ``Pool.failure``."""
+        failure = self._open_pool().failure(index)
+        if failure is None:
+            return ""
+        doing, in_warm_up, status, time, string, said, values = failure
+        if values is not None:
+            return f"{doing}: {self._not_finite(values)}"
+        text = self._sentence(index, doing, status, time, string)
+        text += f"; the FMU said: {said}" if said else ""
+        return f"the warm-up failed: {text}" if in_warm_up else text
+
+    def _sentence(self, index: int, doing: str, status: int, time: float, string: int) -> str:
+        if not math.isnan(time):
+            doing = f"the step at t = {time:g} s"
+        elif string != _NO_STRING:
+            doing = f"setting {self._string_name(string)!r}"
+        if status < 0:  # it was refused, and is a whole sentence
+            return doing
+        label = Status(status).name.capitalize()
+        return f"{self._fmu.description.model_identifier}_{index}: {doing} returned {label}"
+
+    def _string_name(self, reference: int) -> str:
+        return next(v.name for v, _ in self._spec.strings if v.value_reference == reference)
+
+    def _not_finite(self, values: bytes) -> str:
+        named = zip(self._spec.outputs, np.frombuffer(values).tolist(), strict=True)
+        return ", ".join(f"{v.name} = {value}" for v, value in named if not math.isfinite(value))
+
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
+        """See ``Pool.read``."""
+        values = np.empty((len(variables), self.num_instances))
+        failed = self._open_pool().read(self._access(variables), values)
+        if failed >= 0:
+            raise SimulationError(self.failure(failed))
+        return values
+
+    def close(self) -> None:
+        """See ``Pool.close``."""
+        self._close()
+
+    def _open_pool(self) -> _native.Pool:
+        if not self._close.alive:
+            raise SimulationError("the pool is closed")
+        return self._pool
+
+    # The fast way.
+
+    def step_into(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: FloatArray32 | None = None,
+    ) -> int:
+        """Do one step as ``step`` does.
+
+        Args:
+            inputs: As for ``step``, but used where they are and not copied to ``self.inputs``.
+            skip: As for ``step``.
+            observations: As for ``step``.
+
+        Returns:
+            How many of the instances that were stepped have a status worse than a warning.
+        """
+        try:
+            return self._pool.step(inputs, skip, observations)
+        except (TypeError, BufferError, ValueError):
+            pool = self._open_pool()
+            inputs = None if inputs is None else np.asarray(inputs, np.float64)
+            return pool.step(inputs, _as_mask(skip), observations)
+
+    def reset_into(
+        self,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        mask: MaskArray | None = None,
+        observations: FloatArray32 | None = None,
+    ) -> int:
+        """Start instances anew as ``reset`` does.
+
+        Args:
+            variables: As for ``reset``.
+            values: As for ``reset``.
+            mask: As for ``reset``.
+            observations: The rows of the instances in the mask are filled.
+
+        Returns:
+            How many of the instances in the mask have a status worse than a warning.
+        """
+        access = self._accesses.get(variables) or self._access(variables)
+        try:
+            return self._pool.reset(access, values, mask, observations)
+        except (TypeError, BufferError, ValueError):
+            pool = self._open_pool()
+            values = np.asarray(values, np.float64)
+            return pool.reset(access, values, _as_mask(mask), observations)
+
+    def step_or_reset(
+        self,
+        inputs: FloatArray | None,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        mask: MaskArray,
+        observations: FloatArray32 | None = None,
+    ) -> int:
+        """Start the instances in the mask anew and step the others, in one go.
+
+        The same as ``step`` with the mask to be skipped and ``reset`` with the mask, but for the
+        time it takes: no thread waits for the end of one before it begins the other.
+
+        Args:
+            inputs: As for ``step_into``.
+            variables: As for ``reset``.
+            values: As for ``reset``.
+            mask: Which instances to start anew, shape (N,).
+            observations: As for ``step``; all rows are filled.
+
+        Returns:
+            How many of the instances have a status worse than a warning.
+        """
+        access = self._accesses.get(variables) or self._access(variables)
+        try:
+            return self._pool.step_or_reset(inputs, access, values, mask, observations)
+        except (TypeError, BufferError, ValueError):
+            pool = self._open_pool()
+            inputs = None if inputs is None else np.asarray(inputs, np.float64)
+            values = np.asarray(values, np.float64)
+            return pool.step_or_reset(inputs, access, values, _as_mask(mask), observations)
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """The measured time of one instance in ns by method; 0 where it is not known yet."""
+        return dict(zip(("step", "reset", "step_or_reset"), self._pool.costs(), strict=True))
+
+    def prepare_play(
+        self,
+        variables: tuple[Variable, ...],
+        programs: tuple[PlayProgram, PlayProgram],
+        actions: tuple[int, int],
+        start_values: FloatArray,
+        draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
+        episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
+    ) -> Callable[..., tuple[int, int, int]]:
+        """Let whole steps of a vector environment be done here, hooks included; only once.
+
+        The arrays are used as they are, from step to step.
+
+        Args:
+            variables: As for ``reset``.
+            programs: From the actions to the inputs; from the outputs to done, truncated, reward.
+            actions: The lowest and the highest action.
+            start_values: As the values of ``reset``; the draws are written there.
+            draws: Uniform numbers drawn ahead, shape (N, episodes, draws); how many episodes of
+                them are used, shape (N,); lower ends and widths of the distributions and the
+                rows of the start values they are for, shape (draws,).
+            episodes: Steps of each episode, shape (N,); which environments start an episode in
+                the next step, shape (N,); steps after which an episode is truncated.
+
+        Returns:
+            A function of actions (int64), observations, rewards, terminated and truncated, which
+            does a step and fills the latter four. It returns how many instances have a status
+            worse than a warning, how many episodes have ended, and how many of their environments
+            have no episodes drawn ahead any more.
+        """
+        block, used, low, width, rows = draws
+        count, ended, limit = episodes
+        self._pool.prepare_play(
+            self._access(variables),
+            *(_program_bytes(program) for program in programs),
+            *actions,
+            limit,
+            block.shape[2],
+            block.shape[1],
+            start_values,
+            block.reshape(-1),
+            used,
+            low,
+            width,
+            rows,
+            count,
+            ended,
+        )
+        return self._pool.play
+
+    @property
+    def uses_states(self) -> bool:
+        """Whether resets restore saved initial states, as far as is known by now."""
+        return self._pool.uses_states()
+
+
+class PlayProgram(Protocol):
+    """See ``fmugym.vector.trace.Program``."""
+
+    @property
+    def code(self) -> npt.NDArray[np.uint16]:
+        """Operation and operands of each instruction."""
+        ...
+
+    @property
+    def constants(self) -> FloatArray:
+        """What the instructions refer to."""
+        ...
+
+    @property
+    def results(self) -> npt.NDArray[np.uint16]:
+        """The registers of the results."""
+        ...
+
+
+def _program_bytes(program: PlayProgram) -> tuple[bytes, bytes, bytes]:
+    return program.code.tobytes(), program.constants.tobytes(), program.results.tobytes()
+
+
+class _Receiver:
+    """Passes the messages of the FMU on; it must not refer to the pool."""
+
+    def __init__(self, log: logging.Logger, model: str) -> None:
+        self._log, self._model = log, model
+
+    def __call__(self, index: int, status: int, category: str, message: str) -> None:
+        level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
+        self._log.log(level, "%s_%d: [%s] %s", self._model, index, category, message)
+
+
+def available_processors() -> int:
+    """The number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _as_mask(mask: MaskArray | None) -> MaskArray | None:
+    return None if mask is None else np.asarray(mask, np.bool_)
+
+
+def _type_number(variable: Variable, version: int) -> int:
+    if variable.kind == "enumeration":
+        return _TYPES.index("Int64" if version == 3 else "Int32")
+    return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
+
+
+def _resources(folder: Path, version: int) -> bytes:
+    """What an FMU is told of its folder, which differs between all three versions."""
+    if version == 1:
+        return folder.as_uri().encode()
+    if version == 2:
+        return (folder / "resources").as_uri().encode()
+    return os.path.join(folder, "resources", "").encode()
+
+
+def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
+    """Copy the library's folder: other paths and other inodes make other libraries.
+
+    The copies live in the FMU's temporary folder and go with it.
+    """
+    paths = []
+    try:
+        for index in range(count):
+            copy = folder / "private" / str(index)
+            shutil.copytree(folder / library.parent, copy)
+            paths.append(copy / library.name)
+    except (OSError, shutil.Error) as error:
+        raise FMULoadError(
+            f"{library.name} needs a copy for each instance, but copy {len(paths) + 1} of {count} "
+            f"failed: {error}; use fewer instances, or one process for each"
+        ) from None
+    return paths
+
+
+def _close(pool: _native.Pool, fmu: FMU) -> None:
+    pool.close()
+    fmu.close()

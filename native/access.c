@@ -1,0 +1,176 @@
+/* Groups of variables, and the conversion between float64 and the C types of FMI. */
+
+#include "access.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "platform.h"
+
+static Atomic next_id;
+
+static Group *group_of(Access *access, Type type) {
+    for (size_t i = 0; i < access->number_of_groups; i++) {
+        if (access->groups[i].type == type) {
+            return &access->groups[i];
+        }
+    }
+    Group *group = &access->groups[access->number_of_groups++];
+    group->type = type;
+    return group;
+}
+
+static void assign_memory(Access *access) {
+    uint32_t *place = access->memory;
+    for (size_t i = 0; i < access->number_of_groups; i++) {
+        Group *group = &access->groups[i];
+        group->references = place;
+        group->positions = place + group->count;
+        place += 2 * group->count;
+        group->count = 0; /* counted anew while filling */
+    }
+}
+
+bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const uint32_t *references,
+                 size_t count) {
+    memset(access, 0, sizeof *access);
+    access->fmi = fmi;
+    access->id = 1 + atomic_add(&next_id, 1);
+    access->count = count;
+    access->memory = malloc((2 * count + 1) * sizeof(uint32_t));
+    if (access->memory == NULL) {
+        return false;
+    }
+    for (size_t i = 0; i < count; i++) {
+        group_of(access, (Type)types[i])->count++;
+    }
+    assign_memory(access);
+    for (size_t i = 0; i < count; i++) {
+        Group *group = group_of(access, (Type)types[i]);
+        group->references[group->count] = references[i];
+        group->positions[group->count++] = (uint32_t)i;
+    }
+    access->direct = access->number_of_groups == 1 && access->groups[0].type == TYPE_FLOAT64;
+    return true;
+}
+
+void access_close(Access *access) {
+    free(access->memory);
+    access->memory = NULL;
+}
+
+/* Conversions. A float64 outside of the range of an integer type takes the nearest value that the
+ * type has, and NaN takes 0: plain casts would be undefined. */
+
+static double clamp(double value, double low, double high) {
+    if (value != value) {
+        return 0.0;
+    }
+    return value < low ? low : value > high ? high : value;
+}
+
+static int64_t to_int64(double value) {
+    if (value != value) {
+        return 0;
+    }
+    if (value >= 9223372036854775808.0) {
+        return INT64_MAX;
+    }
+    return value <= -9223372036854775808.0 ? INT64_MIN : (int64_t)value;
+}
+
+static uint64_t to_uint64(double value) {
+    if (!(value > 0.0)) {
+        return 0;
+    }
+    return value >= 18446744073709551616.0 ? UINT64_MAX : (uint64_t)value;
+}
+
+#define LOAD(type)                                                                                 \
+    for (size_t i = 0; i < group->count; i++) {                                                    \
+        values[group->positions[i]] = (double)((const type *)typed)[i];                            \
+    }                                                                                              \
+    break
+
+static void load(const Group *group, Type type, const void *typed, double *values) {
+    switch (type) {
+    case TYPE_FLOAT64: LOAD(double);
+    case TYPE_FLOAT32: LOAD(float);
+    case TYPE_INT8: LOAD(int8_t);
+    case TYPE_INT16: LOAD(int16_t);
+    case TYPE_INT32: LOAD(int32_t);
+    case TYPE_INT64: LOAD(int64_t);
+    case TYPE_UINT8: LOAD(uint8_t);
+    case TYPE_UINT16: LOAD(uint16_t);
+    case TYPE_UINT32: LOAD(uint32_t);
+    case TYPE_UINT64: LOAD(uint64_t);
+    default: break;
+    }
+}
+
+#define STORE(type, convert)                                                                       \
+    for (size_t i = 0; i < group->count; i++) {                                                    \
+        const double value = values[group->positions[i]];                                          \
+        ((type *)typed)[i] = (type)(convert);                                                      \
+    }                                                                                              \
+    break
+
+static void store(const Group *group, Type type, const double *values, void *typed) {
+    switch (type) {
+    case TYPE_FLOAT64: STORE(double, value);
+    case TYPE_FLOAT32: STORE(float, value);
+    case TYPE_INT8: STORE(int8_t, clamp(value, INT8_MIN, INT8_MAX));
+    case TYPE_INT16: STORE(int16_t, clamp(value, INT16_MIN, INT16_MAX));
+    case TYPE_INT32: STORE(int32_t, clamp(value, INT32_MIN, INT32_MAX));
+    case TYPE_INT64: STORE(int64_t, to_int64(value));
+    case TYPE_UINT8: STORE(uint8_t, clamp(value, 0, UINT8_MAX));
+    case TYPE_UINT16: STORE(uint16_t, clamp(value, 0, UINT16_MAX));
+    case TYPE_UINT32: STORE(uint32_t, clamp(value, 0, UINT32_MAX));
+    case TYPE_UINT64: STORE(uint64_t, to_uint64(value));
+    default: break;
+    }
+}
+
+/* A Boolean is a char in FMI 1.0, an int in FMI 2.0, a C bool in FMI 3.0. */
+static Type stored_type(const Access *access, const Group *group) {
+    const Type boolean = access->fmi->boolean_size == 1 ? TYPE_UINT8 : TYPE_INT32;
+    return group->type == TYPE_BOOLEAN ? boolean : group->type;
+}
+
+static Status worse(Status a, Status b) {
+    return a > b ? a : b;
+}
+
+Status access_get(const Access *access, const Library *library, void *component, double *values,
+                  void *typed) {
+    const Fmi *fmi = access->fmi;
+    const Group *group = access->groups;
+    Status worst = STATUS_OK;
+
+    if (access->direct) {
+        return fmi->get(library, component, TYPE_FLOAT64, group->references, group->count, values);
+    }
+    for (size_t i = 0; i < access->number_of_groups && worst != STATUS_FATAL; i++, group++) {
+        worst = worse(worst, fmi->get(library, component, group->type, group->references,
+                                      group->count, typed));
+        load(group, stored_type(access, group), typed, values);
+    }
+    return worst;
+}
+
+Status access_set(const Access *access, const Library *library, void *component,
+                  const double *values, void *typed) {
+    const Fmi *fmi = access->fmi;
+    const Group *group = access->groups;
+    Status worst = STATUS_OK;
+
+    if (access->direct) {
+        return fmi->set(library, component, TYPE_FLOAT64, group->references, group->count, values);
+    }
+    for (size_t i = 0; i < access->number_of_groups && worst != STATUS_FATAL; i++, group++) {
+        store(group, stored_type(access, group), values, typed);
+        worst = worse(worst, fmi->set(library, component, group->type, group->references,
+                                      group->count, typed));
+    }
+    return worst;
+}

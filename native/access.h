@@ -1,0 +1,40 @@
+/* A list of variables, got or set by one call per C type and instance. */
+
+#ifndef FMUGYM_ACCESS_H
+#define FMUGYM_ACCESS_H
+
+#include "fmi.h"
+
+typedef struct {
+    Type type;
+    size_t count;
+    uint32_t *references;
+    uint32_t *positions; /* of the values in the list */
+} Group;
+
+typedef struct {
+    const Fmi *fmi;
+    uint64_t id; /* unique in the process */
+    size_t count;
+    size_t number_of_groups;
+    bool direct; /* all values are doubles: the FMU uses the list's own memory */
+    uint32_t *memory; /* references and positions of all groups */
+    Group groups[NUMBER_OF_TYPES];
+} Access;
+
+/* Groups the variables by type, in the order in which the types first appear. Returns whether there
+ * was enough memory. */
+bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const uint32_t *references,
+                 size_t count);
+void access_close(Access *access);
+
+/* Both use typed as scratch memory, of access_scratch bytes, and return the worst status. */
+static inline size_t access_scratch(const Access *access) {
+    return access->count * sizeof(double);
+}
+Status access_get(const Access *access, const Library *library, void *component, double *values,
+                  void *typed);
+Status access_set(const Access *access, const Library *library, void *component,
+                  const double *values, void *typed);
+
+#endif

@@ -1,0 +1,108 @@
+/* Loading of shared libraries, and finding functions in them. */
+
+#include "library.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if defined _WIN32
+#define WIN32_LEAN_AND_MEAN
+#include <windows.h>
+#else
+#include <dlfcn.h>
+#endif
+
+#if defined _WIN32
+
+static void *open_handle(const char *path, char *error, size_t size) {
+    wchar_t wide[4096];
+    HMODULE handle = NULL;
+
+    if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) != 0) {
+        /* libraries that the FMU's needs are looked for in its own folder */
+        handle = LoadLibraryExW(wide, NULL, LOAD_WITH_ALTERED_SEARCH_PATH);
+    }
+    if (handle == NULL) {
+        snprintf(error, size, "LoadLibrary failed with Windows error %lu", GetLastError());
+    }
+    return (void *)handle;
+}
+
+static void close_handle(void *handle) {
+    FreeLibrary((HMODULE)handle);
+}
+
+static Function find(void *handle, const char *name) {
+    return (Function)GetProcAddress((HMODULE)handle, name);
+}
+
+#else
+
+static void *open_handle(const char *path, char *error, size_t size) {
+    void *handle = dlopen(path, RTLD_NOW | RTLD_LOCAL);
+
+    if (handle == NULL) {
+        const char *reason = dlerror();
+        snprintf(error, size, "%s", reason == NULL ? "dlopen failed" : reason);
+    }
+    return handle;
+}
+
+static void close_handle(void *handle) {
+    dlclose(handle);
+}
+
+static Function find(void *handle, const char *name) {
+    /* ISO C has no conversion from a data pointer to a function pointer; POSIX says they match */
+    void *symbol = dlsym(handle, name);
+    Function function = NULL;
+    memcpy(&function, &symbol, sizeof function);
+    return function;
+}
+
+#endif
+
+bool library_open(Library *library, const char *path, char *error, size_t size) {
+    library->handle = open_handle(path, error, size);
+    return library->handle != NULL;
+}
+
+void library_close(Library *library) {
+    if (library->handle != NULL) {
+        close_handle(library->handle);
+    }
+    free(library->functions);
+    library->handle = NULL;
+    library->functions = NULL;
+}
+
+static bool bind_one(Library *library, const char *prefix, const Binding *binding, char *error,
+                     size_t size) {
+    char name[512];
+    const int length = snprintf(name, sizeof name, "%s%s", prefix, binding->name);
+    const bool fits = length > 0 && (size_t)length < sizeof name;
+    const Function function = fits ? find(library->handle, name) : NULL;
+
+    memcpy((char *)library->functions + binding->offset, &function, sizeof function);
+    if (binding->required && function == NULL) {
+        snprintf(error, size, "it does not export %.400s", name);
+        return false;
+    }
+    return true;
+}
+
+bool library_bind(Library *library, const char *prefix, const Binding *bindings, size_t count,
+                  size_t table_size, char *error, size_t size) {
+    library->functions = calloc(1, table_size);
+    if (library->functions == NULL) {
+        snprintf(error, size, "out of memory");
+        return false;
+    }
+    for (size_t i = 0; i < count; i++) {
+        if (!bind_one(library, prefix, &bindings[i], error, size)) {
+            return false;
+        }
+    }
+    return true;
+}

@@ -1,0 +1,33 @@
+/* A shared library and the functions found in it. */
+
+#ifndef FMUGYM_LIBRARY_H
+#define FMUGYM_LIBRARY_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+typedef void (*Function)(void);
+
+typedef struct {
+    void *handle;
+    const char *identifier; /* the prefix of FMI 1.0 */
+    void *functions;        /* the table of the FMI version */
+} Library;
+
+/* Returns whether the library was loaded; if not, error tells why. */
+bool library_open(Library *library, const char *path, char *error, size_t size);
+void library_close(Library *library);
+
+/* A function of the library and its place in the table of functions. */
+typedef struct {
+    const char *name; /* without the prefix */
+    size_t offset;
+    bool required;
+} Binding;
+
+/* Makes the table of functions, in which NULL stands for what the library does not export. Returns
+ * false if a required one is missing; error tells which. */
+bool library_bind(Library *library, const char *prefix, const Binding *bindings, size_t count,
+                  size_t table_size, char *error, size_t size);
+
+#endif

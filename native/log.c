@@ -1,0 +1,266 @@
+/* The logger callbacks of the FMI versions, and the queues behind them.
+ *
+ * An FMU may log from any thread, its own included. One lock guards everything here: logging is
+ * rare, and nothing waits while holding it. */
+
+#include "log.h"
+
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { TEXT_SIZE = 4096, INDEX_BITS = 32 };
+
+static Mutex lock = MUTEX_INITIALIZER;
+static Log *logs;
+static uint32_t next_id = 1;
+
+bool log_open(Log *log, size_t count) {
+    memset(log, 0, sizeof *log);
+    log->recent = calloc(count, sizeof *log->recent);
+    if (log->recent == NULL) {
+        return false;
+    }
+    log->count = count;
+    mutex_lock(&lock);
+    log->id = next_id++;
+    log->next = logs;
+    logs = log;
+    mutex_unlock(&lock);
+    return true;
+}
+
+static void forget(Log *log, size_t index) {
+    Recent *recent = log->recent[index];
+
+    for (size_t i = 0; recent != NULL && i < LOG_RECENT; i++) {
+        free(recent->texts[i]);
+    }
+    free(recent);
+    log->recent[index] = NULL;
+}
+
+static void unlink_log(const Log *log) {
+    for (Log **link = &logs; *link != NULL; link = &(*link)->next) {
+        if (*link == log) {
+            *link = log->next;
+            return;
+        }
+    }
+}
+
+void log_close(Log *log) {
+    mutex_lock(&lock);
+    unlink_log(log);
+    mutex_unlock(&lock);
+    for (size_t i = 0; i < log->count; i++) {
+        forget(log, i);
+    }
+    free(log->recent);
+    for (Message *message = log->first, *next; message != NULL; message = next) {
+        next = message->next;
+        message_free(message);
+    }
+    memset(log, 0, sizeof *log);
+}
+
+uint64_t log_environment(const Log *log, size_t index) {
+    return ((uint64_t)log->id << INDEX_BITS) | index;
+}
+
+void message_free(Message *message) {
+    free(message->category);
+    free(message->text);
+    free(message);
+}
+
+Message *log_take(Log *log, size_t *dropped) {
+    mutex_lock(&lock);
+    Message *first = log->first;
+    *dropped = log->dropped;
+    log->first = log->last = NULL;
+    log->queued = log->dropped = 0;
+    atomic_set(&log->pending, 0);
+    mutex_unlock(&lock);
+    return first;
+}
+
+static char *duplicate(const char *text) {
+    const size_t size = strlen(text) + 1;
+    char *copy = malloc(size);
+    if (copy != NULL) {
+        memcpy(copy, text, size);
+    }
+    return copy;
+}
+
+/* Receiving, under the lock. A message for which there is no memory is lost. */
+
+static void enqueue(Log *log, Message *message) {
+    if (log->first == NULL) {
+        log->first = message;
+    } else {
+        log->last->next = message;
+    }
+    log->last = message;
+    log->queued++;
+}
+
+static void queue_message(Log *log, size_t index, int status, const char *category,
+                          const char *text) {
+    Message *message = log->queued < LOG_QUEUE_LIMIT ? calloc(1, sizeof *message) : NULL;
+
+    atomic_set(&log->pending, 1);
+    if (message == NULL) {
+        log->dropped++;
+        return;
+    }
+    message->index = index;
+    message->status = status;
+    message->category = duplicate(category);
+    message->text = duplicate(text);
+    enqueue(log, message);
+}
+
+static void remember(Log *log, size_t index, const char *text) {
+    Recent *recent = log->recent[index];
+
+    if (recent == NULL) {
+        recent = log->recent[index] = calloc(1, sizeof *recent);
+    }
+    if (recent != NULL) {
+        free(recent->texts[recent->next]);
+        recent->texts[recent->next] = duplicate(text);
+        recent->next = (recent->next + 1) % LOG_RECENT;
+    }
+}
+
+static Log *find_log(uint32_t id) {
+    Log *log = logs;
+    while (log != NULL && log->id != id) {
+        log = log->next;
+    }
+    return log;
+}
+
+static void trim_end(char *text) {
+    size_t length = strlen(text);
+    while (length > 0 && strchr(" \t\r\n", text[length - 1]) != NULL) {
+        text[--length] = '\0';
+    }
+}
+
+static void deliver(uint64_t environment, int status, const char *category, char *text) {
+    const size_t index = (size_t)(environment & UINT32_MAX);
+
+    trim_end(text);
+    mutex_lock(&lock);
+    Log *log = find_log((uint32_t)(environment >> INDEX_BITS));
+    if (log != NULL && index < log->count) {
+        remember(log, index, text);
+        queue_message(log, index, status, category == NULL ? "" : category, text);
+    }
+    mutex_unlock(&lock);
+}
+
+/* What was said */
+
+static char *join(const Recent *recent) {
+    size_t size = 1;
+    for (size_t i = 0; i < LOG_RECENT; i++) {
+        size += recent->texts[i] == NULL ? 0 : strlen(recent->texts[i]) + 3;
+    }
+    char *joined = calloc(1, size);
+    for (size_t i = 0; joined != NULL && i < LOG_RECENT; i++) {
+        const char *text = recent->texts[(recent->next + i) % LOG_RECENT];
+        if (text != NULL) {
+            strcat(joined, joined[0] == '\0' ? "" : " | ");
+            strcat(joined, text);
+        }
+    }
+    return joined;
+}
+
+char *log_said(Log *log, size_t index) {
+    mutex_lock(&lock);
+    const Recent *recent = log->recent[index];
+    char *said = recent == NULL ? NULL : join(recent);
+    mutex_unlock(&lock);
+    return said;
+}
+
+void log_forget(Log *log, size_t index) {
+    mutex_lock(&lock);
+    forget(log, index);
+    mutex_unlock(&lock);
+}
+
+/* Fork */
+
+void log_before_fork(void) {
+    mutex_lock(&lock);
+}
+
+void log_after_fork_in_parent(void) {
+    mutex_unlock(&lock);
+}
+
+void log_after_fork_in_child(void) {
+    mutex_reset(&lock);
+}
+
+/* Callbacks. FMI 1.0 and 2.0 name the instance by its name, which ends in the number of the log and
+ * that of the instance, "..._12_3": FMI 1.0 has no other way, and FMUs of FMI 2.0 have been seen to
+ * pass anything as the environment. */
+
+static uint64_t environment_of(const char *name) {
+    const char *last = name == NULL ? NULL : strrchr(name, '_');
+    const char *first = last;
+
+    while (first != NULL && first > name && *(first - 1) != '_') {
+        first--;
+    }
+    if (first == NULL || first == name) {
+        return 0; /* no log has the number 0 */
+    }
+    const uint64_t id = strtoul(first, NULL, 10);
+    return (id << INDEX_BITS) | (uint32_t)strtoul(last + 1, NULL, 10);
+}
+
+static void format_and_deliver(const char *name, int status, const char *category,
+                               const char *format, va_list arguments) {
+    char text[TEXT_SIZE] = "";
+
+    if (format != NULL) {
+        vsnprintf(text, sizeof text, format, arguments);
+    }
+    deliver(environment_of(name), status, category, text);
+}
+
+void log_message_fmi1(void *component, const char *name, int status, const char *category,
+                      const char *format, ...) {
+    va_list arguments;
+
+    (void)component;
+    va_start(arguments, format);
+    format_and_deliver(name, status, category, format, arguments);
+    va_end(arguments);
+}
+
+void log_message_fmi2(void *environment, const char *name, int status, const char *category,
+                      const char *format, ...) {
+    va_list arguments;
+
+    (void)environment;
+    va_start(arguments, format);
+    format_and_deliver(name, status, category, format, arguments);
+    va_end(arguments);
+}
+
+void log_message_fmi3(void *environment, int status, const char *category, const char *text) {
+    char copy[TEXT_SIZE];
+
+    snprintf(copy, sizeof copy, "%s", text == NULL ? "" : text);
+    deliver((uint64_t)(uintptr_t)environment, status, category, copy);
+}

@@ -1,0 +1,164 @@
+/* What differs between operating systems and compilers: atomics, locks, threads, the clock. */
+
+#ifndef FMUGYM_PLATFORM_H
+#define FMUGYM_PLATFORM_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#if defined _WIN32
+#define WIN32_LEAN_AND_MEAN
+#include <windows.h>
+#else
+#include <pthread.h>
+#include <time.h>
+#endif
+
+#if defined _MSC_VER || defined FMUGYM_INTERLOCKED
+#include <windows.h>
+#else
+#define FMUGYM_STDATOMIC
+#include <stdatomic.h>
+#endif
+
+/* Atomics, all of them sequentially consistent: none is touched more than once per chunk of work. */
+
+#if defined FMUGYM_STDATOMIC
+
+typedef _Atomic uint64_t Atomic;
+
+static inline uint64_t atomic_get(const Atomic *a) {
+    return atomic_load(a);
+}
+static inline void atomic_set(Atomic *a, uint64_t value) {
+    atomic_store(a, value);
+}
+static inline uint64_t atomic_add(Atomic *a, uint64_t value) {
+    return atomic_fetch_add(a, value);
+}
+static inline uint64_t atomic_or_bits(Atomic *a, uint64_t bits) {
+    return atomic_fetch_or(a, bits);
+}
+static inline uint64_t atomic_and_bits(Atomic *a, uint64_t bits) {
+    return atomic_fetch_and(a, bits);
+}
+/* Returns whether the value was the expected one and was replaced; else expected is updated. */
+static inline bool atomic_replace(Atomic *a, uint64_t *expected, uint64_t value) {
+    return atomic_compare_exchange_strong(a, expected, value);
+}
+
+#else
+
+typedef volatile LONG64 Atomic;
+
+static inline uint64_t atomic_get(const Atomic *a) {
+    return (uint64_t)InterlockedCompareExchange64((Atomic *)a, 0, 0);
+}
+static inline void atomic_set(Atomic *a, uint64_t value) {
+    InterlockedExchange64(a, (LONG64)value);
+}
+static inline uint64_t atomic_add(Atomic *a, uint64_t value) {
+    return (uint64_t)InterlockedExchangeAdd64(a, (LONG64)value);
+}
+static inline uint64_t atomic_or_bits(Atomic *a, uint64_t bits) {
+    return (uint64_t)InterlockedOr64(a, (LONG64)bits);
+}
+static inline uint64_t atomic_and_bits(Atomic *a, uint64_t bits) {
+    return (uint64_t)InterlockedAnd64(a, (LONG64)bits);
+}
+static inline bool atomic_replace(Atomic *a, uint64_t *expected, uint64_t value) {
+    const LONG64 seen = InterlockedCompareExchange64(a, (LONG64)value, (LONG64)*expected);
+    const bool replaced = seen == (LONG64)*expected;
+    *expected = (uint64_t)seen;
+    return replaced;
+}
+
+#endif
+
+/* Locks and conditions */
+
+#if defined _WIN32
+
+typedef SRWLOCK Mutex;
+typedef CONDITION_VARIABLE Condition;
+#define MUTEX_INITIALIZER SRWLOCK_INIT
+#define CONDITION_INITIALIZER CONDITION_VARIABLE_INIT
+
+static inline void mutex_lock(Mutex *m) {
+    AcquireSRWLockExclusive(m);
+}
+static inline void mutex_unlock(Mutex *m) {
+    ReleaseSRWLockExclusive(m);
+}
+static inline void condition_wait(Condition *c, Mutex *m) {
+    SleepConditionVariableSRW(c, m, INFINITE, 0);
+}
+static inline void condition_wake_one(Condition *c) {
+    WakeConditionVariable(c);
+}
+static inline void condition_wake_all(Condition *c) {
+    WakeAllConditionVariable(c);
+}
+
+#else
+
+typedef pthread_mutex_t Mutex;
+typedef pthread_cond_t Condition;
+#define MUTEX_INITIALIZER PTHREAD_MUTEX_INITIALIZER
+#define CONDITION_INITIALIZER PTHREAD_COND_INITIALIZER
+
+static inline void mutex_lock(Mutex *m) {
+    pthread_mutex_lock(m);
+}
+static inline void mutex_unlock(Mutex *m) {
+    pthread_mutex_unlock(m);
+}
+static inline void condition_wait(Condition *c, Mutex *m) {
+    pthread_cond_wait(c, m);
+}
+static inline void condition_wake_one(Condition *c) {
+    pthread_cond_signal(c);
+}
+static inline void condition_wake_all(Condition *c) {
+    pthread_cond_broadcast(c);
+}
+
+#endif
+
+static inline void mutex_reset(Mutex *m) {
+    const Mutex fresh = MUTEX_INITIALIZER;
+    *m = fresh;
+}
+static inline void condition_reset(Condition *c) {
+    const Condition fresh = CONDITION_INITIALIZER;
+    *c = fresh;
+}
+
+/* A monotonic clock, in nanoseconds. */
+
+static inline uint64_t clock_now(void) {
+#if defined _WIN32
+    LARGE_INTEGER count, frequency;
+    QueryPerformanceCounter(&count);
+    QueryPerformanceFrequency(&frequency);
+    return (uint64_t)((double)count.QuadPart * (1e9 / (double)frequency.QuadPart));
+#else
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
+#endif
+}
+
+/* Tells the processor that this thread waits for another in a loop. */
+static inline void spin_pause(void) {
+#if defined _MSC_VER
+    YieldProcessor();
+#elif defined __x86_64__ || defined __i386__
+    __builtin_ia32_pause();
+#elif defined __aarch64__
+    __asm__ volatile("yield");
+#endif
+}
+
+#endif

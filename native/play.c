@@ -1,0 +1,85 @@
+#include "play.h"
+
+enum { DONE, TRUNCATED, REWARD };
+
+ptrdiff_t play_find_bad_action(const Turn *turn) {
+    const Play *play = turn->play;
+    size_t bad = 0;
+
+    for (size_t i = 0; i < play->count; i++) {
+        bad += (turn->actions[i] < play->lowest_action) | (turn->actions[i] > play->highest_action);
+    }
+    for (size_t i = 0; bad > 0 && i < play->count; i++) {
+        if (turn->actions[i] < play->lowest_action || turn->actions[i] > play->highest_action) {
+            return (ptrdiff_t)i;
+        }
+    }
+    return -1;
+}
+
+/* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
+static void draw(const Play *play, size_t index) {
+    const Draws *d = &play->draws;
+    const size_t episode = index * d->episodes + (size_t)d->used[index];
+    const double *fractions = d->block + episode * d->draws;
+
+    for (size_t i = 0; i < d->draws; i++) {
+        const double scaled = d->width[i] * fractions[i];
+        play->start_values[(size_t)d->rows[i] * play->count + index] = d->low[i] + scaled;
+    }
+    d->used[index]++;
+}
+
+static Source source_of(const Turn *turn) {
+    Source source = turn->play->source;
+    source.actions = turn->actions;
+    return source;
+}
+
+void play_prepare(const Turn *turn, size_t begin, size_t count) {
+    const Play *play = turn->play;
+    const Source source = source_of(turn);
+    Registers registers;
+
+    program_run(&play->inputs, &source, begin, count, registers);
+    for (size_t i = 0; i < play->inputs.number_of_results; i++) {
+        const double *values = registers[play->inputs.results[i]];
+        double *row = play->input_rows + i * play->count + begin;
+        for (size_t j = 0; j < count; j++) {
+            row[j] = values[j];
+        }
+    }
+    for (size_t index = begin; index < begin + count; index++) {
+        if (play->ended[index] && play->draws.draws > 0) {
+            draw(play, index);
+        }
+        play->step_counts[index] = play->ended[index] ? 0 : play->step_counts[index] + 1;
+    }
+}
+
+Ends play_judge(const Turn *turn, size_t begin, size_t count) {
+    const Play *play = turn->play;
+    const Source source = source_of(turn);
+    const uint16_t *results = play->judgement.results;
+    Registers registers;
+    Ends ends = {0, 0};
+
+    program_run(&play->judgement, &source, begin, count, registers);
+    for (size_t j = 0; j < count; j++) {
+        const size_t index = begin + j;
+        const bool started = play->ended[index];
+        const bool over = play->step_counts[index] >= play->limit;
+        const bool done = !started && registers[results[DONE]][j] != 0.0;
+        const bool cut = !started && (over || registers[results[TRUNCATED]][j] != 0.0);
+
+        turn->rewards[index] = started ? 0.0 : registers[results[REWARD]][j];
+        turn->terminated[index] = done;
+        turn->truncated[index] = cut;
+        play->ended[index] = done || cut;
+        if (play->ended[index]) {
+            ends.ended++;
+            ends.used_up += (size_t)play->draws.used[index] == play->draws.episodes;
+        }
+    }
+    return ends;
+}

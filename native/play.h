@@ -1,0 +1,58 @@
+/* Playing: the part of a vector environment's step that surrounds the steps of the instances. */
+
+#ifndef FMUGYM_PLAY_H
+#define FMUGYM_PLAY_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "program.h"
+
+/* The draws of an episode: uniform numbers of [0, 1), drawn ahead for each environment. */
+typedef struct {
+    size_t draws;        /* of one episode */
+    size_t episodes;     /* drawn ahead for one environment */
+    const double *block; /* draws for each episode of each environment */
+    int64_t *used;       /* episodes of its block that an environment has used */
+    const double *low, *width;
+    const int64_t *rows; /* of the start values, one for each draw */
+} Draws;
+
+/* What stays the same from step to step; all memory is the owner's. */
+typedef struct {
+    size_t count;
+    Program inputs;    /* results: the inputs */
+    Program judgement; /* results: done, truncated, reward */
+    Source source;     /* but for the actions */
+    int64_t lowest_action, highest_action;
+    double *input_rows;
+    double *start_values; /* a row for each start variable */
+    Draws draws;
+    int64_t *step_counts;
+    int64_t limit;  /* steps after which an episode is truncated */
+    uint8_t *ended; /* which environments start an episode instead of a step */
+} Play;
+
+/* One step of all environments: where its results go, and a summary of them. */
+typedef struct {
+    const Play *play;
+    const int64_t *actions;
+    double *rewards;
+    uint8_t *terminated, *truncated;
+} Turn;
+
+typedef struct {
+    size_t ended;   /* environments whose episode has ended now */
+    size_t used_up; /* of these, those that have no episodes drawn ahead any more */
+} Ends;
+
+/* The first environment whose action is out of range, or -1. */
+ptrdiff_t play_find_bad_action(const Turn *turn);
+
+/* Both for a run of at most PROGRAM_WIDTH environments: before their instances are reset or
+ * stepped, and after. */
+void play_prepare(const Turn *turn, size_t begin, size_t count);
+Ends play_judge(const Turn *turn, size_t begin, size_t count);
+
+#endif

@@ -1,0 +1,1129 @@
+/* The pool: its instances, what it does with them, and how the work is divided among threads. */
+
+#include "pool.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "threads.h"
+
+static const double PARALLEL_FROM = 20e3; /* ns of work for which waking a helper pays */
+static const double QUICK = 10e3;         /* ns for which others may wait */
+static const double SMALLEST_CHUNK = 2e3; /* ns */
+static const double LARGEST_CHUNK = 50e3; /* ns */
+static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states of one pool */
+
+enum {
+    TRIALS = 5,
+    STACK_VALUES = 128,
+    MANY = 64,         /* instances from which on every call is measured */
+    MEASURE_EVERY = 16 /* calls with fewer */
+};
+
+/* Failures */
+
+static char *copy_text(const char *text) {
+    const size_t size = text == NULL ? 0 : strlen(text) + 1;
+    char *copy = size == 0 ? NULL : malloc(size);
+    if (copy != NULL) {
+        memcpy(copy, text, size);
+    }
+    return copy;
+}
+
+static double *copy_values(const double *values, size_t count) {
+    double *copy = values == NULL ? NULL : malloc(count * sizeof *copy);
+    if (copy != NULL) {
+        memcpy(copy, values, count * sizeof *copy);
+    }
+    return copy;
+}
+
+static void drop_failure(Instance *me) {
+    if (me->failure != NULL) {
+        free(me->failure->said);
+        free(me->failure->values);
+        free(me->failure);
+        me->failure = NULL;
+    }
+}
+
+/* Without memory there is a status and no reason. */
+static Failure *note_failure(Instance *me, const char *doing, int status) {
+    drop_failure(me);
+    me->failure = calloc(1, sizeof *me->failure);
+    if (me->failure != NULL) {
+        me->failure->doing = doing;
+        me->failure->status = status;
+        me->failure->time = NAN;
+        me->failure->string_reference = UINT32_MAX;
+    }
+    return me->failure;
+}
+
+static Status judge(Instance *me, Status status) {
+    if (status == STATUS_FATAL) {
+        me->phase = PHASE_DEAD;
+    } else if (status == STATUS_ERROR) {
+        me->phase = PHASE_FAILED;
+    }
+    return status;
+}
+
+static size_t index_of(const Pool *pool, const Instance *me) {
+    return (size_t)(me - pool->instances);
+}
+
+/* A call returned a bad status: note which calls are still legal, and why. */
+static Status fail(Pool *pool, Instance *me, const char *doing, Status status) {
+    Failure *failure = note_failure(me, doing, status);
+    if (failure != NULL) {
+        failure->said = log_said(&pool->log, index_of(pool, me));
+    }
+    return judge(me, status);
+}
+
+/* A call was not even made. */
+static Status refuse(Instance *me, const char *reason) {
+    note_failure(me, reason, -1);
+    return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
+}
+
+/* Instances */
+
+static const char *name_of(const Pool *pool, size_t index) {
+    return pool->names + index * pool->name_size;
+}
+
+static bool build(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    const size_t index = index_of(pool, me);
+    const Identity identity = {name_of(pool, index), s->token, s->resources,
+                               log_environment(&pool->log, index), s->logging};
+
+    me->component = s->fmi->instantiate(me->library, &identity);
+    me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
+    return me->component != NULL;
+}
+
+static void free_state(const Pool *pool, Instance *me, void **state) {
+    if (*state != NULL && me->phase != PHASE_DEAD) {
+        pool->settings.fmi->free_state(me->library, me->component, state);
+    }
+    *state = NULL; /* after Fatal the standard forbids to free it: the memory is given up */
+}
+
+/* Snapshots are linked and unlinked under the pool's lock, but instances are replaced by several
+ * threads; each of these touches only what is its own instance's. */
+static void free_states(Pool *pool, Instance *me) {
+    const size_t index = index_of(pool, me);
+
+    free_state(pool, me, &me->saved);
+    for (Snapshot *snapshot = pool->snapshots; snapshot != NULL; snapshot = snapshot->next) {
+        if (snapshot->generations[index] == me->generation) {
+            free_state(pool, me, &snapshot->states[index]);
+        }
+    }
+}
+
+static void discard(Pool *pool, Instance *me) {
+    const Fmi *fmi = pool->settings.fmi;
+
+    free_states(pool, me);
+    if (me->phase == PHASE_STEPPING) {
+        fmi->terminate(me->library, me->component);
+    }
+    if (me->phase != PHASE_DEAD) {
+        fmi->free_instance(me->library, me->component);
+    }
+    me->component = NULL;
+    me->phase = PHASE_DEAD;
+    me->generation++;
+    me->start_id = 0;
+    me->unsavable = false;
+    log_forget(&pool->log, index_of(pool, me));
+}
+
+/* A private library may be loaded anew: whatever Fatal left in its globals is gone then. */
+static void reload_private_library(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    char unused[256];
+
+    if (s->private_libraries) {
+        library_close(me->library);
+        if (library_open(me->library, s->paths[index_of(pool, me)], unused, sizeof unused)) {
+            s->fmi->bind(me->library, unused, sizeof unused);
+        }
+    }
+}
+
+static Status replace(Pool *pool, Instance *me) {
+    const bool was_dead = me->phase == PHASE_DEAD;
+
+    discard(pool, me);
+    if (was_dead) {
+        reload_private_library(pool, me);
+    }
+    if (me->library->functions != NULL && build(pool, me)) {
+        return STATUS_OK;
+    }
+    Failure *failure = note_failure(me, "the FMU refused to be instantiated anew", -1);
+    if (failure != NULL) {
+        failure->said = log_said(&pool->log, index_of(pool, me));
+    }
+    return STATUS_FATAL;
+}
+
+/* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
+ * reset. */
+static Status return_to_instantiated(Pool *pool, Instance *me) {
+    if (me->phase == PHASE_INSTANTIATED) {
+        return STATUS_OK;
+    }
+    if (me->phase != PHASE_DEAD) {
+        const Status status = pool->settings.fmi->reset(me->library, me->component);
+        if (status <= STATUS_WARNING) {
+            me->phase = PHASE_INSTANTIATED;
+            return STATUS_OK;
+        }
+        judge(me, status);
+    }
+    return replace(pool, me);
+}
+
+/* Steps */
+
+static Status step_once(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    /* the order of operations of PoolSpec.communication_point; a division by 1 changes nothing */
+    const double since_start = (double)me->steps * s->time_step;
+    const double time = s->experiment.start_time +
+                        (s->substeps == 1 ? since_start : since_start / (double)s->substeps);
+    const Status status = s->fmi->do_step(me->library, me->component, time, pool->step_size);
+
+    me->steps++;
+    if (status > STATUS_WARNING) {
+        fail(pool, me, "the step", status);
+        if (me->failure != NULL) {
+            me->failure->time = time;
+        }
+    }
+    return status;
+}
+
+static Status advance(Pool *pool, Instance *me) {
+    Status status = STATUS_OK;
+    for (int64_t i = 0; i < pool->settings.substeps && status <= STATUS_WARNING; i++) {
+        status = step_once(pool, me);
+    }
+    return status;
+}
+
+static bool all_finite(const double *values, size_t count) {
+    double sum = 0.0;
+    for (size_t i = 0; i < count; i++) {
+        sum += values[i] - values[i]; /* 0, or NaN */
+    }
+    return sum == 0.0;
+}
+
+static Status note_not_finite(Instance *me, const double *values, size_t count) {
+    Failure *failure = note_failure(me, "the outputs are not finite", -1);
+    if (failure != NULL) {
+        failure->values = copy_values(values, count);
+    }
+    return STATUS_NOT_FINITE;
+}
+
+/* Scratch memory of one thread: values, and as much for their typed form. */
+typedef struct {
+    double *values;
+    void *typed;
+} Scratch;
+
+static Status read_outputs(Pool *pool, Instance *me, Status status, Scratch scratch) {
+    const Settings *s = &pool->settings;
+    const size_t count = s->outputs->count;
+    const Status got =
+        access_get(s->outputs, me->library, me->component, scratch.values, scratch.typed);
+
+    if (got > STATUS_WARNING) {
+        return fail(pool, me, "reading the outputs", got);
+    }
+    if (!all_finite(scratch.values, count)) {
+        return note_not_finite(me, scratch.values, count);
+    }
+    double *place = s->output_values + index_of(pool, me);
+    for (size_t i = 0; i < count; i++, place += s->count) {
+        *place = scratch.values[i];
+    }
+    return status;
+}
+
+static void gather(const Matrix *matrix, size_t column, size_t rows, double *values) {
+    const char *place = matrix->data + (ptrdiff_t)column * matrix->column_stride;
+    for (size_t i = 0; i < rows; i++, place += matrix->row_stride) {
+        memcpy(&values[i], place, sizeof values[i]);
+    }
+}
+
+static Status step_instance(Pool *pool, Instance *me, const Matrix *inputs, Scratch scratch) {
+    const Access *access = pool->settings.inputs;
+
+    if (me->phase != PHASE_STEPPING) {
+        return refuse(me, "a step was asked for before a reset has mended the instance");
+    }
+    gather(inputs, index_of(pool, me), access->count, scratch.values);
+    const Status set =
+        access_set(access, me->library, me->component, scratch.values, scratch.typed);
+    if (set > STATUS_WARNING) {
+        return fail(pool, me, "setting the inputs", set);
+    }
+    const Status status = advance(pool, me);
+    if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
+        return status;
+    }
+    return read_outputs(pool, me, status, scratch);
+}
+
+/* Initialization */
+
+typedef struct {
+    Pool *pool;
+    Instance *me;
+    const Access *start;
+    Scratch scratch; /* holds the start values */
+    uint32_t refused; /* the String that could not be set */
+} StartContext;
+
+static Status set_start_values(void *context) {
+    StartContext *c = context;
+    const Settings *s = &c->pool->settings;
+    Status status = access_set(c->start, c->me->library, c->me->component, c->scratch.values,
+                               c->scratch.typed);
+
+    for (size_t i = 0; i < s->number_of_strings && status <= STATUS_WARNING; i++) {
+        const StringValue *string = &s->strings[i];
+        status = s->fmi->set_string(c->me->library, c->me->component, string->reference,
+                                    string->text);
+        c->refused = status > STATUS_WARNING ? string->reference : c->refused;
+    }
+    return status;
+}
+
+static Status fail_initialization(Pool *pool, Instance *me, const StartContext *context,
+                                  const char *doing, Status status) {
+    fail(pool, me, doing, status);
+    if (me->failure != NULL) {
+        me->failure->string_reference = context->refused;
+    }
+    if (me->phase == PHASE_INSTANTIATED) {
+        me->phase = PHASE_FAILED; /* somewhere in the middle of it: a reset is due */
+    }
+    return status;
+}
+
+static Status warm_up(Pool *pool, Instance *me) {
+    me->steps = 0;
+    for (int64_t i = 0; i < pool->settings.warm_up_steps; i++) {
+        const Status status = advance(pool, me);
+        if (status > STATUS_WARNING) {
+            if (me->failure != NULL) {
+                me->failure->in_warm_up = true;
+            }
+            return status;
+        }
+    }
+    return STATUS_OK;
+}
+
+static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
+    const Settings *s = &pool->settings;
+    StartContext context = {pool, me, start, scratch, UINT32_MAX};
+    const char *doing = "initialization";
+    Status status = return_to_instantiated(pool, me);
+
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    status = s->fmi->initialize(me->library, me->component, &s->experiment,
+                                (StartValues){set_start_values, &context}, &doing);
+    if (status > STATUS_WARNING) {
+        return fail_initialization(pool, me, &context, doing, status);
+    }
+    me->phase = PHASE_STEPPING;
+    return warm_up(pool, me);
+}
+
+/* Initial states: kept once the same start values come a second time, restored from then on. */
+
+static bool states_are_of_use(Pool *pool, const Instance *me) {
+    return pool->settings.can_save && !me->unsavable && !atomic_get(&pool->trial.refuted);
+}
+
+static void give_states_up(Pool *pool) {
+    atomic_set(&pool->trial.refuted, 1);
+}
+
+static bool owns_trial(Pool *pool, const Instance *me) {
+    const uint64_t mine = index_of(pool, me) + 1;
+    uint64_t owner = atomic_get(&pool->trial.owner);
+    return owner == mine || (owner == 0 && atomic_replace(&pool->trial.owner, &owner, mine));
+}
+
+static Status save_state(Pool *pool, Instance *me, void **state) {
+    *state = NULL;
+    const Status status = pool->settings.fmi->get_state(me->library, me->component, state);
+    return status > STATUS_WARNING ? fail(pool, me, "saving the FMU state", status) : status;
+}
+
+static Status restore_state(Pool *pool, Instance *me, void *state) {
+    if (me->phase == PHASE_DEAD) {
+        return refuse(me, "no restore after a fatal error");
+    }
+    const Status status = pool->settings.fmi->set_state(me->library, me->component, state);
+    if (status > STATUS_WARNING) {
+        fail(pool, me, "restoring the FMU state", status);
+        return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
+    }
+    me->phase = PHASE_STEPPING;
+    return status;
+}
+
+static bool too_large(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    const size_t size = s->fmi->state_size(me->library, me->component, me->saved);
+    return size > STATES_LIMIT / s->count;
+}
+
+static Status keep_state(Pool *pool, Instance *me, uint64_t initialization) {
+    const Status status = save_state(pool, me, &me->saved);
+
+    if (status > STATUS_WARNING) {
+        me->unsavable = true;
+        return status;
+    }
+    if (owns_trial(pool, me)) {
+        pool->trial.initialization = initialization;
+        if (too_large(pool, me)) {
+            give_states_up(pool);
+        }
+    }
+    return STATUS_OK;
+}
+
+static double *start_values_of(const Pool *pool, const Instance *me) {
+    return pool->starts + index_of(pool, me) * pool->start_width;
+}
+
+static bool starts_as_before(const Pool *pool, const Instance *me, const Access *start,
+                             const double *values) {
+    const size_t size = start->count * sizeof *values;
+    return me->start_id == start->id && memcmp(start_values_of(pool, me), values, size) == 0;
+}
+
+static Status start_anew(Pool *pool, Instance *me, const Access *start, bool again,
+                         Scratch scratch) {
+    const uint64_t began = again ? clock_now() : 0;
+    const Status status = initialize(pool, me, start, scratch);
+
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    free_state(pool, me, &me->saved);
+    again = again && me->start_id == start->id; /* it may have been replaced */
+    me->start_id = start->id;
+    memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
+    if (!again || !states_are_of_use(pool, me)) {
+        return STATUS_OK;
+    }
+    if (keep_state(pool, me, clock_now() - began) <= STATUS_WARNING) {
+        return STATUS_OK;
+    }
+    return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
+}
+
+static void copy_outputs(const Pool *pool, const Instance *me, double *values) {
+    const Settings *s = &pool->settings;
+    for (size_t i = 0; i < s->outputs->count; i++) {
+        values[i] = s->output_values[i * s->count + index_of(pool, me)];
+    }
+}
+
+/* Compares a restored instance with the initialized one; returns whether it may go on so. */
+static bool passes_trial(Pool *pool, Instance *me, uint64_t restoration, Scratch scratch) {
+    Trial *trial = &pool->trial;
+    const size_t size = pool->settings.outputs->count * sizeof(double);
+
+    copy_outputs(pool, me, scratch.values);
+    if (memcmp(scratch.values, trial->outputs, size) != 0) {
+        give_states_up(pool);
+        return false;
+    }
+    if (trial->trials == 0 || restoration < trial->restoration) {
+        trial->restoration = restoration;
+    }
+    if (++trial->trials == TRIALS && trial->restoration > trial->initialization) {
+        give_states_up(pool);
+    }
+    return true;
+}
+
+static Status restart(Pool *pool, Instance *me, const Access *start, bool again, Scratch scratch) {
+    Status status = start_anew(pool, me, start, again, scratch);
+
+    if (status > STATUS_WARNING) {
+        return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
+    }
+    me->steps = pool->settings.warm_up_steps * pool->settings.substeps;
+    status = read_outputs(pool, me, STATUS_OK, scratch);
+    if (status == STATUS_OK && me->saved != NULL && owns_trial(pool, me)) {
+        copy_outputs(pool, me, pool->trial.outputs);
+    }
+    return status;
+}
+
+static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
+    const Status status = restore_state(pool, me, me->saved);
+
+    if (status > STATUS_WARNING) {
+        free_state(pool, me, &me->saved);
+        me->unsavable = true;
+        return status;
+    }
+    me->steps = pool->settings.warm_up_steps * pool->settings.substeps;
+    return read_outputs(pool, me, STATUS_OK, scratch);
+}
+
+/* By the cheapest way that gives the same as a fresh instance. */
+static Status reset_instance(Pool *pool, Instance *me, const Access *start, const Matrix *values,
+                             Scratch scratch) {
+    gather(values, index_of(pool, me), start->count, scratch.values);
+    const bool again = starts_as_before(pool, me, start, scratch.values);
+
+    if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
+        return restart(pool, me, start, again, scratch);
+    }
+    const bool trying = owns_trial(pool, me) && pool->trial.trials < TRIALS;
+    const uint64_t began = trying ? clock_now() : 0;
+    const Status status = return_to_start(pool, me, scratch);
+    const bool refused = me->saved == NULL;
+    if (!refused && (!trying || status > STATUS_WARNING ||
+                     passes_trial(pool, me, clock_now() - began, scratch))) {
+        return status;
+    }
+    gather(values, index_of(pool, me), start->count, scratch.values);
+    return restart(pool, me, start, again, scratch);
+}
+
+/* Division of the work */
+
+typedef struct {
+    Pool *pool;
+    const Call *call;
+    int operation;
+    const Snapshot *snapshot; /* to be restored */
+    bool listed;              /* whether the items are places in pool->chosen, or instances */
+    bool measured;
+    Atomic troubled; /* instances with a status worse than a warning */
+    Atomic ended;    /* when playing: see Ends */
+    Atomic used_up;
+    Atomic time;     /* ns, of all threads together, if measured */
+} Task;
+
+static bool is_in(Mask mask, size_t index) {
+    return mask.data != NULL && mask.data[(ptrdiff_t)index * mask.stride] != 0;
+}
+
+static void write_observation(const Pool *pool, size_t index, float *observations) {
+    const Settings *s = &pool->settings;
+    const double *value = s->output_values + index;
+    float *row = observations + index * s->num_observed;
+
+    for (size_t i = 0; i < s->num_observed; i++, value += s->count) {
+        row[i] = (float)*value;
+    }
+}
+
+static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
+    const size_t index = index_of(task->pool, me);
+    const Status status = restore_state(task->pool, me, task->snapshot->states[index]);
+
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    me->steps = task->snapshot->steps[index];
+    return read_outputs(task->pool, me, STATUS_OK, scratch);
+}
+
+static Status do_one(Task *task, size_t index, bool in_mask, Scratch scratch) {
+    const Call *call = task->call;
+    Instance *me = &task->pool->instances[index];
+
+    if (task->operation == RESTORE) {
+        return restore_instance(task, me, scratch);
+    }
+    if (task->operation == RESET || in_mask) {
+        return reset_instance(task->pool, me, call->start, &call->start_values, scratch);
+    }
+    return step_instance(task->pool, me, &call->inputs, scratch);
+}
+
+static size_t work_through(Task *task, size_t begin, size_t end, Scratch scratch) {
+    Pool *pool = task->pool;
+    const Call *call = task->call;
+    size_t troubled = 0;
+
+    for (size_t i = begin; i < end; i++) {
+        const size_t index = task->listed ? pool->chosen[i] : i;
+        const bool in_mask = !task->listed && is_in(call->mask, index);
+        if (!(task->operation == STEP && in_mask)) {
+            const Status status = do_one(task, index, in_mask, scratch);
+            pool->settings.status[index] = (int8_t)status;
+            troubled += status > STATUS_WARNING;
+        }
+        if (call->observations != NULL) {
+            write_observation(pool, index, call->observations);
+        }
+    }
+    return troubled;
+}
+
+static size_t play_run(Task *task, size_t begin, size_t count, Scratch scratch) {
+    Pool *pool = task->pool;
+    const Call *call = task->call;
+    size_t troubled = 0;
+
+    play_prepare(call->turn, begin, count);
+    for (size_t index = begin; index < begin + count; index++) {
+        const Status status = do_one(task, index, call->turn->play->ended[index], scratch);
+        pool->settings.status[index] = (int8_t)status;
+        troubled += status > STATUS_WARNING;
+        write_observation(pool, index, call->observations);
+    }
+    const Ends ends = play_judge(call->turn, begin, count);
+    if (ends.ended > 0) {
+        atomic_add(&task->ended, ends.ended);
+        atomic_add(&task->used_up, ends.used_up);
+    }
+    return troubled;
+}
+
+static size_t play_through(Task *task, size_t begin, size_t end, Scratch scratch) {
+    size_t troubled = 0;
+
+    for (size_t first = begin; first < end; first += PROGRAM_WIDTH) {
+        const size_t left = end - first;
+        troubled += play_run(task, first, left < PROGRAM_WIDTH ? left : PROGRAM_WIDTH, scratch);
+    }
+    return troubled;
+}
+
+/* Without 16 bytes per value nothing else will work either. */
+static size_t give_chunk_up(Task *task, size_t begin, size_t end) {
+    for (size_t i = begin; i < end; i++) {
+        const size_t index = task->listed ? task->pool->chosen[i] : i;
+        refuse(&task->pool->instances[index], "out of memory");
+        task->pool->settings.status[index] = STATUS_ERROR;
+    }
+    return end - begin;
+}
+
+static size_t most_values(const Task *task) {
+    const Settings *s = &task->pool->settings;
+    const size_t in = s->inputs->count, out = s->outputs->count;
+    const size_t start = task->call->start == NULL ? 0 : task->call->start->count;
+    const size_t most = in > out ? in : out;
+    return most > start ? most : start;
+}
+
+static size_t work_with_memory(Task *task, size_t begin, size_t end) {
+    const size_t most = most_values(task);
+    double stack[STACK_VALUES];
+    double *memory = 2 * most <= STACK_VALUES ? stack : malloc(2 * most * sizeof *memory);
+
+    if (memory == NULL) {
+        return give_chunk_up(task, begin, end);
+    }
+    const Scratch scratch = {memory, memory + most};
+    const size_t troubled = task->operation == PLAY ? play_through(task, begin, end, scratch)
+                                                    : work_through(task, begin, end, scratch);
+    if (memory != stack) {
+        free(memory);
+    }
+    return troubled;
+}
+
+/* A chunk of the work, on any thread. */
+static void work(void *context, size_t begin, size_t end) {
+    Task *task = context;
+    const uint64_t began = task->measured ? clock_now() : 0;
+    const size_t troubled = work_with_memory(task, begin, end);
+
+    if (troubled > 0) {
+        atomic_add(&task->troubled, troubled);
+    }
+    if (task->measured) {
+        atomic_add(&task->time, clock_now() - began);
+    }
+}
+
+/* The first time an operation is done nothing is known of its cost: item by item, until there is
+ * so much work that helpers are worth while. Returns how many items were done. */
+static size_t explore(Task *task, Cost *cost, size_t count) {
+    size_t done = 0;
+
+    task->measured = true;
+    while (done < count && (double)atomic_get(&task->time) < PARALLEL_FROM) {
+        work(task, done, done + 1);
+        done++;
+    }
+    cost->mean = (double)(atomic_get(&task->time) + 1) / (double)done;
+    return done;
+}
+
+static size_t at_least_one(double items) {
+    return items < 1.0 ? 1 : items > 1e9 ? (size_t)1e9 : (size_t)items;
+}
+
+/* Items from the first one on that explore has left. */
+typedef struct {
+    Task *task;
+    size_t first;
+} Rest;
+
+static void work_on_rest(void *context, size_t begin, size_t end) {
+    const Rest *rest = context;
+    work(rest->task, rest->first + begin, rest->first + end);
+}
+
+static void run(Task *task, double mean, size_t first, size_t count) {
+    const double total = mean * (double)(count - first);
+    Rest rest = {task, first};
+    const Job job = {
+        .work = work_on_rest,
+        .context = &rest,
+        .count = count - first,
+        .helpers = total < PARALLEL_FROM ? 0 : task->pool->settings.threads - 1,
+        .smallest = at_least_one(SMALLEST_CHUNK / mean),
+        .largest = at_least_one(LARGEST_CHUNK / mean),
+    };
+    threads_run(&job);
+}
+
+static void run_measured(Task *task, Cost *cost, size_t count) {
+    task->measured = count >= MANY || ++cost->calls % MEASURE_EVERY == 0;
+    run(task, cost->mean, 0, count);
+    if (task->measured) {
+        const double mean = (double)atomic_get(&task->time) / (double)count;
+        cost->mean += (mean - cost->mean) / 8.0;
+    }
+}
+
+/* Others read it without the lock. */
+static void note_whether_quick(Pool *pool, int operation) {
+    const double total = pool->costs[operation].mean * (double)pool->settings.count;
+    const uint64_t quick = total < QUICK;
+    if (atomic_get(&pool->quick[operation]) != quick) {
+        atomic_set(&pool->quick[operation], quick);
+    }
+}
+
+static size_t run_task(Task *task, size_t count) {
+    Cost *cost = &task->pool->costs[task->operation];
+
+    if (count == 0) {
+        return 0;
+    }
+    if (cost->mean == 0.0) {
+        const size_t done = explore(task, cost, count);
+        if (done < count) {
+            run(task, cost->mean, done, count);
+        }
+    } else {
+        run_measured(task, cost, count);
+    }
+    note_whether_quick(task->pool, task->operation);
+    return (size_t)atomic_get(&task->troubled);
+}
+
+bool pool_is_quick(const Pool *pool, int operation) {
+    return atomic_get(&pool->quick[operation]) != 0;
+}
+
+/* Calls */
+
+static size_t choose(Pool *pool, Mask mask) {
+    const size_t count = pool->settings.count;
+    size_t chosen = 0;
+
+    for (size_t i = 0; i < count; i++) {
+        pool->chosen[chosen] = (uint32_t)i;
+        chosen += mask.data == NULL || mask.data[(ptrdiff_t)i * mask.stride] != 0;
+    }
+    return chosen;
+}
+
+/* Other start variables than before: what was kept of them is of no use any more. */
+static bool make_room_for_starts(Pool *pool, const Access *start) {
+    const size_t count = pool->settings.count;
+
+    if (start->count <= pool->start_width) {
+        return true;
+    }
+    double *starts = malloc(count * start->count * sizeof *starts);
+    if (starts == NULL) {
+        return false;
+    }
+    free(pool->starts);
+    pool->starts = starts;
+    pool->start_width = start->count;
+    for (size_t i = 0; i < count; i++) {
+        pool->instances[i].start_id = 0;
+    }
+    return true;
+}
+
+size_t pool_step(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = STEP};
+
+    mutex_lock(&pool->lock);
+    const size_t troubled = run_task(&task, pool->settings.count);
+    mutex_unlock(&pool->lock);
+    return troubled;
+}
+
+size_t pool_reset(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = RESET, .listed = true};
+
+    mutex_lock(&pool->lock);
+    const size_t count = choose(pool, call->mask);
+    const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
+                                                                    : give_chunk_up(&task, 0, count);
+    mutex_unlock(&pool->lock);
+    return troubled;
+}
+
+size_t pool_step_or_reset(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = MIXED};
+    const size_t count = pool->settings.count;
+
+    mutex_lock(&pool->lock);
+    const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
+                                                                    : give_chunk_up(&task, 0, count);
+    mutex_unlock(&pool->lock);
+    return troubled;
+}
+
+size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
+    Task task = {.pool = pool, .call = call, .operation = PLAY};
+    const size_t count = pool->settings.count;
+
+    mutex_lock(&pool->lock);
+    const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
+                                                                    : give_chunk_up(&task, 0, count);
+    mutex_unlock(&pool->lock);
+    *ends = (Ends){(size_t)atomic_get(&task.ended), (size_t)atomic_get(&task.used_up)};
+    return troubled;
+}
+
+size_t pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask) {
+    const Call call = {.mask = mask};
+    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .snapshot = snapshot};
+
+    task.listed = true;
+    mutex_lock(&pool->lock);
+    const size_t troubled = run_task(&task, choose(pool, mask));
+    mutex_unlock(&pool->lock);
+    return troubled;
+}
+
+ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
+    const size_t count = pool->settings.count;
+    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    ptrdiff_t failed = memory == NULL ? 0 : -1;
+
+    mutex_lock(&pool->lock);
+    for (size_t i = 0; i < count && failed < 0; i++) {
+        Instance *me = &pool->instances[i];
+        if (me->phase == PHASE_DEAD) {
+            refuse(me, "nothing can be read after a fatal error");
+            failed = (ptrdiff_t)i;
+            break;
+        }
+        const Status status =
+            access_get(access, me->library, me->component, memory, memory + access->count);
+        if (status > STATUS_WARNING) {
+            fail(pool, me, "reading variables", status);
+            failed = (ptrdiff_t)i;
+        }
+        for (size_t j = 0; j < access->count; j++) {
+            values[j * count + i] = memory[j];
+        }
+    }
+    mutex_unlock(&pool->lock);
+    free(memory);
+    return failed;
+}
+
+bool pool_failure(Pool *pool, size_t index, Failure *copy) {
+    mutex_lock(&pool->lock);
+    const Failure *failure = pool->instances[index].failure;
+    if (failure != NULL) {
+        *copy = *failure;
+        copy->said = copy_text(failure->said);
+        copy->values = copy_values(failure->values, pool->settings.outputs->count);
+    }
+    mutex_unlock(&pool->lock);
+    return failure != NULL;
+}
+
+/* Snapshots */
+
+bool snapshot_open(Snapshot *snapshot, size_t count) {
+    memset(snapshot, 0, sizeof *snapshot);
+    snapshot->states = calloc(count, sizeof *snapshot->states);
+    snapshot->steps = calloc(count, sizeof *snapshot->steps);
+    snapshot->generations = calloc(count, sizeof *snapshot->generations);
+    return snapshot->states != NULL && snapshot->steps != NULL && snapshot->generations != NULL;
+}
+
+static bool is_own(const Pool *pool, const Snapshot *snapshot, size_t index) {
+    return snapshot->states[index] != NULL &&
+           snapshot->generations[index] == pool->instances[index].generation;
+}
+
+static void unlink_snapshot(Pool *pool, const Snapshot *snapshot) {
+    for (Snapshot **link = &pool->snapshots; *link != NULL; link = &(*link)->next) {
+        if (*link == snapshot) {
+            *link = snapshot->next;
+            return;
+        }
+    }
+}
+
+static void free_own_states(Pool *pool, Snapshot *snapshot) {
+    mutex_lock(&pool->lock);
+    unlink_snapshot(pool, snapshot);
+    for (size_t i = 0; i < pool->settings.count && pool->open; i++) {
+        if (is_own(pool, snapshot, i)) {
+            free_state(pool, &pool->instances[i], &snapshot->states[i]);
+        }
+    }
+    mutex_unlock(&pool->lock);
+}
+
+void snapshot_close(Snapshot *snapshot) {
+    if (snapshot->pool != NULL) {
+        free_own_states(snapshot->pool, snapshot);
+    }
+    free(snapshot->states);
+    free(snapshot->steps);
+    free(snapshot->generations);
+    memset(snapshot, 0, sizeof *snapshot);
+}
+
+static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
+    const size_t index = index_of(pool, me);
+
+    if (me->phase != PHASE_STEPPING) {
+        return refuse(me, me->phase == PHASE_INSTANTIATED
+                              ? "cannot save the FMU state before the first reset"
+                              : "cannot save the FMU state before a reset has mended the instance");
+    }
+    snapshot->generations[index] = me->generation;
+    snapshot->steps[index] = me->steps;
+    return save_state(pool, me, &snapshot->states[index]);
+}
+
+ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot) {
+    ptrdiff_t failed = -1;
+
+    mutex_lock(&pool->lock);
+    snapshot->pool = pool;
+    snapshot->next = pool->snapshots;
+    pool->snapshots = snapshot;
+    for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
+        if (save_instance(pool, &pool->instances[i], snapshot) > STATUS_WARNING) {
+            failed = (ptrdiff_t)i;
+        }
+    }
+    mutex_unlock(&pool->lock);
+    return failed;
+}
+
+ptrdiff_t pool_find_foreign(Pool *pool, const Snapshot *snapshot, Mask mask) {
+    ptrdiff_t foreign = -1;
+
+    mutex_lock(&pool->lock);
+    for (size_t i = 0; i < pool->settings.count && foreign < 0; i++) {
+        const bool chosen = mask.data == NULL || is_in(mask, i);
+        if (chosen && (snapshot->pool != pool || !is_own(pool, snapshot, i))) {
+            foreign = (ptrdiff_t)i;
+        }
+    }
+    mutex_unlock(&pool->lock);
+    return foreign;
+}
+
+/* Opening and closing */
+
+static Mutex list_lock = MUTEX_INITIALIZER;
+static Pool *pools;
+
+static void link_pool(Pool *pool) {
+    mutex_lock(&list_lock);
+    pool->next = pools;
+    pools = pool;
+    mutex_unlock(&list_lock);
+}
+
+static void unlink_pool(const Pool *pool) {
+    mutex_lock(&list_lock);
+    for (Pool **link = &pools; *link != NULL; link = &(*link)->next) {
+        if (*link == pool) {
+            *link = pool->next;
+            break;
+        }
+    }
+    mutex_unlock(&list_lock);
+}
+
+static bool allocate(Pool *pool) {
+    const Settings *s = &pool->settings;
+
+    pool->name_size = strlen(s->model) + sizeof "_4294967295_4294967295";
+    pool->libraries = calloc(s->private_libraries ? s->count : 1, sizeof *pool->libraries);
+    pool->instances = calloc(s->count, sizeof *pool->instances);
+    pool->names = calloc(s->count, pool->name_size);
+    pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
+    pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
+    pool->trial.outputs = calloc(s->outputs->count + 1, sizeof *pool->trial.outputs);
+    return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
+           pool->chosen != NULL && pool->starts != NULL && pool->trial.outputs != NULL;
+}
+
+static void prepare_instance(Pool *pool, size_t index) {
+    const Settings *s = &pool->settings;
+    Instance *me = &pool->instances[index];
+
+    snprintf(pool->names + index * pool->name_size, pool->name_size, "%s_%u_%zu", s->model,
+             (unsigned)pool->log.id, index);
+    me->library = &pool->libraries[s->private_libraries ? index : 0];
+    me->phase = PHASE_DEAD;
+}
+
+static bool load_libraries(Pool *pool, char *error, size_t size) {
+    const Settings *s = &pool->settings;
+
+    for (size_t i = 0; i < (s->private_libraries ? s->count : 1); i++) {
+        pool->libraries[i].identifier = s->model;
+        if (!library_open(&pool->libraries[i], s->paths[i], error, size) ||
+            !s->fmi->bind(&pool->libraries[i], error, size)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static bool build_all(Pool *pool, char *error, size_t size) {
+    for (size_t i = 0; i < pool->settings.count; i++) {
+        if (!build(pool, &pool->instances[i])) {
+            char *said = log_said(&pool->log, i);
+            snprintf(error, size, "it refused to be instantiated%s%s",
+                     said == NULL ? "" : "; the FMU said: ", said == NULL ? "" : said);
+            free(said);
+            return false;
+        }
+    }
+    return true;
+}
+
+bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
+    memset(pool, 0, sizeof *pool);
+    mutex_reset(&pool->lock);
+    pool->settings = *settings;
+    pool->step_size = settings->time_step / (double)settings->substeps;
+    pool->open = true;
+    snprintf(error, size, "out of memory");
+    if (!log_open(&pool->log, settings->count) || !allocate(pool)) {
+        return false;
+    }
+    for (size_t i = 0; i < settings->count; i++) {
+        prepare_instance(pool, i);
+    }
+    link_pool(pool);
+    return load_libraries(pool, error, size) && build_all(pool, error, size);
+}
+
+static void free_instances(Pool *pool) {
+    const Settings *s = &pool->settings;
+
+    for (size_t i = 0; i < s->count && pool->instances != NULL; i++) {
+        discard(pool, &pool->instances[i]);
+        drop_failure(&pool->instances[i]);
+    }
+    for (size_t i = 0; i < (s->private_libraries ? s->count : 1) && pool->libraries != NULL; i++) {
+        library_close(&pool->libraries[i]);
+    }
+}
+
+static void forget_snapshots(Pool *pool) {
+    for (Snapshot *snapshot = pool->snapshots, *next; snapshot != NULL; snapshot = next) {
+        next = snapshot->next;
+        snapshot->pool = NULL;
+        snapshot->next = NULL;
+    }
+    pool->snapshots = NULL;
+}
+
+void pool_close(Pool *pool) {
+    mutex_lock(&pool->lock);
+    if (pool->open) {
+        pool->open = false;
+        free_instances(pool);
+        forget_snapshots(pool);
+        free(pool->libraries);
+        free(pool->instances);
+        free(pool->starts);
+        free(pool->names);
+        free(pool->chosen);
+        free(pool->trial.outputs);
+        unlink_pool(pool);
+    }
+    mutex_unlock(&pool->lock);
+}
+
+/* Fork: only the forking thread lives on in the child, so what others had locked is free there. */
+
+#if !defined _WIN32
+
+static void before_fork(void) {
+    mutex_lock(&list_lock);
+    log_before_fork();
+}
+
+static void after_fork_in_parent(void) {
+    log_after_fork_in_parent();
+    mutex_unlock(&list_lock);
+}
+
+static void after_fork_in_child(void) {
+    log_after_fork_in_child();
+    mutex_reset(&list_lock);
+    threads_reset();
+    for (Pool *pool = pools; pool != NULL; pool = pool->next) {
+        mutex_reset(&pool->lock);
+    }
+}
+
+#endif
+
+void pool_prepare_process(void) {
+    threads_reset();
+#if !defined _WIN32
+    pthread_atfork(before_fork, after_fork_in_parent, after_fork_in_child);
+#endif
+}

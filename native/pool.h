@@ -1,0 +1,183 @@
+/* N instances of one FMU: stepped, reset, saved and restored without Python.
+ *
+ * The pool writes outputs and statuses into memory of its owner. Every function may be called from
+ * any thread; calls for one pool wait for each other. */
+
+#ifndef FMUGYM_POOL_H
+#define FMUGYM_POOL_H
+
+#include "access.h"
+#include "fmi.h"
+#include "log.h"
+#include "platform.h"
+#include "play.h"
+
+typedef struct {
+    uint32_t reference;
+    const char *text;
+} StringValue;
+
+/* What a pool is made from; it must all stay in place as long as the pool does. */
+typedef struct {
+    const Fmi *fmi;
+    const char *model; /* the model identifier */
+    const char *token;
+    const char *resources;
+    const char *const *paths; /* of the library, or of one private copy per instance */
+    bool private_libraries;   /* whether there is one for each instance */
+    bool logging;
+    bool can_save;
+    Experiment experiment;
+    double time_step;
+    int64_t substeps;
+    int64_t warm_up_steps;
+    const StringValue *strings;
+    size_t number_of_strings;
+    const Access *inputs, *outputs;
+    size_t num_observed;
+    size_t count;
+    size_t threads;
+    double *output_values; /* one row of count per output */
+    int8_t *status;
+} Settings;
+
+typedef enum {
+    PHASE_INSTANTIATED,
+    PHASE_STEPPING,
+    PHASE_FAILED, /* after Error: a reset is legal */
+    PHASE_DEAD    /* after Fatal, or where there is no instance: no call is legal */
+} Phase;
+
+/* Why the last status was worse than a warning. */
+typedef struct {
+    const char *doing; /* what failed; with the status -1 a whole sentence */
+    int status;
+    bool in_warm_up;
+    double time;    /* of a step, NaN for other calls */
+    uint32_t string_reference; /* of the String that could not be set, or UINT32_MAX */
+    char *said;     /* what the FMU logged, or NULL */
+    double *values; /* the outputs if these are the reason, or NULL */
+} Failure;
+
+typedef struct {
+    Library *library;
+    void *component;
+    void *saved;       /* the FMU state after initialization with the start values, or NULL */
+    uint64_t start_id; /* of the list of start variables of the last initialization, or 0 */
+    int64_t steps;     /* communication steps done */
+    Failure *failure;
+    uint32_t generation; /* goes up whenever the instance is replaced */
+    uint8_t phase;
+    bool unsavable; /* it refused once */
+    char padding[64 - 6 * 8 - 6];
+} Instance;
+
+typedef struct Snapshot {
+    struct Snapshot *next;
+    struct Pool *pool; /* NULL once the pool is closed */
+    void **states;
+    int64_t *steps;
+    uint32_t *generations;
+} Snapshot;
+
+/* Measured cost of an operation. */
+typedef struct {
+    double mean; /* ns per instance; 0 as long as it is unknown */
+    uint32_t calls;
+} Cost;
+
+enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
+
+/* The first instance that saves its initial state finds out whether that was a good idea: whether
+ * the FMU comes out the same, sooner, and small enough. */
+typedef struct {
+    Atomic owner; /* its index + 1 */
+    Atomic refuted;
+    size_t trials;
+    uint64_t initialization; /* shortest times, ns */
+    uint64_t restoration;
+    double *outputs; /* after the initialization */
+} Trial;
+
+typedef struct Pool {
+    struct Pool *next; /* in the list of all pools */
+    Settings settings;
+    double step_size; /* of a communication step */
+    Mutex lock;
+    bool open;
+    Log log;
+    Library *libraries;
+    Instance *instances;
+    double *starts; /* start values of the last initialization, start_width for each instance */
+    size_t start_width;
+    char *names;
+    size_t name_size;
+    uint32_t *chosen; /* the indices of a call's instances */
+    Snapshot *snapshots;
+    Cost costs[OPERATIONS];
+    Atomic quick[OPERATIONS]; /* whether a call is short */
+    Trial trial;
+} Pool;
+
+/* float64 values, variables first; strides in bytes. */
+typedef struct {
+    const char *data;
+    ptrdiff_t row_stride, column_stride;
+} Matrix;
+
+/* One byte for each instance; data is NULL for no mask. */
+typedef struct {
+    const char *data;
+    ptrdiff_t stride;
+} Mask;
+
+/* What to do in a call; what is not needed for it may be zero. */
+typedef struct {
+    Matrix inputs;
+    Mask mask;
+    const Access *start; /* the variables set before initialization */
+    Matrix start_values;
+    float *observations; /* one row of num_observed for each instance, or NULL */
+    const Turn *turn;    /* what surrounds the steps, or NULL */
+} Call;
+
+/* To be called once per process. */
+void pool_prepare_process(void);
+
+/* Returns whether all could be loaded and instantiated; if not, error tells why and the pool is
+ * closed, with its log still open. */
+bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size);
+void pool_close(Pool *pool);
+
+/* Whether a call is known to be so short that nobody will mind waiting for it. */
+bool pool_is_quick(const Pool *pool, int operation);
+
+/* Copies the last failure of an instance. Returns whether there is one, of which the caller frees
+ * said and values. */
+bool pool_failure(Pool *pool, size_t index, Failure *copy);
+
+/* All three return how many of the instances have a status worse than a warning now. */
+
+/* Steps all instances but those in the mask; writes all observations. */
+size_t pool_step(Pool *pool, const Call *call);
+/* Starts the instances in the mask (all if there is none) anew; writes their observations. */
+size_t pool_reset(Pool *pool, const Call *call);
+/* Starts those in the mask anew and steps the others; writes all observations. */
+size_t pool_step_or_reset(Pool *pool, const Call *call);
+
+/* Starts those anew whose episode has ended and steps the others, with the turn's programs before
+ * and after; writes all observations. */
+size_t pool_play(Pool *pool, const Call *call, Ends *ends);
+
+/* These return the index of the first instance that fails, or -1. */
+ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);
+ptrdiff_t pool_find_foreign(Pool *pool, const Snapshot *snapshot, Mask mask);
+ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
+
+/* Returns how many have a status worse than a warning now. */
+size_t pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask);
+
+bool snapshot_open(Snapshot *snapshot, size_t count);
+void snapshot_close(Snapshot *snapshot);
+
+#endif

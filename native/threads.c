@@ -1,0 +1,307 @@
+/* Helper threads that take chunks of jobs.
+ *
+ * A job sits in a slot, and slots are never freed, so a helper that was put to sleep by the operating
+ * system between finding a job and taking a chunk of it does no harm when it wakes up much later: a
+ * chunk is taken by replacing the slot's ticket, (epoch, next item), and the epoch has gone on. So
+ * the caller waits for chunks that were taken, never for threads. */
+
+#include "threads.h"
+
+#include <fenv.h>
+#include <string.h>
+
+#include "platform.h"
+
+#if !defined _WIN32
+#include <signal.h>
+#endif
+
+enum {
+    SLOTS = 64, /* jobs at the same time; with more, a caller works alone */
+    MOST_HELPERS = 255,
+    STACK_SIZE = 8 << 20, /* of the main thread on most systems: FMUs may count on it */
+    HELPER_SPIN = 5000, /* ns to look for more work before going to sleep */
+    CALLER_SPIN = 5000  /* ns to wait for the last chunks before going to sleep */
+};
+
+typedef struct {
+    Atomic ticket; /* epoch << 32 | next item */
+    Atomic count;
+    Atomic done;
+    Atomic helpers; /* at work in this slot */
+    Atomic limit;   /* of helpers */
+    Atomic smallest;
+    Atomic largest;
+    Atomic waiting; /* whether the caller sleeps */
+    /* constant from the opening of the ticket until all is done */
+    Job job;
+    fenv_t environment;
+    Mutex lock;
+    Condition finished;
+    char padding[64];
+} Slot;
+
+static const uint64_t CLOSED = UINT32_MAX;
+
+static Slot slots[SLOTS];
+static Atomic taken;  /* one bit per slot: in use */
+static Atomic opened; /* one bit per slot: has a job */
+static Atomic sleeping;
+static Atomic started;
+static Mutex lock; /* of going to sleep and of starting helpers */
+static Condition work_arrived;
+
+static size_t next_item(uint64_t ticket) {
+    return (size_t)(ticket & UINT32_MAX);
+}
+
+/* Large chunks first, smaller ones towards the end, so that all finish together. Whole cache lines
+ * where chunks are large: neighbours write next to each other. */
+static size_t chunk_size(const Slot *slot, size_t left) {
+    const size_t smallest = (size_t)atomic_get(&slot->smallest);
+    const size_t largest = (size_t)atomic_get(&slot->largest);
+    size_t size = left / (2 * ((size_t)atomic_get(&slot->limit) + 1));
+
+    size = size > largest ? largest : size;
+    size = size < smallest ? smallest : size;
+    if (size >= 16) {
+        size = (size + 15) / 16 * 16;
+    }
+    return size < left ? size : left;
+}
+
+static void finish(Slot *slot, size_t size, size_t count) {
+    if (atomic_add(&slot->done, size) + size == count && atomic_get(&slot->waiting)) {
+        mutex_lock(&slot->lock);
+        condition_wake_all(&slot->finished);
+        mutex_unlock(&slot->lock);
+    }
+}
+
+/* Takes chunks until there are none. A helper works in the caller's floating-point environment: the
+ * rounding mode and the treatment of denormals must not depend on the thread. */
+static void take_chunks(Slot *slot, bool helper) {
+    uint64_t ticket = atomic_get(&slot->ticket), epoch = UINT64_MAX;
+
+    for (;;) {
+        const size_t begin = next_item(ticket);
+        const size_t count = (size_t)atomic_get(&slot->count);
+        if (begin >= count) {
+            return;
+        }
+        const size_t size = chunk_size(slot, count - begin);
+        if (!atomic_replace(&slot->ticket, &ticket, ticket + size)) {
+            continue;
+        }
+        if (helper && epoch != ticket >> 32) {
+            epoch = ticket >> 32;
+            fesetenv(&slot->environment);
+        }
+        slot->job.work(slot->job.context, begin, begin + size);
+        finish(slot, size, count);
+        ticket = atomic_get(&slot->ticket);
+    }
+}
+
+/* Helpers */
+
+static bool has_work(const Slot *slot) {
+    return next_item(atomic_get(&slot->ticket)) < atomic_get(&slot->count) &&
+           atomic_get(&slot->helpers) < atomic_get(&slot->limit);
+}
+
+static Slot *find_work(void) {
+    uint64_t left = atomic_get(&opened);
+    for (size_t i = 0; left != 0; i++, left >>= 1) {
+        if ((left & 1) && has_work(&slots[i])) {
+            return &slots[i];
+        }
+    }
+    return NULL;
+}
+
+static void help(Slot *slot) {
+    if (atomic_add(&slot->helpers, 1) < atomic_get(&slot->limit)) {
+        take_chunks(slot, true);
+    }
+    atomic_add(&slot->helpers, (uint64_t)-1);
+}
+
+static Slot *spin_for_work(void) {
+    const uint64_t end = clock_now() + HELPER_SPIN;
+    Slot *slot = find_work();
+
+    while (slot == NULL && clock_now() < end) {
+        spin_pause();
+        slot = find_work();
+    }
+    return slot;
+}
+
+static void sleep_until_work(void) {
+    mutex_lock(&lock);
+    atomic_add(&sleeping, 1);
+    while (find_work() == NULL) {
+        condition_wait(&work_arrived, &lock);
+    }
+    atomic_add(&sleeping, (uint64_t)-1);
+    mutex_unlock(&lock);
+}
+
+static void helper_main(void) {
+    for (;;) {
+        Slot *slot = spin_for_work();
+        if (slot != NULL) {
+            help(slot);
+        } else {
+            sleep_until_work();
+        }
+    }
+}
+
+#if defined _WIN32
+
+static DWORD WINAPI helper_entry(void *unused) {
+    (void)unused;
+    helper_main();
+    return 0;
+}
+
+static bool start_helper(void) {
+    HANDLE thread = CreateThread(NULL, STACK_SIZE, helper_entry, NULL,
+                                 STACK_SIZE_PARAM_IS_A_RESERVATION, NULL);
+    if (thread != NULL) {
+        CloseHandle(thread);
+    }
+    return thread != NULL;
+}
+
+#else
+
+static void *helper_entry(void *unused) {
+    (void)unused;
+    helper_main();
+    return NULL;
+}
+
+/* Signals are for the threads that were there before. */
+static bool start_helper(void) {
+    pthread_attr_t attributes;
+    pthread_t thread;
+    sigset_t all, before;
+
+    pthread_attr_init(&attributes);
+    pthread_attr_setstacksize(&attributes, STACK_SIZE);
+    pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
+    sigfillset(&all);
+    pthread_sigmask(SIG_SETMASK, &all, &before);
+    const bool made = pthread_create(&thread, &attributes, helper_entry, NULL) == 0;
+    pthread_sigmask(SIG_SETMASK, &before, NULL);
+    pthread_attr_destroy(&attributes);
+    return made;
+}
+
+#endif
+
+/* Where the system refuses, those that are there must do. */
+static void start_helpers(size_t wanted) {
+    wanted = wanted > MOST_HELPERS ? MOST_HELPERS : wanted;
+    if (atomic_get(&started) >= wanted) {
+        return;
+    }
+    mutex_lock(&lock);
+    while (atomic_get(&started) < wanted && start_helper()) {
+        atomic_add(&started, 1);
+    }
+    mutex_unlock(&lock);
+}
+
+static void wake_helpers(size_t wanted) {
+    if (atomic_get(&sleeping) == 0) {
+        return;
+    }
+    mutex_lock(&lock);
+    for (size_t i = 0; i < wanted && i < atomic_get(&sleeping); i++) {
+        condition_wake_one(&work_arrived);
+    }
+    mutex_unlock(&lock);
+}
+
+/* The caller */
+
+static Slot *take_slot(void) {
+    for (size_t i = 0; i < SLOTS; i++) {
+        const uint64_t bit = (uint64_t)1 << i;
+        if (!(atomic_or_bits(&taken, bit) & bit)) {
+            return &slots[i];
+        }
+    }
+    return NULL;
+}
+
+/* The ticket is closed while the rest changes: no late helper may take a chunk meanwhile. */
+static void open_slot(Slot *slot, const Job *job) {
+    const uint64_t epoch = (atomic_get(&slot->ticket) >> 32) + 1;
+
+    atomic_set(&slot->ticket, epoch << 32 | CLOSED);
+    slot->job = *job;
+    fegetenv(&slot->environment);
+    atomic_set(&slot->limit, job->helpers);
+    atomic_set(&slot->smallest, job->smallest);
+    atomic_set(&slot->largest, job->largest);
+    atomic_set(&slot->done, 0);
+    atomic_set(&slot->count, job->count);
+    atomic_set(&slot->ticket, epoch << 32);
+    atomic_or_bits(&opened, (uint64_t)1 << (slot - slots));
+}
+
+static void wait_for_chunks(Slot *slot, size_t count) {
+    if (atomic_get(&slot->done) == count) {
+        return;
+    }
+    const uint64_t end = clock_now() + CALLER_SPIN;
+    while (clock_now() < end) {
+        if (atomic_get(&slot->done) == count) {
+            return;
+        }
+        spin_pause();
+    }
+    mutex_lock(&slot->lock);
+    atomic_set(&slot->waiting, 1);
+    while (atomic_get(&slot->done) != count) {
+        condition_wait(&slot->finished, &slot->lock);
+    }
+    atomic_set(&slot->waiting, 0);
+    mutex_unlock(&slot->lock);
+}
+
+void threads_run(const Job *job) {
+    Slot *slot = job->helpers == 0 || job->count < 2 ? NULL : take_slot();
+
+    if (slot == NULL) {
+        job->work(job->context, 0, job->count);
+        return;
+    }
+    const uint64_t bit = (uint64_t)1 << (slot - slots);
+    start_helpers(job->helpers);
+    open_slot(slot, job);
+    wake_helpers(job->helpers);
+    take_chunks(slot, false);
+    atomic_and_bits(&opened, ~bit);
+    wait_for_chunks(slot, job->count);
+    atomic_and_bits(&taken, ~bit);
+}
+
+void threads_reset(void) {
+    memset((void *)slots, 0, sizeof slots);
+    for (size_t i = 0; i < SLOTS; i++) {
+        mutex_reset(&slots[i].lock);
+        condition_reset(&slots[i].finished);
+    }
+    atomic_set(&taken, 0);
+    atomic_set(&opened, 0);
+    atomic_set(&sleeping, 0);
+    atomic_set(&started, 0);
+    mutex_reset(&lock);
+    condition_reset(&work_arrived);
+}
