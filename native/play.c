@@ -36,14 +36,18 @@ static Source source_of(const Turn *turn) {
     return source;
 }
 
-void play_prepare(const Turn *turn, size_t begin, size_t count) {
+void play_open(const Turn *turn, PlayScratch *scratch) {
+    program_prepare(&turn->play->inputs, scratch->inputs);
+    program_prepare(&turn->play->judgement, scratch->judgement);
+}
+
+void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
-    Registers registers;
 
-    program_run(&play->inputs, &source, begin, count, registers);
+    program_run(&play->inputs, &source, begin, count, scratch->inputs);
     for (size_t i = 0; i < play->inputs.number_of_results; i++) {
-        const double *values = registers[play->inputs.results[i]];
+        const double *values = scratch->inputs[play->inputs.results[i]];
         double *row = play->input_rows + i * play->count + begin;
         for (size_t j = 0; j < count; j++) {
             row[j] = values[j];
@@ -57,22 +61,24 @@ void play_prepare(const Turn *turn, size_t begin, size_t count) {
     }
 }
 
-Ends play_judge(const Turn *turn, size_t begin, size_t count) {
+Ends play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
-    Registers registers;
+    const double *dones = scratch->judgement[results[DONE]];
+    const double *cuts = scratch->judgement[results[TRUNCATED]];
+    const double *rewards = scratch->judgement[results[REWARD]];
     Ends ends = {0, 0};
 
-    program_run(&play->judgement, &source, begin, count, registers);
+    program_run(&play->judgement, &source, begin, count, scratch->judgement);
     for (size_t j = 0; j < count; j++) {
         const size_t index = begin + j;
         const bool started = play->ended[index];
         const bool over = play->step_counts[index] >= play->limit;
-        const bool done = !started && registers[results[DONE]][j] != 0.0;
-        const bool cut = !started && (over || registers[results[TRUNCATED]][j] != 0.0);
+        const bool done = !started && dones[j] != 0.0;
+        const bool cut = !started && (over || cuts[j] != 0.0);
 
-        turn->rewards[index] = started ? 0.0 : registers[results[REWARD]][j];
+        turn->rewards[index] = started ? 0.0 : rewards[j];
         turn->terminated[index] = done;
         turn->truncated[index] = cut;
         play->ended[index] = done || cut;

@@ -50,9 +50,16 @@ typedef struct {
 /* The first environment whose action is out of range, or -1. */
 ptrdiff_t play_find_bad_action(const Turn *turn);
 
+/* Scratch memory of one thread. */
+typedef struct {
+    Registers inputs, judgement;
+} PlayScratch;
+
+void play_open(const Turn *turn, PlayScratch *scratch);
+
 /* Both for a run of at most PROGRAM_WIDTH environments: before their instances are reset or
  * stepped, and after. */
-void play_prepare(const Turn *turn, size_t begin, size_t count);
-Ends play_judge(const Turn *turn, size_t begin, size_t count);
+void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
+Ends play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 
 #endif

@@ -591,19 +591,20 @@ static size_t work_through(Task *task, size_t begin, size_t end, Scratch scratch
     return troubled;
 }
 
-static size_t play_run(Task *task, size_t begin, size_t count, Scratch scratch) {
+static size_t play_run(Task *task, size_t begin, size_t count, Scratch scratch,
+                       PlayScratch *registers) {
     Pool *pool = task->pool;
     const Call *call = task->call;
     size_t troubled = 0;
 
-    play_prepare(call->turn, begin, count);
+    play_prepare(call->turn, begin, count, registers);
     for (size_t index = begin; index < begin + count; index++) {
         const Status status = do_one(task, index, call->turn->play->ended[index], scratch);
         pool->settings.status[index] = (int8_t)status;
         troubled += status > STATUS_WARNING;
         write_observation(pool, index, call->observations);
     }
-    const Ends ends = play_judge(call->turn, begin, count);
+    const Ends ends = play_judge(call->turn, begin, count, registers);
     if (ends.ended > 0) {
         atomic_add(&task->ended, ends.ended);
         atomic_add(&task->used_up, ends.used_up);
@@ -612,11 +613,14 @@ static size_t play_run(Task *task, size_t begin, size_t count, Scratch scratch) 
 }
 
 static size_t play_through(Task *task, size_t begin, size_t end, Scratch scratch) {
+    PlayScratch registers;
     size_t troubled = 0;
 
+    play_open(task->call->turn, &registers);
     for (size_t first = begin; first < end; first += PROGRAM_WIDTH) {
         const size_t left = end - first;
-        troubled += play_run(task, first, left < PROGRAM_WIDTH ? left : PROGRAM_WIDTH, scratch);
+        const size_t count = left < PROGRAM_WIDTH ? left : PROGRAM_WIDTH;
+        troubled += play_run(task, first, count, scratch, &registers);
     }
     return troubled;
 }

@@ -1,9 +1,7 @@
-/* Every loop is over plain arrays of one length, which compilers turn into vector instructions. */
-
 #include "program.h"
 
 #include <math.h>
-#include <stdbool.h>
+#include <string.h>
 
 static size_t number_of_operands(uint16_t operation) {
     if (operation <= LOAD_CONSTANT) {
@@ -60,26 +58,17 @@ bool program_is_sound(const Program *program, const Source *source) {
     return true;
 }
 
-static void copy(double *restrict to, const double *restrict from, size_t count) {
-    for (size_t j = 0; j < count; j++) {
-        to[j] = from[j];
-    }
-}
-
 static void convert(double *restrict to, const int64_t *restrict from, size_t count) {
     for (size_t j = 0; j < count; j++) {
         to[j] = (double)from[j];
     }
 }
 
-static void fill(double *to, double value, size_t count) {
-    for (size_t j = 0; j < count; j++) {
-        to[j] = value;
-    }
+static void copy(double *to, const double *from, size_t count) {
+    memcpy(to, from, count * sizeof *to);
 }
 
-static void load(const Program *program, const Source *s, Instruction i, size_t begin, size_t count,
-                 double *to) {
+static void load(const Source *s, Instruction i, size_t begin, size_t count, double *to) {
     const size_t offset = i.operands[0] * s->count + begin;
 
     switch (i.operation) {
@@ -98,20 +87,19 @@ static void load(const Program *program, const Source *s, Instruction i, size_t 
     case LOAD_STEP_COUNT:
         convert(to, s->step_counts + begin, count);
         break;
-    default:
-        fill(to, program->constants[i.operands[0]], count);
+    default: /* a constant, which is there already */
         break;
     }
 }
 
 #define EACH(expression)                                                                           \
-    for (size_t j = 0; j < count; j++) {                                                           \
+    for (size_t j = 0; j < PROGRAM_WIDTH; j++) {                                                   \
         to[j] = expression;                                                                        \
     }                                                                                              \
     break
 
 static void compute(uint16_t operation, const double *restrict a, const double *restrict b,
-                    const double *restrict c, double *restrict to, size_t count) {
+                    const double *restrict c, double *restrict to) {
     switch (operation) {
     case OP_ADD:
         EACH(a[j] + b[j]);
@@ -154,17 +142,27 @@ static void compute(uint16_t operation, const double *restrict a, const double *
     }
 }
 
+void program_prepare(const Program *program, Registers registers) {
+    memset(registers, 0, program->length * sizeof registers[0]);
+    for (size_t place = 0; place < program->length; place++) {
+        const Instruction i = program->code[place];
+        for (size_t j = 0; i.operation == LOAD_CONSTANT && j < PROGRAM_WIDTH; j++) {
+            registers[place][j] = program->constants[i.operands[0]];
+        }
+    }
+}
+
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers registers) {
     for (size_t place = 0; place < program->length; place++) {
         const Instruction i = program->code[place];
 
         if (i.operation <= LOAD_CONSTANT) {
-            load(program, source, i, begin, count, registers[place]);
+            load(source, i, begin, count, registers[place]);
         } else {
             /* operands that an operation does not have are 0: register 0 is always there */
             compute(i.operation, registers[i.operands[0]], registers[i.operands[1]],
-                    registers[i.operands[2]], registers[place], count);
+                    registers[i.operands[2]], registers[place]);
         }
     }
 }

@@ -68,10 +68,14 @@ typedef struct {
 
 typedef double Registers[PROGRAM_LENGTH][PROGRAM_WIDTH];
 
+/* Once before the first run with these registers: constants stay in their place. */
+void program_prepare(const Program *program, Registers registers);
+
 /* Whether every operand refers to something that there is. */
 bool program_is_sound(const Program *program, const Source *source);
 
-/* Evaluates for the instances from begin on, at most PROGRAM_WIDTH of them. */
+/* Evaluates for the instances from begin on, at most PROGRAM_WIDTH of them. Registers are computed
+ * in their full width, as loops of a known length become vector instructions. */
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers registers);
 

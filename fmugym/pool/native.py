@@ -383,8 +383,10 @@ class NativePool:
         count, ended, limit = episodes
         self._pool.prepare_play(
             self._access(variables),
-            *(_program_bytes(program) for program in programs),
-            *actions,
+            _program_bytes(programs[0]),
+            _program_bytes(programs[1]),
+            actions[0],
+            actions[1],
             limit,
             block.shape[2],
             block.shape[1],
