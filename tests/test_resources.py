@@ -1,0 +1,211 @@
+"""The bundled FMUs: rebuilt, validated, and their states and derivatives tried through FMPy."""
+
+import sys
+import zipfile
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi3 import FMU3Slave
+from fmpy.validation import validate_fmu
+
+import fmugym
+from fmugym.bundled import FMI_VERSIONS, MODELS, bundled_fmu
+
+ROOT = Path(__file__).parents[1]
+EACH = [(model, version) for model in MODELS for version in FMI_VERSIONS]
+STATES = {
+    "CartPole": ["x", "x_dot", "phi", "phi_dot"],
+    "Pendulum": ["theta", "theta_dot"],
+}
+DERIVATIVES = {
+    "CartPole": ["x_dot", "x_ddot", "phi_dot", "phi_ddot"],
+    "Pendulum": ["theta_dot", "theta_ddot"],
+}
+START = {
+    "CartPole": {"x_0": 0.1, "x_dot_0": -0.3, "phi_0": 0.4, "phi_dot_0": 0.7},
+    "Pendulum": {"q_0": 1.2, "q_dot_0": -0.8, "c": 2e-3},
+}
+INPUT = {"CartPole": ("f", 3.0), "Pendulum": ("tau", 0.02)}
+
+
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="the FMUs are built and released on Linux and macOS"
+)
+@pytest.mark.parametrize(("model", "version"), EACH)
+def test_linux_libraries_are_rebuilt_byte_for_byte(model, version, tmp_path, monkeypatch):
+    pytest.importorskip("ziglang", reason="needs the extra test, which brings the compiler")
+    monkeypatch.syspath_prepend(str(ROOT / "resources"))
+    from build_fmus import build_library
+
+    library = build_library(model, version, "x86_64-linux", tmp_path)
+    folder = "x86_64-linux" if version == "3.0" else "linux64"
+    with zipfile.ZipFile(bundled_fmu(model, version)) as archive:
+        committed = archive.read(f"binaries/{folder}/{model}.so")
+    assert library.read_bytes() == committed
+
+
+@pytest.mark.parametrize(("model", "version"), EACH)
+def test_validation_finds_no_problem(model, version):
+    assert validate_fmu(str(bundled_fmu(model, version))) == []
+
+
+@pytest.mark.parametrize(("model", "version"), EACH)
+def test_libraries_for_all_platforms(model, version):
+    platforms = {
+        "1.0": ("darwin64", "linux64", "win64"),
+        "2.0": ("darwin64", "linux64", "win64"),
+        "3.0": (
+            "aarch64-darwin",
+            "aarch64-linux",
+            "x86_64-darwin",
+            "x86_64-linux",
+            "x86_64-windows",
+        ),
+    }
+    assert fmugym.FMU(bundled_fmu(model, version)).platforms == platforms[version]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_macos_library_is_for_both_processors(model):
+    with zipfile.ZipFile(bundled_fmu(model, "2.0")) as archive:
+        library = archive.read(f"binaries/darwin64/{model}.dylib")
+    assert library[:4] == b"\xca\xfe\xba\xbe"  # a universal binary
+    count = int.from_bytes(library[4:8], "big")
+    kinds = {int.from_bytes(library[8 + 20 * i : 12 + 20 * i], "big") for i in range(count)}
+    assert kinds == {0x01000007, 0x0100000C}  # x86-64 and arm64
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_descriptions_agree_between_the_versions(model):
+    """Names, units, limits and start values; what FMI 1.0 cannot say is left out."""
+    described = [fmugym.FMU(bundled_fmu(model, v)).description for v in FMI_VERSIONS]
+
+    def facts(variable):
+        limits = variable.minimum, variable.maximum
+        return variable.kind, variable.start, variable.unit, limits, variable.items
+
+    first = {name: facts(v) for name, v in described[0].variables.items() if name != "time"}
+    for other in described[1:]:
+        assert {n: facts(v) for n, v in other.variables.items() if n != "time"} == first
+
+
+class Driver:
+    """An FMU driven through FMPy's own classes."""
+
+    def __init__(self, model, version, tmp_path):
+        self.model = model
+        path = str(bundled_fmu(model, version))
+        self.description = fmpy.read_model_description(path)
+        self.references = {v.name: v.valueReference for v in self.description.modelVariables}
+        self.is_fmi3 = version == "3.0"
+        self.fmu = (FMU3Slave if self.is_fmi3 else FMU2Slave)(
+            guid=self.description.guid,
+            modelIdentifier=model,
+            unzipDirectory=str(fmpy.extract(path, tmp_path)),
+            instanceName=model,
+        )
+        self.fmu.instantiate()
+        self.set(START[model])
+        if self.is_fmi3:
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.setupExperiment()
+            self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
+        self.set(dict([INPUT[model]]))
+        self.time = 0.0
+
+    def set(self, values):
+        references = [self.references[name] for name in values]
+        (self.fmu.setFloat64 if self.is_fmi3 else self.fmu.setReal)(
+            references, list(values.values())
+        )
+
+    def get(self, names):
+        references = [self.references[name] for name in names]
+        return np.array((self.fmu.getFloat64 if self.is_fmi3 else self.fmu.getReal)(references))
+
+    def step(self, count=1):
+        for _ in range(count):
+            self.fmu.doStep(self.time, 0.01)
+            self.time = round(self.time + 0.01, 10)
+        return self.get(STATES[self.model])
+
+    def derivative(self, unknowns, known):
+        arguments = [self.references[n] for n in unknowns], [self.references[known]], [1.0]
+        return np.array(self.fmu.getDirectionalDerivative(*arguments))
+
+
+@pytest.fixture(params=[(m, v) for m in MODELS for v in ("2.0", "3.0")], ids="-".join)
+def driver(request, tmp_path):
+    made = Driver(*request.param, tmp_path)
+    yield made
+    made.fmu.terminate()
+    made.fmu.freeInstance()
+
+
+def right_hand_side(model, state, value):
+    """The accelerations, from the published equations in a form of their own."""
+    if model == "Pendulum":
+        angle, velocity = state
+        m, length, b, c, v_c, g = 0.06, 0.1, 4e-4, 2e-3, 0.05, 9.81
+        moment = value - b * velocity - c * np.tanh(velocity / v_c)
+        return np.array([velocity, moment / (m * length**2) + g / length * np.sin(angle)])
+    _, v, phi, w = state
+    rod = 900 * np.pi * 0.025**2
+    mass, first = rod + 1.0, 0.5 * rod + 1.0
+    second = rod * (1 / 3 + 0.025**2 / 4) + 1.0 + 0.001
+    matrix = [[10.0 + mass, first * np.cos(phi)], [first * np.cos(phi), second]]
+    forces = [value + first * w**2 * np.sin(phi), 9.81 * first * np.sin(phi)]
+    x_ddot, phi_ddot = np.linalg.solve(matrix, forces)
+    return np.array([v, x_ddot, w, phi_ddot])
+
+
+def test_directional_derivatives_are_those_of_the_equations(driver):
+    """Against central differences of the right-hand side above."""
+    model = driver.model
+    state = driver.get(STATES[model])
+    name, value = INPUT[model]
+    assert driver.get(DERIVATIVES[model]) == pytest.approx(
+        right_hand_side(model, state, value), rel=1e-9
+    )
+    step = 1e-6
+    for index, known in enumerate(STATES[model]):
+        change = np.zeros_like(state)
+        change[index] = step
+        slope = right_hand_side(model, state + change, value)
+        slope = (slope - right_hand_side(model, state - change, value)) / (2 * step)
+        assert driver.derivative(DERIVATIVES[model], known) == pytest.approx(slope, abs=1e-5)
+    slope = right_hand_side(model, state, value + step) - right_hand_side(
+        model, state, value - step
+    )
+    assert driver.derivative(DERIVATIVES[model], name) == pytest.approx(
+        slope / (2 * step), abs=1e-4
+    )
+
+
+def test_outputs_follow_their_states(driver):
+    pairs = {"CartPole": ("theta", "phi", -1.0), "Pendulum": ("q", "theta", 1.0)}
+    output, state, factor = pairs[driver.model]
+    assert driver.derivative([output], state).tolist() == [factor]
+
+
+def test_states_are_restored_and_serialized(driver):
+    driver.step(5)
+    saved, time = driver.fmu.getFMUState(), driver.time
+    size = len(driver.fmu.serializeFMUState(saved))
+    data = driver.fmu.serializeFMUState(saved)
+    after = driver.step(20)
+    driver.fmu.setFMUState(saved)
+    driver.time = time
+    assert driver.step(20).tolist() == after.tolist()
+    revived = driver.fmu.deserializeFMUState(data)
+    driver.fmu.setFMUState(revived)
+    driver.time = time
+    assert driver.step(20).tolist() == after.tolist()
+    for state in (saved, revived):
+        driver.fmu.freeFMUState(state)
+    assert 0 < size < 2000
