@@ -659,6 +659,7 @@ class FMI3Instance(Instance):
         component, self._step_results = self._component, (flags, last_successful_time)
 
         def step(time: float, step_size: float) -> int:
+            flags[1] = flags[2] = False  # an FMU that has nothing to say may not write them
             status: int = do_step(component, time, step_size, True, *results)
             if status <= Status.WARNING and flags[1]:
                 return Status.TERMINATED
