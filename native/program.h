@@ -9,7 +9,7 @@
 
 enum {
     PROGRAM_WIDTH = 32,   /* instances evaluated together */
-    PROGRAM_LENGTH = 64,  /* instructions, and so registers, at most */
+    PROGRAM_LENGTH = 128, /* instructions, and so registers, at most */
     PROGRAM_RESULTS = 16  /* results, at most */
 };
 

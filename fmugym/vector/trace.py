@@ -55,7 +55,7 @@ OPERATIONS: Final = (
 )
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
-MOST_INSTRUCTIONS: Final = 64
+MOST_INSTRUCTIONS: Final = 128
 """What the native pool has registers for."""
 
 
@@ -247,9 +247,17 @@ def trace_hooks(env: FMUEnv) -> tuple[Program, Program]:
         UntraceableError: If the hooks do what a program cannot; the text says what.
     """
     _require_simple(env)
-    symbolic = _symbolic(env)
+    try:
+        return _traced(_symbolic(env))
+    except UntraceableError:
+        raise
+    except Exception as error:  # whatever else numbers can do, symbols cannot
+        raise UntraceableError(f"it fails on symbols: {error}") from error
+
+
+def _traced(symbolic: FMUEnv) -> tuple[Program, Program]:
     before = set(symbolic.__dict__)
-    inputs = _values(symbolic._get_inputs(), len(env._interface.inputs))
+    inputs = _values(symbolic._get_inputs(), len(symbolic._interface.inputs))
     symbolic.inputs = tuple(inputs)
     done = _flag(symbolic._is_done())
     symbolic.done = done
@@ -326,31 +334,46 @@ def _flag(value: Any) -> Symbol:
 
 
 def _compile(results: Sequence[Symbol]) -> Program:
-    """Number the symbols in the order of evaluation, each once."""
-    numbers: dict[int, int] = {}
-    code: list[list[int]] = []
-    constants: list[float] = []
-
-    def number(symbol: Symbol) -> int:
-        if id(symbol) not in numbers:
-            operands = [_operand(operand, constants, number) for operand in symbol.operands]
-            operation = OPERATIONS.index(symbol.operation)
-            code.append([operation, *operands, *[0] * (3 - len(operands))])
-            numbers[id(symbol)] = len(code) - 1
-        return numbers[id(symbol)]
-
-    registers = [number(symbol) for symbol in results]
-    if len(code) > MOST_INSTRUCTIONS:
+    """Number the symbols in the order of evaluation, equal ones once."""
+    instructions: dict[tuple[int, ...], int] = {}
+    constants: dict[str, int] = {}
+    registers: dict[int, int] = {}
+    for symbol in _in_order(results):
+        operands = [
+            registers[id(o)] if isinstance(o, Symbol) else _place(o, constants)
+            for o in symbol.operands
+        ]
+        instruction = (OPERATIONS.index(symbol.operation), *operands, *[0] * (3 - len(operands)))
+        registers[id(symbol)] = instructions.setdefault(instruction, len(instructions))
+    if len(instructions) > MOST_INSTRUCTIONS:
         raise UntraceableError(f"it has more than {MOST_INSTRUCTIONS} operations")
-    return Program(np.array(code, np.uint16), np.array(constants), np.array(registers, np.uint16))
+    return Program(
+        np.array(list(instructions), np.uint16),
+        np.array([float.fromhex(text) for text in constants]),
+        np.array([registers[id(symbol)] for symbol in results], np.uint16),
+    )
 
 
-def _operand(operand: Any, constants: list[float], number: Callable[[Symbol], int]) -> int:
-    if isinstance(operand, Symbol):
-        return number(operand)
+def _in_order(results: Sequence[Symbol]) -> list[Symbol]:
+    """All symbols that results are made of, each after its operands."""
+    order: list[Symbol] = []
+    seen: set[int] = set()
+    waiting = [(symbol, False) for symbol in reversed(results)]
+    while waiting:
+        symbol, has_operands = waiting.pop()
+        if has_operands:
+            order.append(symbol)
+        elif id(symbol) not in seen:
+            seen.add(id(symbol))
+            waiting.append((symbol, True))
+            waiting.extend((o, False) for o in symbol.operands if isinstance(o, Symbol))
+    return order
+
+
+def _place(operand: float, constants: dict[str, int]) -> int:
+    """An index as it is; for a constant its place, told by all its bits: 0.0 is not -0.0."""
     if isinstance(operand, float):
-        constants.append(operand)
-        return len(constants) - 1
+        return constants.setdefault(operand.hex(), len(constants))
     return int(operand)
 
 
