@@ -2,7 +2,8 @@
 
 ``check_fmu_env`` is what the project's own tests run on every environment and FMI version. It
 finds what goes wrong when a new FMU is integrated: a reset that does not restore everything,
-parameters without effect, observations outside of their space.
+parameters without effect, observations outside of their space. ``check_hooks`` tells ahead whether
+a class's hooks work on the arrays of many environments.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from gymnasium.utils.env_checker import data_equivalence
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, ContractError
+from fmugym.vector.probe import CURE, find_difference
 
-__all__ = ["check_fmu_env"]
+__all__ = ["check_fmu_env", "check_hooks"]
 
 logger = logging.getLogger(__name__)
 
@@ -50,12 +52,40 @@ def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 
         ContractError: If the environment breaks the contract; the text says how.
         ConfigError: If it is none of this package.
     """
-    inner = env.unwrapped
-    if not isinstance(inner, FMUEnv):
-        raise ConfigError(f"expected an environment of fmugym, got {type(inner).__name__}")
+    inner = _of_this_package(env)
     actions = _sample_actions(inner, seed, num_steps)
     for check in _CHECKS:
         check(inner, actions, seed)
+
+
+def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any) -> None:
+    """Check that hooks give the same on arrays as in one environment at a time.
+
+    A vector environment calls such hooks once a step for all environments, others once for each.
+
+    Args:
+        make_env: The class, or another callable that makes an environment.
+        kwargs: Its arguments.
+
+    Raises:
+        ContractError: If a hook is different on arrays; the text names it and says what to do.
+        ConfigError: If the environment is none of this package.
+    """
+    env = make_env(**kwargs)
+    try:
+        inner = _of_this_package(env)
+        difference = find_difference(inner)
+    finally:
+        env.close()
+    if difference is not None:
+        raise ContractError(f"{type(inner).__name__}: {difference}. {CURE}")
+
+
+def _of_this_package(env: gymnasium.Env[Any, Any]) -> FMUEnv:
+    inner = env.unwrapped
+    if not isinstance(inner, FMUEnv):
+        raise ConfigError(f"expected an environment of fmugym, got {type(inner).__name__}")
+    return inner
 
 
 def _sample_actions(env: FMUEnv, seed: int, count: int) -> list[Any]:

@@ -15,11 +15,12 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 RESOURCES = Path(__file__).resolve().parent
-MODELS = ("CartPole", "Pendulum")
+MODELS = ("CartPole", "Pendulum", "DoublePendulum")
 FMI_VERSIONS = ("1.0", "2.0", "3.0")
 
 
@@ -61,6 +62,11 @@ def header_folder() -> Path:
     if spec is None or spec.origin is None:
         raise SystemExit("the FMI headers come with fmpy: pip install fmpy")
     return Path(spec.origin).parent / "c-code"
+
+
+def description_file(model: str, fmi_version: str) -> Path:
+    """Return the path of a model description, which need not exist for every FMI version."""
+    return RESOURCES / model / f"FMI{fmi_version[0]}.xml"
 
 
 def source_files(model: str, fmi_version: str) -> list[str]:
@@ -153,7 +159,7 @@ def build_fmu(model: str, fmi_version: str, platforms: list[str], output: Path) 
 
     Args:
         model: the name of the model, one of MODELS.
-        fmi_version: one of FMI_VERSIONS.
+        fmi_version: one of FMI_VERSIONS for which the model has a description.
         platforms: keys of PLATFORMS.
         output: the folder for the FMUs; the FMU goes to the subfolder of its FMI version.
 
@@ -161,8 +167,7 @@ def build_fmu(model: str, fmi_version: str, platforms: list[str], output: Path) 
         The path of the FMU.
     """
     path = output / fmi_version / f"{model}.fmu"
-    description = RESOURCES / model / f"FMI{fmi_version[0]}.xml"
-    files = {"modelDescription.xml": description.read_bytes()}
+    files = {"modelDescription.xml": description_file(model, fmi_version).read_bytes()}
     write_archive(path, files | binaries(model, fmi_version, platforms))
     return path
 
@@ -175,10 +180,15 @@ def main() -> None:
     parser.add_argument("--platform", choices=PLATFORMS, action="append")
     parser.add_argument("--output", type=Path, default=RESOURCES / "fmus", help="%(default)s")
     options = parser.parse_args()
-    for model in options.model or MODELS:
-        for version in options.fmi_version or FMI_VERSIONS:
-            path = build_fmu(model, version, options.platform or list(PLATFORMS), options.output)
-            print(f"{path} ({path.stat().st_size / 1000:.0f} kB)")
+    asked = product(options.model or MODELS, options.fmi_version or FMI_VERSIONS)
+    pairs = [
+        (model, version) for model, version in asked if description_file(model, version).exists()
+    ]
+    if not pairs:
+        parser.error("there is no such model in this FMI version")
+    for model, version in pairs:
+        path = build_fmu(model, version, options.platform or list(PLATFORMS), options.output)
+        print(f"{path} ({path.stat().st_size / 1000:.0f} kB)")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import pytest
 from fmu_tools import ITEMS, MAJOR_VERSIONS, edited_fmu, probe_fmu, write_fmu
 
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu, model_description
-from fmugym.bundled import FMI_VERSIONS, MODELS
+from fmugym.bundled import BUNDLED, FMI_VERSIONS
 
 
 def describe(path):
@@ -25,8 +25,7 @@ def with_xml(tmp_path, xml):
 
 
 class TestBundledModels:
-    @pytest.mark.parametrize("version", FMI_VERSIONS)
-    @pytest.mark.parametrize("model", MODELS)
+    @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_variables_are_those_that_fmpy_reads(self, model, version):
         path = bundled_fmu(model, version)
         ours, theirs = describe(path), fmpy.read_model_description(str(path))

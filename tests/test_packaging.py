@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fmugym.bundled import FMI_VERSIONS, MODELS
+from fmugym.bundled import BUNDLED, FMI_VERSIONS
 
 ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(
@@ -149,7 +149,7 @@ def test_an_installed_wheel_brings_the_command(wheel_python, tmp_path):
 
 
 def test_the_wheel_holds_the_fmus_byte_for_byte(built):
-    names = [f"{fmi_version}/{model}.fmu" for fmi_version in FMI_VERSIONS for model in MODELS]
+    names = [f"{fmi_version}/{model}.fmu" for model, fmi_version in BUNDLED]
     with zipfile.ZipFile(built[1]) as wheel:
         packed = {name: wheel.read(f"fmugym/fmus/{name}") for name in names}
     assert packed == {name: (ROOT / "resources/fmus" / name).read_bytes() for name in names}

@@ -20,8 +20,9 @@ class Plain(fmugym.FMUEnv):
 
 def simulate(model, outputs, parameters, inputs, time_step, fmi_version="2.0"):
     """The outputs at the start and after each step, shape (len(inputs) + 1, len(outputs))."""
+    names = {"CartPole": "f", "Pendulum": "tau", "DoublePendulum": ["tau1", "tau2"]}
     config = {
-        "model_input_names": "f" if model == "CartPole" else "tau",
+        "model_input_names": names[model],
         "model_output_names": outputs,
         "model_parameters": parameters,
         "time_step": time_step,
@@ -136,3 +137,78 @@ def test_torque_and_velocity_limits():
     at_limit = simulate("Pendulum", ["q", "q_dot"], parameters, [0.1] * 50, 0.001)
     assert limited.tolist() == at_limit.tolist()
     assert limited[:, 1].max() == 3.0
+
+
+BASE = {"P1": 7.466e-4, "P2": 1.489e-4, "P3": 2.160e-4, "P6": 2.122e-4, "P4": 0.09642, "P5": 0.034}
+DOUBLE = ["q1", "q1_dot", "q2", "q2_dot"]
+SWING = {"q1_0": 1.5, "q1_dot_0": 2.0, "q2_0": -2.2, "q2_dot_0": 4.0}
+NO_FRICTION = {"b1": 0.0, "b2": 0.0, "cf1": 0.0, "cf2": 0.0, "q_dot_max": 1e3}
+without_fmi_1 = pytest.mark.parametrize("fmi_version", ["2.0", "3.0"])
+
+
+def double_inertia(q2, p):
+    """The inertia matrix, shape (2, 2) or (2, 2, n)."""
+    coupling = p["P3"] + p["P2"] * np.cos(q2)
+    return np.array([[p["P1"] + 2 * p["P2"] * np.cos(q2), coupling], [coupling, p["P6"] + 0 * q2]])
+
+
+@without_fmi_1
+@pytest.mark.parametrize("changed", [{}, {"P3": 1.6e-4, "P6": 2.6e-4}])
+def test_frictionless_double_pendulum_keeps_its_energy(fmi_version, changed):
+    """Also where P3 and P6 are not the same."""
+    p = BASE | changed
+    parameters = {**p, **NO_FRICTION, **SWING, "max_step": 2e-4}
+    rest = [np.zeros(2)] * 200
+    rows = simulate("DoublePendulum", DOUBLE, parameters, rest, 0.02, fmi_version)
+    q1, v1, q2, v2 = rows.T
+    v = np.array([v1, v2])
+    energy = 0.5 * np.einsum("in,ijn,jn->n", v, double_inertia(q2, p), v)
+    energy -= p["P4"] * np.cos(q1) + p["P5"] * np.cos(q1 + q2)
+    assert np.ptp(q1) > 2  # it does swing
+    assert np.ptp(q2) > 4
+    assert np.ptp(energy) < 1e-7 * (p["P4"] + p["P5"])
+
+
+@without_fmi_1
+def test_double_pendulum_with_friction_agrees_with_scipy(fmi_version):
+    """Against Lagrange's equations in mass-matrix form, solved numerically at each point."""
+    p, torque = BASE, np.array([0.05, -0.03])
+    b, cf = np.array([3.2e-4, 1.31e-4]), np.array([2.29e-3, 3.15e-3])
+
+    def derivative(_, state):
+        q1, v1, q2, v2 = state
+        v = np.array([v1, v2])
+        slope = -p["P2"] * np.sin(q2) * np.array([[2.0, 1.0], [1.0, 0.0]])  # of M over q2
+        centrifugal = slope @ v * v2 - [0.0, 0.5 * v @ slope @ v]
+        gravity = p["P5"] * np.sin(q1 + q2) + np.array([p["P4"] * np.sin(q1), 0.0])
+        forces = torque - b * v - cf * np.tanh(v / 0.05) - gravity - centrifugal
+        a1, a2 = np.linalg.solve(double_inertia(q2, p), forces)
+        return v1, a1, v2, a2
+
+    parameters = {**SWING, "max_step": 1e-5}  # the friction turns within 1 ms
+    ours = simulate("DoublePendulum", DOUBLE, parameters, [torque] * 50, 0.02, fmi_version)
+    times = np.linspace(0, 1, 51)
+    start = [SWING[f"{name}_0"] for name in DOUBLE]
+    theirs = solve_ivp(derivative, (0, 1), start, "DOP853", times, rtol=1e-11, atol=1e-12).y.T
+    assert np.abs(ours - theirs).max() < 1e-6
+
+
+def test_acrobot_and_pendubot_have_one_motor():
+    for limit, idle in (("tau_max1", [0.1, 0.05]), ("tau_max2", [0.05, 0.1])):
+        torques = np.array(idle) * (np.array(["tau_max1", "tau_max2"]) != limit)
+        limited = simulate("DoublePendulum", DOUBLE, {limit: 0.0}, [idle] * 20, 0.02)
+        driven = simulate("DoublePendulum", DOUBLE, {}, [torques] * 20, 0.02)
+        assert limited.tolist() == driven.tolist()
+        assert np.ptp(limited[:, 0]) > 0.01
+
+
+def test_double_pendulum_velocity_limit():
+    parameters = {**NO_FRICTION, "P4": 0.0, "P5": 0.0, "q_dot_max": 3.0}
+    rows = simulate("DoublePendulum", DOUBLE, parameters, [[0.15, 0.15]] * 50, 0.01)
+    assert np.abs(rows[:, [1, 3]]).max() == 3.0
+
+
+@pytest.mark.parametrize("value", [0.0, 6e-4])
+def test_an_indefinite_inertia_is_refused(value):
+    with pytest.raises(fmugym.SimulationError, match="positive definite inertia matrix"):
+        simulate("DoublePendulum", DOUBLE, {"P6" if value == 0 else "P3": value}, [], 0.02)

@@ -10,7 +10,7 @@ from fmu_tools import MAJOR_VERSIONS, edited_fmu
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
 from fmugym.adapters import Status
-from fmugym.bundled import FMI_VERSIONS, MODELS
+from fmugym.bundled import BUNDLED, MODELS
 from fmugym.pool import PoolSpec
 
 LOG = logging.getLogger("fmugym.test")
@@ -18,6 +18,7 @@ LOG = logging.getLogger("fmugym.test")
 PLANTS = {
     "CartPole": ("f", ["x", "x_dot", "theta", "theta_dot"], "theta_0", 10.0),
     "Pendulum": ("tau", ["theta", "theta_dot"], "q_0", 0.1),
+    "DoublePendulum": ("tau2", ["q1", "q1_dot", "q2", "q2_dot"], "q1_0", 0.1),
 }
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
@@ -49,9 +50,7 @@ def make_pool(request):
         pool.close()
 
 
-@pytest.fixture(
-    params=[(m, v) for m in MODELS for v in FMI_VERSIONS], ids=lambda p: f"{p[0]}-{p[1]}"
-)
+@pytest.fixture(params=BUNDLED, ids="-".join)
 def plant(request, make_pool):
     """Make pools over each of the bundled FMUs."""
     return Plant(*request.param, make_pool)

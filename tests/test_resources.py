@@ -12,29 +12,35 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
 import fmugym
-from fmugym.bundled import FMI_VERSIONS, MODELS, bundled_fmu
+from fmugym.bundled import BUNDLED, FMI_VERSIONS, MODELS, bundled_fmu
 
 ROOT = Path(__file__).parents[1]
-EACH = [(model, version) for model in MODELS for version in FMI_VERSIONS]
 STATES = {
     "CartPole": ["x", "x_dot", "phi", "phi_dot"],
     "Pendulum": ["theta", "theta_dot"],
+    "DoublePendulum": ["q1", "q1_dot", "q2", "q2_dot"],
 }
 DERIVATIVES = {
     "CartPole": ["x_dot", "x_ddot", "phi_dot", "phi_ddot"],
     "Pendulum": ["theta_dot", "theta_ddot"],
+    "DoublePendulum": ["q1_dot", "q1_ddot", "q2_dot", "q2_ddot"],
 }
 START = {
     "CartPole": {"x_0": 0.1, "x_dot_0": -0.3, "phi_0": 0.4, "phi_dot_0": 0.7},
     "Pendulum": {"q_0": 1.2, "q_dot_0": -0.8, "c": 2e-3},
+    "DoublePendulum": {"q1_0": 0.9, "q1_dot_0": -0.06, "q2_0": 1.3, "q2_dot_0": 0.04},
 }
-INPUT = {"CartPole": ("f", 3.0), "Pendulum": ("tau", 0.02)}
+INPUTS = {
+    "CartPole": {"f": 3.0},
+    "Pendulum": {"tau": 0.02},
+    "DoublePendulum": {"tau1": 0.05, "tau2": -0.02},
+}
 
 
 @pytest.mark.skipif(
     sys.platform == "win32", reason="the FMUs are built and released on Linux and macOS"
 )
-@pytest.mark.parametrize(("model", "version"), EACH)
+@pytest.mark.parametrize(("model", "version"), BUNDLED)
 def test_linux_libraries_are_rebuilt_byte_for_byte(model, version, tmp_path, monkeypatch):
     pytest.importorskip("ziglang", reason="needs the extra test, which brings the compiler")
     monkeypatch.syspath_prepend(str(ROOT / "resources"))
@@ -47,12 +53,12 @@ def test_linux_libraries_are_rebuilt_byte_for_byte(model, version, tmp_path, mon
     assert library.read_bytes() == committed
 
 
-@pytest.mark.parametrize(("model", "version"), EACH)
+@pytest.mark.parametrize(("model", "version"), BUNDLED)
 def test_validation_finds_no_problem(model, version):
     assert validate_fmu(str(bundled_fmu(model, version))) == []
 
 
-@pytest.mark.parametrize(("model", "version"), EACH)
+@pytest.mark.parametrize(("model", "version"), BUNDLED)
 def test_libraries_for_all_platforms(model, version):
     platforms = {
         "1.0": ("darwin64", "linux64", "win64"),
@@ -81,7 +87,8 @@ def test_macos_library_is_for_both_processors(model):
 @pytest.mark.parametrize("model", MODELS)
 def test_descriptions_agree_between_the_versions(model):
     """Names, units, limits and start values; what FMI 1.0 cannot say is left out."""
-    described = [fmugym.FMU(bundled_fmu(model, v)).description for v in FMI_VERSIONS]
+    versions = [v for v in FMI_VERSIONS if (model, v) in BUNDLED]
+    described = [fmugym.FMU(bundled_fmu(model, v)).description for v in versions]
 
     def facts(variable):
         limits = variable.minimum, variable.maximum
@@ -115,7 +122,7 @@ class Driver:
             self.fmu.setupExperiment()
             self.fmu.enterInitializationMode()
         self.fmu.exitInitializationMode()
-        self.set(dict([INPUT[model]]))
+        self.set(INPUTS[model])
         self.time = 0.0
 
     def set(self, values):
@@ -139,7 +146,7 @@ class Driver:
         return np.array(self.fmu.getDirectionalDerivative(*arguments))
 
 
-@pytest.fixture(params=[(m, v) for m in MODELS for v in ("2.0", "3.0")], ids="-".join)
+@pytest.fixture(params=[pair for pair in BUNDLED if pair[1] != "1.0"], ids="-".join)
 def driver(request, tmp_path):
     made = Driver(*request.param, tmp_path)
     yield made
@@ -147,19 +154,39 @@ def driver(request, tmp_path):
     made.fmu.freeInstance()
 
 
-def right_hand_side(model, state, value):
-    """The accelerations, from the published equations in a form of their own."""
-    if model == "Pendulum":
-        angle, velocity = state
-        m, length, b, c, v_c, g = 0.06, 0.1, 4e-4, 2e-3, 0.05, 9.81
-        moment = value - b * velocity - c * np.tanh(velocity / v_c)
-        return np.array([velocity, moment / (m * length**2) + g / length * np.sin(angle)])
+def right_hand_side(model, state, inputs):
+    """The derivatives, from the published equations in a form of their own."""
+    return {"Pendulum": pendulum, "DoublePendulum": double_pendulum, "CartPole": cart_pole}[model](
+        state, *inputs
+    )
+
+
+def pendulum(state, tau):
+    angle, velocity = state
+    m, length, b, c, v_c, g = 0.06, 0.1, 4e-4, 2e-3, 0.05, 9.81
+    moment = tau - b * velocity - c * np.tanh(velocity / v_c)
+    return np.array([velocity, moment / (m * length**2) + g / length * np.sin(angle)])
+
+
+def double_pendulum(state, tau1, tau2):
+    q1, v1, q2, v2 = state
+    p1, p2, p3, p6, p4, p5 = 7.466e-4, 1.489e-4, 2.160e-4, 2.122e-4, 0.09642, 0.03400
+    matrix = [[p1 + 2 * p2 * np.cos(q2), p3 + p2 * np.cos(q2)], [p3 + p2 * np.cos(q2), p6]]
+    coriolis = p2 * np.sin(q2) * np.array([-(2 * v1 * v2 + v2**2), v1**2])
+    gravity = np.array([p4 * np.sin(q1), 0.0]) + p5 * np.sin(q1 + q2)
+    v = np.array([v1, v2])
+    friction = [3.20e-4, 1.31e-4] * v + [2.29e-3, 3.15e-3] * np.tanh(v / 0.05)
+    a1, a2 = np.linalg.solve(matrix, [tau1, tau2] - coriolis - gravity - friction)
+    return np.array([v1, a1, v2, a2])
+
+
+def cart_pole(state, f):
     _, v, phi, w = state
     rod = 900 * np.pi * 0.025**2
     mass, first = rod + 1.0, 0.5 * rod + 1.0
     second = rod * (1 / 3 + 0.025**2 / 4) + 1.0 + 0.001
     matrix = [[10.0 + mass, first * np.cos(phi)], [first * np.cos(phi), second]]
-    forces = [value + first * w**2 * np.sin(phi), 9.81 * first * np.sin(phi)]
+    forces = [f + first * w**2 * np.sin(phi), 9.81 * first * np.sin(phi)]
     x_ddot, phi_ddot = np.linalg.solve(matrix, forces)
     return np.array([v, x_ddot, w, phi_ddot])
 
@@ -167,30 +194,54 @@ def right_hand_side(model, state, value):
 def test_directional_derivatives_are_those_of_the_equations(driver):
     """Against central differences of the right-hand side above."""
     model = driver.model
-    state = driver.get(STATES[model])
-    name, value = INPUT[model]
-    assert driver.get(DERIVATIVES[model]) == pytest.approx(
-        right_hand_side(model, state, value), rel=1e-9
+    knowns = [*STATES[model], *INPUTS[model]]
+    point = np.array([*driver.get(STATES[model]), *INPUTS[model].values()])
+    count = len(STATES[model])
+
+    def derivatives(point):
+        return right_hand_side(model, point[:count], point[count:])
+
+    assert driver.get(DERIVATIVES[model]) == pytest.approx(derivatives(point), rel=1e-9)
+    for known, change in zip(knowns, 1e-6 * np.eye(len(knowns)), strict=True):
+        slope = (derivatives(point + change) - derivatives(point - change)) / 2e-6
+        assert driver.derivative(DERIVATIVES[model], known) == pytest.approx(
+            slope, rel=1e-6, abs=1e-4
+        )
+
+
+def test_directional_derivatives_after_steps(driver):
+    """The same where a step has just been done and nothing was read since."""
+    driver.step(3)
+    state, inputs = driver.get(STATES[driver.model]), list(INPUTS[driver.model].values())
+    known, change = STATES[driver.model][0], np.eye(len(state))[0] * 1e-6
+    ahead, behind = (right_hand_side(driver.model, state + s * change, inputs) for s in (1, -1))
+    assert driver.derivative(DERIVATIVES[driver.model], known) == pytest.approx(
+        (ahead - behind) / 2e-6, rel=1e-6, abs=1e-4
     )
-    step = 1e-6
-    for index, known in enumerate(STATES[model]):
-        change = np.zeros_like(state)
-        change[index] = step
-        slope = right_hand_side(model, state + change, value)
-        slope = (slope - right_hand_side(model, state - change, value)) / (2 * step)
-        assert driver.derivative(DERIVATIVES[model], known) == pytest.approx(slope, abs=1e-5)
-    slope = right_hand_side(model, state, value + step) - right_hand_side(
-        model, state, value - step
-    )
-    assert driver.derivative(DERIVATIVES[model], name) == pytest.approx(
-        slope / (2 * step), abs=1e-4
-    )
+
+
+def test_a_torque_beyond_its_limit_has_no_influence(tmp_path):
+    driver = Driver("DoublePendulum", "3.0", tmp_path)
+    driver.set({"tau1": 0.2, "tau2": 0.1})
+    assert driver.derivative(["q1_ddot", "q2_ddot"], "tau1").tolist() == [0.0, 0.0]
+    assert driver.derivative(["q2_ddot"], "tau2")[0] > 0
+    driver.fmu.terminate()
+    driver.fmu.freeInstance()
 
 
 def test_outputs_follow_their_states(driver):
-    pairs = {"CartPole": ("theta", "phi", -1.0), "Pendulum": ("q", "theta", 1.0)}
+    pairs = {
+        "CartPole": ("theta", "phi", -1.0),
+        "Pendulum": ("q", "theta", 1.0),
+        "DoublePendulum": ("q2", "q2", 1.0),
+    }
     output, state, factor = pairs[driver.model]
     assert driver.derivative([output], state).tolist() == [factor]
+
+
+def test_the_double_pendulum_is_not_there_for_fmi_1():
+    with pytest.raises(fmugym.ConfigError, match=r"no bundled DoublePendulum for FMI 1\.0, only"):
+        bundled_fmu("DoublePendulum", 1.0)
 
 
 def test_states_are_restored_and_serialized(driver):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -72,6 +73,9 @@ class Engine(ABC):
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """Give a parameter one value for each environment, from its next episode on."""
 
+    def note_attributes(self) -> None:  # noqa: B027  (most engines need not know)
+        """Take notice that attributes that hooks read have changed."""
+
 
 class BatchEngine(Engine):
     """Turns a prototype into N environments: what its hooks read holds arrays from now on.
@@ -94,10 +98,10 @@ class BatchEngine(Engine):
         env._values, env.inputs = self._pool.outputs, self._pool.inputs
         env.state = self._pool.outputs[: env._output_count]
         env._was_reset = True  # for the views of single environments
+        self.given: dict[str, npt.NDArray[Any]] = {}
         self._make_parameters(env._plan)
 
     def _make_parameters(self, plan: EpisodePlan) -> None:
-        self.given: dict[str, npt.NDArray[Any]] = {}
         self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
         names = [variable.name for variable in plan.model_variables]
         self._parameters = dict(zip(names, self._start_values, strict=True))
@@ -106,7 +110,14 @@ class BatchEngine(Engine):
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
+        env, before = self.env, self._parameters
         self.given[name] = values
+        parameters = {**env._interface.parameters, name: values[0]}
+        env._interface = replace(env._interface, parameters=parameters)
+        env._plan = env._plan_episode({})
+        self._make_parameters(env._plan)
+        for known in before.keys() & self._parameters.keys():
+            self._parameters[known][:] = before[known]
 
     # Episodes.
 
@@ -128,16 +139,25 @@ class BatchEngine(Engine):
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
     ) -> dict[str, FloatArray]:
         """Draw and start episodes; returns what is to be told of the draws."""
-        env = self.env
         values = self._draw(indices, plan)
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
+        self._forget(indices, plan)
+        return {name: self._row(name).copy() for name in [*plan.told, *plan.drawn_names]}
+
+    def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
+        """Let hooks read after a reset what they read in a single environment."""
+        env = self.env
         env.step_count[indices] = 0
-        env.action[..., indices] = 0
-        env.previous_action[..., indices] = 0
-        told = [*plan.told, *plan.drawn_names, *self.given]
-        return {name: self._row(name).copy() for name in told}
+        env.previous_state[:, indices] = env.state[:, indices]
+        no_action = np.reshape(env._no_action, (*env.action.shape[:-1], 1))
+        env.action[..., indices] = env.previous_action[..., indices] = no_action
+        env.done = env.done.copy()  # it was given away
+        env.done[indices] = False
+        set_here = {variable.name for variable in plan.model_variables}
+        for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
+            row[indices] = self._parameters[name][indices] if name in set_here else start
 
     def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
         for index in indices.tolist():
@@ -162,7 +182,9 @@ class BatchEngine(Engine):
             self._place(constants, constants.values(), indices)
             self._overridden = True
         self._place(plan.constant_variables, plan.constant_variables.values(), indices)
-        self._place(self.given, (given[indices] for given in self.given.values()), indices)
+        constant = plan.constant_parameters.keys() - plan.told.keys()
+        given = {name: self.given[name][indices] for name in self.given if name in constant}
+        self._place(given, given.values(), indices)
         if default:
             return self._start_values
         return np.stack([self._parameters[variable.name] for variable in plan.model_variables])
@@ -175,13 +197,13 @@ class BatchEngine(Engine):
 
     def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
         for name, value in zip(names, values, strict=True):
-            self._row(name)[indices] = value
+            self._row(name)[..., indices] = value
 
     def _row(self, name: str) -> FloatArray:
         """The values of a parameter or an episode variable, one for each environment."""
         variables = self.env.variables
         if name in variables:
-            if np.shape(variables[name]) != (self._n,) or not variables[name].flags.writeable:
+            if np.shape(variables[name])[-1:] != (self._n,):
                 variables[name] = np.array(np.broadcast_to(variables[name], self._n))
             row: FloatArray = variables[name]
         else:
@@ -193,11 +215,10 @@ class BatchEngine(Engine):
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         env, pool = self.env, self._pool
-        env.previous_action, env.action = env.action, self._checked(actions)
-        np.copyto(env.previous_state, env.state)
+        actions = self._checked(actions)
         env._in_hooks = True
         try:
-            self._write_inputs(env._get_inputs())
+            self._take_actions(actions)
             drawn: dict[str, FloatArray] = {}
             if resetting is not None:
                 drawn = self._begin(resetting, np.flatnonzero(resetting), env._plan)
@@ -213,6 +234,17 @@ class BatchEngine(Engine):
         finally:
             env._in_hooks = False
 
+    def _take_actions(self, actions: npt.NDArray[Any]) -> None:
+        env = self.env
+        before = env.action, env.previous_action, env.previous_state
+        env.previous_action, env.action = env.action, actions
+        env.previous_state = env.state.copy()
+        try:
+            self._write_inputs(env._get_inputs())
+        except BaseException:  # no FMU was touched: better actions may follow
+            env.action, env.previous_action, env.previous_state = before
+            raise
+
     def _checked(self, actions: Any) -> npt.NDArray[Any]:
         """Copy the actions, environments last as hooks want them."""
         space: Any = self.env.action_space
@@ -226,6 +258,7 @@ class BatchEngine(Engine):
             )
         if space.dtype.kind != "f":
             self._check_elements(space, array)
+            array = array.astype(space.dtype, copy=False)
         return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
     def _check_elements(self, space: Any, array: npt.NDArray[Any]) -> None:
@@ -239,7 +272,10 @@ class BatchEngine(Engine):
 
     def _write_inputs(self, values: Any) -> None:
         inputs = self._pool.inputs
-        if len(inputs) == 1 and not isinstance(values, list | tuple) and np.ndim(values) < 2:
+        if values is None:
+            raise ConfigError("_get_inputs returned None, expected a number for each input")
+        is_sequence = isinstance(values, list | tuple)
+        if not is_sequence and np.ndim(values) < (2 if len(inputs) == 1 else 1):
             values = [values]
         if len(values) != len(inputs):
             raise ConfigError(f"_get_inputs returned {len(values)} values, expected {len(inputs)}")
@@ -262,7 +298,7 @@ class BatchEngine(Engine):
     def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
         env = self.env
         if env._has_update:
-            self._update(resetting)
+            self._update(resetting, self._failed(self._pool.statuses))
         terminated = self._flags("_is_done", env._is_done())
         statuses = self._pool.statuses
         has_faults = bool(np.count_nonzero(statuses))
@@ -283,15 +319,21 @@ class BatchEngine(Engine):
         self.note_ends(terminated, truncated)
         return result
 
-    def _update(self, resetting: MaskArray | None) -> None:
-        env = self.env
-        if resetting is None:
-            env._update()
-            return
-        before = {name: self._row(name).copy() for name in env.variables}
-        env._update()
-        for name, values in before.items():
-            self._row(name)[resetting] = values[resetting]
+    def _update(self, resetting: MaskArray | None, failed: MaskArray) -> None:
+        """Call the hook, but keep the variables of environments that did not step.
+
+        What it assigns is copied: it may be part of an array that the next step writes again.
+        """
+        variables = self.env.variables
+        keep = failed if resetting is None else failed | resetting
+        before = {name: self._row(name) for name in variables}
+        kept = {name: row[..., keep] for name, row in before.items()} if keep.any() else {}
+        self.env._update()
+        for name, row in before.items():
+            if variables[name] is not row:
+                variables[name] = np.array(variables[name])
+        for name, values in kept.items():
+            self._row(name)[..., keep] = values
 
     def _flags(self, hook: str, values: Any) -> MaskArray:
         if values is None:
@@ -319,29 +361,41 @@ class BatchEngine(Engine):
     def _observe(self, observed: Any) -> Any:
         if observed is not None:
             return observed
-        return envs_first(self.env._get_observation())
+        observation = self.env._get_observation()
+        if observation is None:
+            raise ConfigError("_get_observation returned None; is its return statement missing?")
+        return envs_first(observation, self.env.observation_space)
 
     def _infos(self, mask: MaskArray) -> dict[str, Any]:
         if not self.env._has_info:
             return {}
-        values = {name: self._info_array(value) for name, value in self.env._get_info().items()}
+        return self._info_arrays(self.env._get_info(), mask)
+
+    def _info_arrays(self, info: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+        values = {name: self._info_array(value, mask) for name, value in info.items()}
         return values | {f"_{name}": mask.copy() for name in values}
 
-    def _info_array(self, value: Any) -> Any:
+    def _info_array(self, value: Any, mask: MaskArray) -> Any:
+        if isinstance(value, Mapping):
+            return self._info_arrays(value, mask)
         if np.ndim(value) == 0:
-            return np.full(self._n, value)
+            return np.full(self._n, value, object if isinstance(value, str) else None)
         return envs_first(value)
 
     def _stopped(self, statuses: StatusArray) -> MaskArray:
         stopped: MaskArray = statuses == Status.TERMINATED
         return stopped
 
+    def _failed(self, statuses: StatusArray) -> MaskArray:
+        failed: MaskArray = (statuses > Status.WARNING) & (statuses != Status.TERMINATED)
+        return failed
+
     def _take_faults(self, result: StepResult, statuses: StatusArray) -> None:
         env, config = self.env, self.env.config
         stopped = self._stopped(statuses)
         if stopped.any():
-            result.infos["fmu_terminated"] = result.infos["_fmu_terminated"] = stopped
-        failed = (statuses > Status.WARNING) & ~stopped
+            result.infos.update({"fmu_terminated": stopped, "_fmu_terminated": stopped.copy()})
+        failed = self._failed(statuses)
         indices = np.flatnonzero(failed).tolist()
         if not indices:
             return

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import MaskArray
 from fmugym.vector.batch import BatchEngine, StepResult
 from fmugym.vector.probe import sample_states
 from fmugym.vector.trace import Program, UntraceableError, evaluate, trace_hooks
 
-__all__ = ["CompiledEngine", "Drawn", "find_programs"]
+__all__ = ["CompiledEngine", "find_programs"]
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +37,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
             raise UntraceableError("the pool is not the native one")
         programs = trace_hooks(env)
         _require_same(env, programs)
-    except UntraceableError as reason:
+    except Exception as reason:  # whatever numbers can do and symbols cannot
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
@@ -62,36 +60,6 @@ def _require_same(env: FMUEnv, programs: tuple[Program, Program]) -> None:
             raise UntraceableError("the program gives other values than the hooks")
     if not np.array_equal(inputs, np.broadcast_to(expected_inputs, inputs.shape)):
         raise UntraceableError("the program gives other inputs than the hook")
-
-
-class Drawn(Mapping[str, Any]):
-    """The values drawn in a step, by name, with their masks as ``_name``.
-
-    Args:
-        names: What was drawn.
-        values: Shape (draws, N).
-        mask: Which environments drew, shape (N,).
-    """
-
-    def __init__(self, names: list[str], values: FloatArray, mask: MaskArray) -> None:
-        self._names, self._values, self._mask = names, values, mask
-
-    def __getitem__(self, key: str) -> npt.NDArray[Any]:
-        if key in self._names:
-            row: FloatArray = self._values[self._names.index(key)]
-            return row
-        if key[:1] == "_" and key[1:] in self._names:
-            return self._mask
-        raise KeyError(key)
-
-    def __iter__(self) -> Iterator[str]:
-        return (key for name in self._names for key in (name, f"_{name}"))
-
-    def __len__(self) -> int:
-        return 2 * len(self._names)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
 
 
 class CompiledEngine(BatchEngine):
@@ -117,7 +85,9 @@ class CompiledEngine(BatchEngine):
         super().__init__(env, num_envs, max_episode_steps)
         plan, streams = env._plan, self._streams
         space: Any = env.action_space
+        self._outdated = False
         self._names = plan.drawn_names
+        self._masks = [f"_{name}" for name in self._names]
         self._rows = np.array([plan.parameter_names.index(n) for n in self._names], np.intp)
         pool: Any = self._pool
         self._play = pool.prepare_play(
@@ -131,7 +101,8 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
-        if self.given or self._overridden or self._streams.num_draws is None:
+        interpreted = self._outdated or self.given or self._overridden
+        if interpreted or self._streams.num_draws is None:
             return super().step(actions, resetting)
         result = StepResult(
             np.empty((self._n, self.env._output_count), np.float32),
@@ -143,13 +114,18 @@ class CompiledEngine(BatchEngine):
         troubled, ended, used_up = self._play_checked(actions, result)
         self.any_ended = ended > 0
         if resetting is not None:
-            drawn = Drawn(self._names, self._start_values[self._rows], resetting)
+            drawn: dict[str, Any] = dict.fromkeys(self._masks, resetting)
+            drawn.update(zip(self._names, self._start_values[self._rows], strict=True))
             result.infos["drawn"], result.infos["_drawn"] = drawn, resetting
         if troubled:
-            self._mend(result, resetting)
+            self._mend(actions, result, resetting)
         if used_up:
             self._streams.refill_used_up(self.ended)
         return result
+
+    def note_attributes(self) -> None:
+        """The programs have the former values in them."""
+        self._outdated = True
 
     def _play_checked(self, actions: Any, result: StepResult) -> tuple[int, int, int]:
         try:
@@ -158,7 +134,7 @@ class CompiledEngine(BatchEngine):
             actions = np.ascontiguousarray(self._checked(actions), np.int64)
         return self._play(actions, *result[:4])  # type: ignore[no-any-return]
 
-    def _mend(self, result: StepResult, resetting: MaskArray | None) -> None:
+    def _mend(self, actions: Any, result: StepResult, resetting: MaskArray | None) -> None:
         """Deal with FMUs that failed, or asked to stop: rare, and so left to numpy."""
         statuses = self._pool.statuses
         if resetting is not None:
@@ -166,7 +142,7 @@ class CompiledEngine(BatchEngine):
         stopped = self._stopped(statuses)
         if stopped.any():
             result.terminated[stopped] = True
-            self.env.done = result.terminated
+            self.env.action, self.env.done = self._checked(actions), result.terminated
             result.rewards[stopped] = self._rewards(self.env._reward_policy())[stopped]
         self._take_faults(result, statuses)
         self.note_ends(result.terminated, result.truncated)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,14 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from fmugym.config import checked_value
 from fmugym.env import FMUEnv, request_pool
 from fmugym.errors import ConfigError, SimulationError, unknown_name
-from fmugym.pool.base import MaskArray
+from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.vector.batch import BatchEngine, Engine, StepResult
 from fmugym.vector.compiled import CompiledEngine, find_programs
 from fmugym.vector.per_env import PerEnvEngine
-from fmugym.vector.probe import find_difference
+from fmugym.vector.probe import CURE, find_difference
 from fmugym.vector.views import column
 
 __all__ = ["FMUVectorEnv", "vectorized"]
@@ -65,7 +66,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         hooks: str = "auto",
         **pool_options: Any,
     ) -> None:
-        if num_envs < 1:
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ConfigError(f"num_envs must be a positive integer, got {num_envs!r}")
         if hooks not in HOOKS:
             raise unknown_name("way of calling hooks", hooks, HOOKS)
@@ -107,10 +108,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if difference is None:
             return True
         name = type(self._prototype).__name__
-        text = (
-            f"{name}: {difference}; its hooks cannot be called on arrays. Write them element-wise "
-            "(& | and numpy.where for 'and', 'or' and 'if'; no reduction over all values)"
-        )
+        text = f"{name}: {difference}, so that its hooks cannot be called on arrays. {CURE}"
         if hooks != "auto":
             raise ConfigError(text)
         logger.warning("%s; until then they are called one environment at a time, slower", text)
@@ -148,9 +146,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             return [int(seed) + index for index in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ConfigError(f"there are {len(seed)} seeds, expected {self.num_envs}")
-        return seed
+        if not isinstance(seed, Iterable):
+            raise ConfigError(f"seed must be an integer or a list of them, got {seed!r}")
+        seeds = [None if one is None else int(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ConfigError(f"there are {len(seeds)} seeds, expected {self.num_envs}")
+        return seeds
 
     def _checked_mask(self, mask: Any) -> MaskArray:
         if mask is None:
@@ -215,11 +216,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def render(self) -> tuple[Any, ...] | None:
         """The pictures of all environments, or None without a render mode."""
+        self._require_open("render")
         if self.render_mode is None:
             return None
+        if not self._started:
+            raise SimulationError("render was called before the first reset")
         pictures = []
         for env in self._singles():
-            if env._renderer is None and isinstance(self._engine, BatchEngine):
+            if env._renderer is None:
                 env._renderer = self._prototype._renderer
             pictures.append(env.render())
             self._prototype._renderer = env._renderer
@@ -235,19 +239,37 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         Args:
             name: An attribute that hooks read, or the name of a parameter; that takes effect with
                 the next episode.
-            values: One value for each environment, or one for all.
+            values: A list or array of one value for each environment, or one value for all.
+
+        Raises:
+            ConfigError: If the number of values is wrong, or they do not fit.
         """
-        array = np.broadcast_to(np.asarray(values), (self.num_envs,)).copy()
-        if not hasattr(self._prototype, name) and name in self._prototype.fmu.description.variables:
-            self._prototype._plan_episode(dict.fromkeys([name], array[0]))
-            self._engine.set_parameter(name, array)
+        each = isinstance(values, list | tuple) or np.ndim(values) > 0
+        if each and len(values) != self.num_envs:
+            raise ConfigError(
+                f"there are {len(values)} values of {name!r}, expected {self.num_envs}"
+            )
+        prototype = self._prototype
+        if not hasattr(prototype, name) and name in prototype.fmu.description.variables:
+            self._engine.set_parameter(name, self._parameter_values(name, values))
         elif isinstance(self._engine, PerEnvEngine):
-            for env, value in zip(self._engine.envs, array.tolist(), strict=True):
-                setattr(env, name, value)
+            for index, env in enumerate(self._engine.envs):
+                setattr(env, name, values[index] if each else values)
         else:
-            setattr(self._prototype, name, array)
-            attributes = {**self._prototype._per_env_attributes, name: array}
-            self._prototype._per_env_attributes = attributes
+            self._set_attributes(name, _row_of(name, values) if each else values, each)
+
+    def _parameter_values(self, name: str, values: Any) -> FloatArray:
+        start_values = np.broadcast_to(np.asarray(values, object), self.num_envs).tolist()
+        self._prototype._plan_episode({name: start_values[0]})
+        variable = self._prototype.fmu.variable(name)
+        return np.array([checked_value(variable, value) for value in start_values])
+
+    def _set_attributes(self, name: str, values: Any, each: bool) -> None:
+        prototype = self._prototype
+        attributes = {n: v for n, v in prototype._per_env_attributes.items() if n != name}
+        setattr(prototype, name, values)
+        prototype._per_env_attributes = {**attributes, name: values} if each else attributes
+        self._engine.note_attributes()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each environment, or get an attribute."""
@@ -313,6 +335,13 @@ def _checked_prototype(env: Any) -> FMUEnv:
             f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
         )
     return env
+
+
+def _row_of(name: str, values: Any) -> npt.NDArray[Any]:
+    row = np.array(values)
+    if row.ndim != 1:
+        raise ConfigError(f"{name!r} can hold one number for each environment, got {values!r}")
+    return row
 
 
 def _objects(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:

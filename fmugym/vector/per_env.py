@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -91,7 +92,7 @@ class PerEnvEngine(Engine):
         return StepResult(self._stacked(), rewards, terminated, truncated, infos)
 
     def _actions(self, actions: Any) -> list[Any]:
-        items = list(iterate(self._action_space, actions))
+        items = list(iterate(self._action_space, copy.deepcopy(actions)))  # hooks keep them
         if len(items) != len(self.envs):
             raise ConfigError(f"there are {len(items)} actions, expected {len(self.envs)}")
         return items

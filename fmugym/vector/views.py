@@ -9,7 +9,6 @@ from types import MappingProxyType, MethodType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.archive import FMU
@@ -28,6 +27,12 @@ _SHARED_TYPES = (
 )
 """Types of attributes that do not change, and of what is too costly to be copied."""
 
+_SHARED_NAMES = frozenset(
+    {"_constructor_arguments", "metadata", "_start_inputs", "_no_action", "_pool"}
+    | {"_input_row", "_output_row", "_observation_row"}
+)
+"""Attributes of ``FMUEnv`` that hooks have no business with."""
+
 
 def light_copy(env: FMUEnv) -> FMUEnv:
     """Copy an environment without loading the FMU again: all attributes are shared."""
@@ -42,12 +47,18 @@ def light_copy(env: FMUEnv) -> FMUEnv:
 
 def copied_attributes(env: FMUEnv) -> dict[str, Any]:
     """Copies of the attributes that hooks might change, one by one, by name."""
-    memo = {id(env): env, id(env._pool): env._pool, id(env.spec): env.spec}
+    memo = {id(env): env, id(env.spec): env.spec}
     return {
         name: _copied(value, memo)
         for name, value in env.__dict__.items()
-        if not isinstance(value, _SHARED_TYPES) and not callable(value)
+        if name not in _SHARED_NAMES and _may_change(value)
     }
+
+
+def _may_change(value: Any) -> bool:
+    if isinstance(value, _SHARED_TYPES) or callable(value):
+        return False
+    return not (type(value) is tuple and all(type(element) is float for element in value))
 
 
 def _copied(value: Any, memo: dict[int, Any]) -> Any:
@@ -102,12 +113,15 @@ def take(values: Any, index: int) -> Any:
     return part.item() if part.ndim == 0 and part.dtype.kind == "f" else part[()]
 
 
-def envs_first(values: Any) -> Any:
-    """Turn arrays (or dicts of them) of a batch, envs last, into new ones with envs first."""
+def envs_first(values: Any, space: spaces.Space[Any] | None = None) -> Any:
+    """Turn arrays (or dicts of them) of a batch, envs last, into new ones with envs first.
+
+    Args:
+        values: The arrays.
+        space: That of a single environment, whose types the new ones have; None for any types.
+    """
     if isinstance(values, Mapping):
-        return {name: envs_first(value) for name, value in values.items()}
-    return _moved(np.asarray(values))
-
-
-def _moved(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return np.array(np.moveaxis(values, -1, 0), order="C")
+        inner = space if isinstance(space, spaces.Dict) else {}
+        return {name: envs_first(value, inner.get(name)) for name, value in values.items()}
+    dtype = None if space is None else space.dtype
+    return np.array(np.moveaxis(np.asarray(values), -1, 0), dtype, order="C")
