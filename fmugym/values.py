@@ -7,7 +7,7 @@ from typing import Any
 
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["EpisodeVariables", "NamedValues"]
+__all__ = ["EpisodeVariables", "LateDict", "NamedValues"]
 
 
 class NamedValues:
@@ -85,3 +85,70 @@ class EpisodeVariables(dict[str, Any]):
     def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
         """A copy is a dict like any other."""
         return dict, (dict(self),)
+
+
+class LateDict(dict[str, Any]):
+    """A dict that is filled when it is first looked at, for what is rarely looked at.
+
+    Args:
+        fill: Returns the items.
+    """
+
+    def __init__(self, fill: Callable[[], Mapping[str, Any]]) -> None:
+        super().__init__()
+        self._fill: Callable[[], Mapping[str, Any]] | None = fill
+
+    def _filled(self) -> dict[str, Any]:
+        if self._fill is not None:
+            fill, self._fill = self._fill, None
+            super().update(fill())
+        return self
+
+    def __getitem__(self, key: str) -> Any:
+        return dict.__getitem__(self._filled(), key)
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        dict.__setitem__(self._filled(), key, value)
+
+    def __delitem__(self, key: str) -> None:
+        dict.__delitem__(self._filled(), key)
+
+    def __contains__(self, key: object) -> bool:
+        return dict.__contains__(self._filled(), key)
+
+    def __iter__(self) -> Iterator[str]:
+        return dict.__iter__(self._filled())
+
+    def __len__(self) -> int:
+        return dict.__len__(self._filled())
+
+    def __eq__(self, other: object) -> bool:
+        return dict.__eq__(self._filled(), other)
+
+    __hash__ = None
+
+    def __repr__(self) -> str:
+        return dict.__repr__(self._filled())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self.items()),)
+
+    def keys(self) -> Any:
+        """See ``dict``."""
+        return dict.keys(self._filled())
+
+    def values(self) -> Any:
+        """See ``dict``."""
+        return dict.values(self._filled())
+
+    def items(self) -> Any:
+        """See ``dict``."""
+        return dict.items(self._filled())
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """See ``dict``."""
+        return dict.get(self._filled(), key, default)
+
+    def copy(self) -> dict[str, Any]:
+        """See ``dict``; the copy is a plain one."""
+        return dict(self.items())

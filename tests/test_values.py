@@ -6,7 +6,7 @@ import pickle
 import pytest
 
 from fmugym import ConfigError
-from fmugym.values import EpisodeVariables, NamedValues
+from fmugym.values import EpisodeVariables, LateDict, NamedValues
 
 
 class TestNamedValues:
@@ -81,3 +81,52 @@ class TestEpisodeVariables:
     def test_copies_are_dicts(self, variables, clone):
         """For an info, for example, that is sent to another process."""
         assert clone(variables) == {"target": 1.0, "integral": 0.0}
+
+
+class TestLateDict:
+    def make(self):
+        self.calls = 0
+
+        def fill():
+            self.calls += 1
+            return {"a": 1, "b": 2}
+
+        return LateDict(fill)
+
+    @pytest.mark.parametrize(
+        "look",
+        [
+            lambda d: d["a"],
+            lambda d: "a" in d,
+            list,
+            len,
+            dict,
+            lambda d: {**d},
+            lambda d: d.get("a"),
+            lambda d: list(d.items()),
+            lambda d: list(d.values()),
+            lambda d: list(d.keys()),
+            lambda d: d.copy(),
+            lambda d: d == {},
+            repr,
+            pickle.dumps,
+            copy.deepcopy,
+        ],
+    )
+    def test_is_filled_once_by_any_look(self, look):
+        late = self.make()
+        assert isinstance(late, dict)
+        assert self.calls == 0
+        look(late)
+        look(late)
+        assert self.calls == 1
+        assert late == {"a": 1, "b": 2}
+
+    def test_is_like_a_plain_dict(self):
+        late = self.make()
+        late["c"] = 3
+        del late["a"]
+        assert dict(late) == {"b": 2, "c": 3}
+        assert pickle.loads(pickle.dumps(late)) == {"b": 2, "c": 3}
+        assert repr(late) == "{'b': 2, 'c': 3}"
+        assert late | {"d": 4} == {"b": 2, "c": 3, "d": 4}

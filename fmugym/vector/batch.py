@@ -155,9 +155,10 @@ class BatchEngine(Engine):
         env.action[..., indices] = env.previous_action[..., indices] = no_action
         env.done = env.done.copy()  # it was given away
         env.done[indices] = False
-        set_here = {variable.name for variable in plan.model_variables}
         for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
-            row[indices] = self._parameters[name][indices] if name in set_here else start
+            row[indices] = (
+                self._parameters[name][indices] if name in plan.parameter_names else start
+            )
 
     def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
         for index in indices.tolist():

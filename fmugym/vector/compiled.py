@@ -10,6 +10,7 @@ import numpy as np
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import MaskArray
+from fmugym.values import LateDict
 from fmugym.vector.batch import BatchEngine, StepResult
 from fmugym.vector.probe import sample_states
 from fmugym.vector.trace import Program, UntraceableError, evaluate, trace_hooks
@@ -87,15 +88,16 @@ class CompiledEngine(BatchEngine):
         space: Any = env.action_space
         self._outdated = False
         self._names = plan.drawn_names
-        self._masks = [f"_{name}" for name in self._names]
-        self._rows = np.array([plan.parameter_names.index(n) for n in self._names], np.intp)
+        rows = [plan.parameter_names.index(name) for name in self._names]
+        together = rows == list(range(len(rows)))
+        self._drawn_rows = slice(len(rows)) if together else np.array(rows, np.intp)
         pool: Any = self._pool
         self._play = pool.prepare_play(
             plan.model_variables,
             programs,
             (int(space.start), int(space.start + space.n - 1)),
             self._start_values,
-            (streams.block, streams.used, *plan.limits, self._rows),
+            (streams.block, streams.used, *plan.limits, np.array(rows, np.int64)),
             (env.step_count, self.ended, self._limit),
         )
 
@@ -114,14 +116,23 @@ class CompiledEngine(BatchEngine):
         troubled, ended, used_up = self._play_checked(actions, result)
         self.any_ended = ended > 0
         if resetting is not None:
-            drawn: dict[str, Any] = dict.fromkeys(self._masks, resetting)
-            drawn.update(zip(self._names, self._start_values[self._rows], strict=True))
-            result.infos["drawn"], result.infos["_drawn"] = drawn, resetting
+            result.infos["drawn"] = self._drawn(resetting)
+            result.infos["_drawn"] = resetting
         if troubled:
             self._mend(actions, result, resetting)
         if used_up:
             self._streams.refill_used_up(self.ended)
         return result
+
+    def _drawn(self, mask: MaskArray) -> LateDict:
+        """The values of now, which later steps write again; few ever look at them."""
+        values = np.array(self._start_values[self._drawn_rows])
+
+        def fill() -> dict[str, Any]:
+            named = dict(zip(self._names, values, strict=True))
+            return named | {f"_{name}": mask.copy() for name in named}
+
+        return LateDict(fill)
 
     def note_attributes(self) -> None:
         """The programs have the former values in them."""

@@ -47,7 +47,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             a single environment: compiled for the native pool where they are plain arithmetic, on
             arrays, or one environment at a time. ``"compiled"``, ``"array"`` and ``"per_env"`` ask
             for one of them; where it is not possible, that is an error.
-        pool_options: Passed to ``fmugym.pool.make_pool``: ``backend``, ``threads``.
+        pool_options: Passed to ``fmugym.pool.make_pool``: ``backend``, ``threads``,
+            ``private_libraries``.
 
     Raises:
         ConfigError: If an argument does not fit, or with ``hooks="array"`` if a hook does not
@@ -302,6 +303,7 @@ def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEn
         hooks: str = "auto",
         backend: str = "auto",
         threads: int | None = None,
+        private_libraries: bool | None = None,
         **kwargs: Any,
     ) -> FMUVectorEnv:
         """Make a vector environment; see ``FMUVectorEnv``."""
@@ -314,6 +316,7 @@ def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEn
             hooks=hooks,
             backend=backend,
             threads=threads,
+            private_libraries=private_libraries,
         )
 
     return make
