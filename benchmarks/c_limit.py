@@ -8,6 +8,7 @@ A C compiler is needed: ``cc`` or ``gcc``, or else the package ``ziglang``.
 from __future__ import annotations
 
 import argparse
+import atexit
 import functools
 import importlib.util
 import math
@@ -16,8 +17,11 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import fmugym
+
+__all__ = ["Rates", "build", "compiler", "measure"]
 
 SOURCE = Path(__file__).with_suffix(".c")
 TIME_STEP = 0.02
@@ -31,6 +35,18 @@ REALS = {
 }
 INTEGERS = {"pole_type": 2, "solver": 1}
 """Gymnasium's cart-pole: a uniform rod, explicit Euler."""
+
+
+class Rates(NamedTuple):
+    """Steps per second of all threads together, resets included in the time.
+
+    Attributes:
+        wall: By the wall clock.
+        cpu: Per second of processor time.
+    """
+
+    wall: float
+    cpu: float
 
 
 def compiler() -> list[str]:
@@ -51,6 +67,7 @@ def compiler() -> list[str]:
 def build() -> tuple[Path, fmugym.FMU]:
     """Compile the program once; the FMU is kept, as its folder goes with it."""
     folder = Path(tempfile.mkdtemp(prefix="c-limit-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     program = folder / "c_limit"
     options = ["-O2", "-Wall", "-Wextra", "-o", str(program), str(SOURCE)]
     subprocess.run([*compiler(), *options, "-lm", "-ldl", "-lpthread"], check=True)
@@ -59,16 +76,13 @@ def build() -> tuple[Path, fmugym.FMU]:
     return program, fmu
 
 
-def steps_per_second(num_envs: int, threads: int = 1, seconds: float = 1.0) -> float:
+def measure(num_envs: int, threads: int = 1, seconds: float = 1.0) -> Rates:
     """Run the program.
 
     Args:
         num_envs: Number of instances, of all threads together.
         threads: Each steps its part of the instances, and none waits for another.
         seconds: For how long.
-
-    Returns:
-        Steps per second of all threads together, resets included in the time.
     """
     program, fmu = build()
     names = ["f", "x", "x_dot", "phi", "phi_dot", "x_0", "x_dot_0", "phi_0", "phi_dot_0"]
@@ -78,18 +92,18 @@ def steps_per_second(num_envs: int, threads: int = 1, seconds: float = 1.0) -> f
     command = [str(program), str(fmu.extract() / fmu.library), fmu.description.instantiation_token]
     command += [str(num_envs), str(threads), str(seconds), str(TIME_STEP), *references]
     result = subprocess.run([*command, *parameters], check=True, capture_output=True, text=True)
-    return float(result.stdout)
+    return Rates(*map(float, result.stdout.split()))
 
 
 def main() -> None:
-    """Print steps per second."""
+    """Print both rates."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=1.0)
     arguments = parser.parse_args()
-    rate = steps_per_second(arguments.num_envs, arguments.threads, arguments.seconds)
-    print(f"{rate / 1e6:.2f} M steps/s")
+    rates = measure(arguments.num_envs, arguments.threads, arguments.seconds)
+    print(f"{rates.wall / 1e6:.2f} M steps/s, {rates.cpu / 1e6:.2f} M steps/CPU-s")
 
 
 if __name__ == "__main__":

@@ -584,9 +584,16 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         overlay = Overlay(self.time, action, self._last_reward, self._return)
         return self._renderer.render(self._get_frame(), overlay)
 
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """The goal reward in the form that hindsight replay calls; see ``_goal_reward``."""
-        return self._goal_reward(achieved_goal, desired_goal)
+    @property
+    def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
+        """The goal reward in the form that hindsight replay calls; see ``_goal_reward``.
+
+        Raises:
+            AttributeError: If this is no goal task: that is how Stable-Baselines3 tells.
+        """
+        if not self._is_goal_task:
+            raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
+        return lambda achieved, desired, info: self._goal_reward(achieved, desired)
 
     def read_variables(self, *names: str) -> dict[str, float]:
         """Read any numeric variables of the FMU now, for inspection outside of an episode's loop.

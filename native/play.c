@@ -20,6 +20,10 @@ ptrdiff_t play_find_bad_action(const Turn *turn) {
 /* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
 static void draw(const Play *play, size_t index) {
     const Draws *d = &play->draws;
+
+    if ((size_t)d->used[index] >= d->episodes) {
+        return; /* nobody has drawn ahead: the episode starts as the last one */
+    }
     const size_t episode = index * d->episodes + (size_t)d->used[index];
     const double *fractions = d->block + episode * d->draws;
 

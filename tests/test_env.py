@@ -391,8 +391,8 @@ def test_goal_task():
     assert env.compute_reward(*goals, {}).tolist() == [-1.0, 0.0]
     check_fmu_env(env)
     env.close()
-    with pytest.raises(SimulationError, match="no goal task"):
-        Swing().compute_reward(0, 0, {})
+    assert hasattr(env, "compute_reward")
+    assert not hasattr(Swing(), "compute_reward")  # which is how others tell a goal task
 
 
 def test_render_fps_follows_the_time_step():

@@ -379,7 +379,7 @@ class TestHooks:
             env.out["summ"]
 
     def test_a_goal_reward_that_is_not_there(self, make_env):
-        with pytest.raises(SimulationError, match="PlainEnv is no goal task"):
+        with pytest.raises(AttributeError, match="PlainEnv is no goal task"):
             make_env().compute_reward(np.zeros(1), np.zeros(1), {})
 
 

@@ -1592,3 +1592,13 @@ def test_a_prototype_that_does_not_fit_is_closed(temp_root):
     with pytest.raises(ConfigError):
         FMUVectorEnv(Branching, 2, hooks="array")
     assert not list(temp_root.iterdir())
+
+
+def test_single_environments_are_read_one_by_one():
+    envs = gym.make_vec("fmugym/CartPole-v0", num_envs=3)
+    envs.reset(seed=1)
+    envs.set_attr("m_pole", [0.1, 0.2, 0.3])
+    envs.reset(seed=1)
+    assert envs.get_attr("m_pole") == (0.1, 0.2, 0.3)
+    assert [read["m_pole"] for read in envs.call("read_variables", "m_pole")] == [0.1, 0.2, 0.3]
+    envs.close()

@@ -19,6 +19,9 @@ __all__ = ["CompiledEngine", "find_programs"]
 
 logger = logging.getLogger(__name__)
 
+_FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
+_make_tuple: Any = tuple.__new__  # a third of what a NamedTuple's own constructor takes
+
 
 def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program] | None:
     """Compile the hooks of an environment and compare them with what they are on arrays.
@@ -87,6 +90,7 @@ class CompiledEngine(BatchEngine):
         plan, streams = env._plan, self._streams
         space: Any = env.action_space
         self._outdated = False
+        self._shape = num_envs, env._output_count
         self._names = plan.drawn_names
         rows = [plan.parameter_names.index(name) for name in self._names]
         together = rows == list(range(len(rows)))
@@ -106,18 +110,20 @@ class CompiledEngine(BatchEngine):
         interpreted = self._outdated or self.given or self._overridden
         if interpreted or self._streams.num_draws is None:
             return super().step(actions, resetting)
-        result = StepResult(
-            np.empty((self._n, self.env._output_count), np.float32),
-            np.empty(self._n),
-            np.empty(self._n, np.bool_),
-            np.empty(self._n, np.bool_),
-            {},
-        )
-        troubled, ended, used_up = self._play_checked(actions, result)
+        observations = np.empty(self._shape, _FLOAT32)
+        rewards = np.empty(self._n)
+        terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
+        arrays = observations, rewards, terminated, truncated
+        try:
+            troubled, ended, used_up = self._play(actions, *arrays)
+        except (TypeError, ValueError, BufferError):
+            actions = np.ascontiguousarray(self._checked(actions), np.int64)
+            troubled, ended, used_up = self._play(actions, *arrays)
         self.any_ended = ended > 0
+        infos: dict[str, Any] = {}
         if resetting is not None:
-            result.infos["drawn"] = self._drawn(resetting)
-            result.infos["_drawn"] = resetting
+            infos = {"drawn": self._drawn(resetting), "_drawn": resetting}
+        result: StepResult = _make_tuple(StepResult, (*arrays, infos))
         if troubled:
             self._mend(actions, result, resetting)
         if used_up:
@@ -137,13 +143,6 @@ class CompiledEngine(BatchEngine):
     def note_attributes(self) -> None:
         """The programs have the former values in them."""
         self._outdated = True
-
-    def _play_checked(self, actions: Any, result: StepResult) -> tuple[int, int, int]:
-        try:
-            return self._play(actions, *result[:4])  # type: ignore[no-any-return]
-        except (TypeError, ValueError, BufferError):
-            actions = np.ascontiguousarray(self._checked(actions), np.int64)
-        return self._play(actions, *result[:4])  # type: ignore[no-any-return]
 
     def _mend(self, actions: Any, result: StepResult, resetting: MaskArray | None) -> None:
         """Deal with FMUs that failed, or asked to stop: rare, and so left to numpy."""

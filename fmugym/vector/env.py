@@ -231,8 +231,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return tuple(pictures)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of each environment; for parameters and attributes set by ``set_attr``."""
-        return tuple(getattr(env, name) for env in self._singles())
+        """An attribute, or else a parameter of the FMU, of each environment.
+
+        Compiled steps do not keep ``action``, ``done`` and what hooks read of the step before.
+        """
+        singles = self._singles()
+        if not hasattr(singles[0], name) and name in singles[0].parameters:
+            return tuple(env.parameters[name] for env in singles)
+        return tuple(getattr(env, name) for env in singles)
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.

@@ -62,6 +62,8 @@ class EpisodeStreams:
 
     def seed(self, seeds: Sequence[int | None], indices: npt.NDArray[np.intp]) -> None:
         """Seed some of the environments anew; None leaves a stream as it is."""
+        if not any(seed is not None for seed in seeds):
+            return
         for index in indices.tolist():
             if seeds[index] is not None:
                 self._generators[index], _ = seeding.np_random(seeds[index])

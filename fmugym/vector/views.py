@@ -17,6 +17,7 @@ from fmugym.env import FMUEnv
 from fmugym.episode import EpisodePlan
 from fmugym.pool import PoolSpec
 from fmugym.values import EpisodeVariables, NamedValues
+from fmugym.vector.column import PoolColumn
 
 __all__ = ["batched", "column", "copied_attributes", "envs_first", "light_copy", "take"]
 
@@ -89,6 +90,8 @@ def batched(env: FMUEnv, count: int) -> None:
 def column(env: FMUEnv, index: int) -> FMUEnv:
     """Environment number ``index`` of a batch as a single one, for calling its hooks only."""
     single = light_copy(env)
+    if env._pool is not None:
+        single._pool = PoolColumn(env._pool, index)
     single._values = tuple(env._values[:, index].tolist())
     single.state = single._values[: env._output_count]
     single.previous_state = tuple(env.previous_state[:, index].tolist())

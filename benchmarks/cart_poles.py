@@ -1,0 +1,207 @@
+"""The cart-poles of all packages, each stepped with the same actions, made to be measured."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import warnings
+from contextlib import ExitStack
+from typing import Any
+
+import c_limit
+import fmpy
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from fmpy.fmi2 import FMU2Slave
+from measure import MissingError, Run, Sample, Stopwatch, repeated
+
+import fmugym
+from fmugym.pool import has_native_pool
+
+__all__ = [
+    "FMUGYM",
+    "GYMNASIUM",
+    "c_limit_run",
+    "environment_run",
+    "envpool_run",
+    "fmpy_run",
+    "fmugym_vector",
+    "require_native_pool",
+    "vector_run",
+]
+
+FMUGYM, GYMNASIUM = "fmugym/CartPole-v0", "CartPole-v1"
+STEPS = 64
+"""Steps between two looks at the clock; as many different actions are taken, again and again."""
+
+PARAMETERS = {"m_pole": 0.1, "max_step": 1.0, "theta_0": math.pi / 2}
+"""What differs in Gymnasium's plant from the FMU's defaults, all but the solver."""
+
+
+def actions(num_envs: int) -> npt.NDArray[np.int64]:
+    """The actions of ``STEPS`` steps: pushes to either side, at random."""
+    return np.random.default_rng(0).integers(0, 2, (STEPS, num_envs))
+
+
+def require_native_pool() -> None:
+    """Leave out what would be measured on the Python pool by mistake.
+
+    Raises:
+        MissingError: Without the C extension.
+    """
+    if not has_native_pool():
+        raise MissingError("not built")
+
+
+# One environment
+
+
+def environment_run(env: gym.Env[Any, Any]) -> Run:
+    """Steps, with a reset where an episode ends."""
+    chosen = actions(1)[:, 0].tolist() * 16
+    env.reset(seed=0)
+
+    def block() -> None:
+        for action in chosen:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return repeated(block, len(chosen))
+
+
+def fmpy_run(stack: ExitStack) -> Run:
+    """FMPy's wrappers as its documentation uses them: set, step, get; no reward, no episodes."""
+    fmu, references = _fmpy_instance(stack)
+    force, outputs = [references["f"]], [references[n] for n in ("x", "x_dot", "phi", "phi_dot")]
+    forces = [20.0 * action - 10.0 for action in actions(1)[:, 0].tolist()] * 16
+
+    def block() -> None:
+        _fmpy_start(fmu, references)
+        for index, value in enumerate(forces):
+            fmu.setReal(force, [value])
+            fmu.doStep(currentCommunicationPoint=0.02 * index, communicationStepSize=0.02)
+            fmu.getReal(outputs)
+
+    return repeated(block, len(forces))
+
+
+def _fmpy_instance(stack: ExitStack) -> tuple[FMU2Slave, dict[str, int]]:
+    path = str(fmugym.bundled_fmu("CartPole"))
+    description, folder = fmpy.read_model_description(path), fmpy.extract(path)
+    stack.callback(shutil.rmtree, folder, ignore_errors=True)
+    fmu = FMU2Slave(
+        guid=description.guid,
+        modelIdentifier=description.coSimulation.modelIdentifier,
+        unzipDirectory=folder,
+    )
+    fmu.instantiate()
+    stack.callback(fmu.freeInstance)
+    return fmu, {v.name: v.valueReference for v in description.modelVariables}
+
+
+def _fmpy_start(fmu: FMU2Slave, references: dict[str, int]) -> None:
+    fmu.reset()
+    fmu.setReal([references[name] for name in PARAMETERS], list(PARAMETERS.values()))
+    fmu.setInteger([references["solver"]], [1])
+    fmu.setupExperiment(startTime=0.0)
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+
+
+# Many environments
+
+
+def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """This package's vector environment, on the native pool where no other is asked for.
+
+    Raises:
+        MissingError: If there is no native pool.
+    """
+    if options.get("backend") != "python":
+        require_native_pool()
+    return gym.make_vec(FMUGYM, num_envs, **options)
+
+
+def vector_run(env: Any) -> Run:
+    """Steps of a vector environment in the mode ``NEXT_STEP``.
+
+    The step that only resets an environment is no transition and not counted; the clock stands
+    still while counting.
+    """
+    workers = [process.pid for process in getattr(env, "processes", ())]
+    dtype = env.action_space.dtype
+    chosen = list(actions(env.num_envs).astype(dtype))
+    env.reset(seed=0) if workers else env.reset()
+    resetting = 0
+
+    def run(seconds: float) -> Sample:
+        nonlocal resetting
+        watch, done = Stopwatch(workers), 0
+        while watch.wall < seconds:
+            ends = _step_block(env, chosen, watch)
+            done += env.num_envs * STEPS - sum(ends[:-1]) - resetting
+            resetting = ends[-1]
+        return watch.sample(done)
+
+    return run
+
+
+def _step_block(
+    env: Any, chosen: list[npt.NDArray[np.integer[Any]]], watch: Stopwatch
+) -> list[int]:
+    """Returns how many episodes each step has ended."""
+    step, flags = env.step, []
+    watch.start()
+    for action in chosen:
+        _, _, terminated, truncated, _ = step(action)
+        flags.append((terminated, truncated))
+    watch.stop()
+    return [int(np.count_nonzero(one | other)) for one, other in flags]
+
+
+def envpool_run(stack: ExitStack, num_envs: int, threads: int) -> Run:
+    """EnvPool's cart-pole, which resets in the next step too.
+
+    Raises:
+        MissingError: If it is not installed.
+    """
+    try:
+        import envpool
+    except ImportError:
+        raise MissingError("not installed") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"num_envs": num_envs, "num_threads": threads, "seed": 0}
+        env = envpool.make(GYMNASIUM, env_type="gymnasium", **options)
+        stack.callback(env.close)
+        return vector_run(_EnvPool(env, num_envs))
+
+
+class _EnvPool:
+    """What ``vector_run`` asks for."""
+
+    def __init__(self, env: Any, num_envs: int) -> None:
+        self.num_envs, self.reset, self.step = num_envs, env.reset, env.step
+        self.action_space = gym.spaces.MultiDiscrete(np.full(num_envs, 2), dtype=np.int32)
+
+
+def c_limit_run(num_envs: int, threads: int) -> Run:
+    """The C program that does nothing but step the FMU.
+
+    Raises:
+        MissingError: Without a compiler, or with more threads than environments.
+    """
+    if threads > num_envs:
+        raise MissingError("-")
+    try:
+        c_limit.build()
+    except (RuntimeError, OSError) as error:
+        raise MissingError("no C compiler") from error
+
+    def run(seconds: float) -> Sample:
+        rates = c_limit.measure(num_envs, threads, seconds)
+        return Sample(rates.wall * seconds, seconds, rates.wall * seconds / rates.cpu)
+
+    return run

@@ -1,0 +1,106 @@
+"""Everything that is said of speed and memory, measured side by side in one run.
+
+    python benchmarks/run.py
+    python benchmarks/run.py --quick --only single
+    python benchmarks/run.py --json benchmarks.json
+
+In every section the configurations have their turns one after the other, many times over; the
+figures are medians over the rounds, and ratios are taken within a round: other work on the machine
+disturbs all alike. Leave the machine alone all the same. Packages that are not installed get a row
+that says so; a C compiler (``cc``, or the package ``ziglang``) is needed for some rows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import heavy
+import loaded
+import memory
+import reset
+import single
+import vector
+from measure import Effort, processors
+from tables import Table
+
+SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
+    "single": single.tables,
+    "vector": vector.tables,
+    "reset": reset.tables,
+    "heavy": heavy.tables,
+    "memory": memory.tables,
+    "loaded": loaded.tables,
+}
+FULL = Effort(rounds=11, seconds=0.08, quick=False)
+QUICK = Effort(rounds=1, seconds=0.01, quick=True)
+LOADED = Effort(rounds=21, seconds=0.2, quick=False)
+"""Longer, as the system hands out the processors in slices of some milliseconds."""
+
+
+def main() -> None:
+    """Print the tables."""
+    arguments = _parser().parse_args()
+    logging.basicConfig(level=logging.WARNING)
+    begin, results = time.perf_counter(), {}
+    print(f"{_machine()}\n", flush=True)
+    for name in arguments.only or SECTIONS:
+        results[name] = SECTIONS[name](_effort(name, arguments.quick))
+        for table in results[name]:
+            print(f"{table}\n", flush=True)
+    print(f"{time.perf_counter() - begin:.0f} s; {_load()}")
+    if arguments.json:
+        _write(arguments.json, results)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="only show that everything works")
+    parser.add_argument("--only", action="append", choices=SECTIONS, help="may be repeated")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    return parser
+
+
+def _effort(section: str, quick: bool) -> Effort:
+    if quick:
+        return QUICK
+    return LOADED if section == "loaded" else FULL
+
+
+def _machine() -> str:
+    names = ("fmugym-toolbox", "gymnasium", "numpy", "FMPy", "envpool")
+    packages = [f"{name} {found}" for name in names if (found := _version(name))]
+    system = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    return f"{system}, {processors()} processors, {_load()}\n{', '.join(packages)}"
+
+
+def _load() -> str:
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    return f"load average {load}"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _write(path: Path, results: dict[str, list[Table]]) -> None:
+    sections = {
+        name: [{"title": table.title, "figures": table.data} for table in tables if table.data]
+        for name, tables in results.items()
+    }
+    content = {"machine": _machine(), "sections": sections}
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Steps per second of vector environments of several sizes, beside those of other packages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import cart_poles
+import gymnasium as gym
+from cart_poles import GYMNASIUM
+from measure import (
+    Effort,
+    Run,
+    Sample,
+    by_turns,
+    cpu_rate,
+    make_runs,
+    ratio,
+    thread_counts,
+    wall_rate,
+)
+from tables import Table, rate, share, times
+
+__all__ = ["tables"]
+
+SIZES = (1, 8, 64, 1024, 4096)
+MOST = {"fmugym, Python pool": 64, "Gymnasium SyncVectorEnv": 64, "Gymnasium AsyncVectorEnv": 8}
+"""Where more environments would only take longer to tell the same."""
+
+BASE, LIMIT = "Gymnasium make_vec (numpy)", "C limit, 1 thread"
+TITLES = (
+    "Vector environments: steps/s, and how many times that of Gymnasium's numpy vector",
+    "Vector environments: steps/CPU-s, and wall-clock share of the C limit with as many threads",
+)
+
+
+def tables(effort: Effort) -> list[Table]:
+    """Measure all sizes; all columns are numbers of environments."""
+    sizes = SIZES[:2] if effort.quick else SIZES
+    header = ["environments", *map(str, sizes)]
+    walls, cpus = (Table(title, header) for title in TITLES)
+    columns = [_column(size, effort) for size in sizes]
+    for name in columns[0]:
+        cells = [column[name] for column in columns]
+        walls.rows.append([name, *(cell[0] for cell in cells)])
+        cpus.rows.append([name, *(cell[1] for cell in cells)])
+        walls.data += [cell[2] for cell in cells]
+    return [walls, cpus]
+
+
+def _column(size: int, effort: Effort) -> dict[str, tuple[str, str, dict[str, Any]]]:
+    """The two cells of each configuration, and the figures in them."""
+    with ExitStack() as stack:
+        makers = dict(_makers(stack, size))
+        runs, missing = make_runs({n: m for n, m in makers.items() if size <= MOST.get(n, size)})
+        samples = by_turns(runs, effort)
+    column = {}
+    for name in makers:
+        head = {"configuration": name, "num_envs": size}
+        text = missing.get(name, "-")
+        column[name] = _cells(name, samples, head) if name in runs else (text, text, head)
+    return column
+
+
+def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run]]]:
+    threads = thread_counts()
+    for count, text in threads.items():
+        yield f"fmugym, {text}", lambda n=count: _fmugym(stack, size, threads=n)
+    yield 'fmugym, hooks="array"', lambda: _fmugym(stack, size, hooks="array")
+    yield "fmugym, Python pool", lambda: _fmugym(stack, size, backend="python")
+    yield BASE, lambda: _gymnasium(stack, size, "vector_entry_point")
+    yield "Gymnasium SyncVectorEnv", lambda: _gymnasium(stack, size, "sync")
+    yield "Gymnasium AsyncVectorEnv", lambda: _gymnasium(stack, size, "async", context="spawn")
+    for count, text in threads.items():
+        yield f"EnvPool, {text}", lambda n=count: cart_poles.envpool_run(stack, size, n)
+    for count, text in threads.items():
+        yield f"C limit, {text}", lambda n=count: cart_poles.c_limit_run(size, n)
+
+
+def _fmugym(stack: ExitStack, size: int, **options: Any) -> Run:
+    env = cart_poles.fmugym_vector(size, **options)
+    stack.callback(env.close)
+    return cart_poles.vector_run(env)
+
+
+def _gymnasium(stack: ExitStack, size: int, mode: str, **options: Any) -> Run:
+    env = gym.make_vec(GYMNASIUM, size, vectorization_mode=mode, vector_kwargs=options)
+    stack.callback(env.close)
+    return cart_poles.vector_run(env)
+
+
+def _cells(
+    name: str, samples: dict[str, list[Sample]], data: dict[str, Any]
+) -> tuple[str, str, dict[str, Any]]:
+    own = samples[name]
+    data |= {"steps_per_s": wall_rate(own), "steps_per_cpu_s": cpu_rate(own)}
+    data["of_gymnasium"] = ratio(own, samples[BASE])
+    limit = samples.get(_limit(name, samples))
+    data["of_limit"] = ratio(own, limit) if limit else None
+    wall = f"{rate(data['steps_per_s'])} {times(data['of_gymnasium'])}"
+    part = share(data["of_limit"]) if limit else ""
+    return wall, f"{rate(data['steps_per_cpu_s'])} {part}".rstrip(), data
+
+
+def _limit(name: str, samples: dict[str, list[Sample]]) -> str:
+    """The C program with as many threads, as far as there are environments for them."""
+    threads = name.rpartition(", ")[2] if name.endswith("threads") else "1 thread"
+    own = f"C limit, {threads}"
+    return own if own in samples else LIMIT

@@ -1,0 +1,356 @@
+"""FMU environments for Stable-Baselines3: a ``VecEnv`` over ``FMUVectorEnv``.
+
+Needs the extra ``sb3``. See ``docs/stable-baselines3.md``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from itertools import repeat
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.pool.base import MaskArray
+from fmugym.vector import FMUVectorEnv, vectorized
+from fmugym.vector.batch import BatchEngine
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+except ImportError as error:
+    raise ImportError(
+        "fmugym.sb3 needs Stable-Baselines3, which cannot be imported; install the extra 'sb3', "
+        "for example with: pip install 'fmugym-toolbox[sb3]'"
+    ) from error
+
+__all__ = ["FMUVecEnv", "make_sb3_env"]
+
+Indices = int | Iterable[int] | None
+StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
+
+_NOTHING_ENDED: dict[str, Any] = {"TimeLimit.truncated": False}
+"""The info of a step after which the episode goes on."""
+
+_TOGETHER = frozenset({"close", "reset", "step"})
+"""Methods that one environment cannot do alone."""
+
+_KEPT_FOR_ALL = frozenset(
+    {"action", "after_end", "config", "done", "fmu", "inputs", "out", "parameters"}
+    | {"previous_action", "previous_state", "state", "step_count", "variables"}
+)
+"""Attributes of one environment that are views of those of all."""
+
+
+def make_sb3_env(
+    env: str | Callable[..., FMUEnv],
+    num_envs: int = 1,
+    *,
+    seed: int | None = None,
+    monitor: bool = True,
+    **kwargs: Any,
+) -> VecEnv:
+    """Make N environments for Stable-Baselines3, the counterpart of its ``make_vec_env``.
+
+    Args:
+        env: A registered id, or a class; ids bring their ``max_episode_steps``.
+        num_envs: N.
+        seed: Environment i is seeded with ``seed + i`` at the first reset.
+        monitor: Whether to put a ``VecMonitor`` around them, which the training's log of returns
+            and lengths comes from.
+        kwargs: Arguments of ``FMUVectorEnv`` (``max_episode_steps``, ``hooks``, ``threads``, ...)
+            and of the environment.
+
+    Raises:
+        ConfigError: If the environment is none of fmugym's, or an argument does not fit.
+    """
+    kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
+    if isinstance(env, str):
+        vector_env = _registered(env, num_envs, kwargs)
+    else:
+        vector_env = vectorized(env)(num_envs, **kwargs)
+    venv = FMUVecEnv(vector_env)
+    if seed is not None:
+        venv.seed(seed)
+        venv.action_space.seed(seed)
+    return VecMonitor(venv) if monitor else venv
+
+
+def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_module(module)
+    creator: Any = gymnasium.spec(name).entry_point
+    creator = load_env_creator(creator) if isinstance(creator, str) else creator
+    if isinstance(creator, type) and not issubclass(creator, FMUEnv):
+        raise ConfigError(f"{name} is no environment of fmugym; use SB3's own make_vec_env for it")
+    return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)
+
+
+class FMUVecEnv(VecEnv):
+    """N environments in the form that Stable-Baselines3 trains on.
+
+    It gives what SB3's ``DummyVecEnv`` over the N single environments gives, step by step, at the
+    speed of ``FMUVectorEnv``. The arrays and dicts it hands out are new ones.
+
+    Args:
+        env: The environments, made with ``autoreset_mode="same_step"``.
+
+    Attributes:
+        vector_env: The environments, as given.
+
+    Raises:
+        ConfigError: If ``env`` is something else, or has another autoreset mode.
+    """
+
+    def __init__(self, env: FMUVectorEnv) -> None:
+        if not isinstance(env, FMUVectorEnv):
+            raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
+        mode = env.metadata["autoreset_mode"]
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ConfigError(
+                f"the autoreset mode is {mode.name}, expected SAME_STEP: make the FMUVectorEnv "
+                "with autoreset_mode='same_step'"
+            )
+        self.vector_env = env
+        self.spec = env.spec
+        self._set_parameters: dict[str, list[Any]] = {}
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.metadata = dict(env.metadata)
+
+    # Episodes and steps.
+
+    def reset(self) -> Any:
+        """Start new episodes, with the seeds of ``seed`` and the options of ``set_options``.
+
+        Returns:
+            The observations; the infos are in ``reset_infos``.
+        """
+        groups = self._groups_of_options()
+        if len(groups) > 1 and not self.vector_env._started:
+            self.vector_env.reset()
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for mask, options in groups:
+            options = {**options, "reset_mask": mask}
+            observations, infos = self.vector_env.reset(seed=self._seeds, options=options)
+            _hand_out(infos, self.reset_infos)
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def _groups_of_options(self) -> list[tuple[MaskArray, dict[str, Any]]]:
+        """The environments that have the same options; most often there is one group, of all."""
+        kinds: list[dict[str, Any]] = []
+        for options in self._options:
+            if options not in kinds:
+                kinds.append(options)
+        return [(np.array([o == kind for o in self._options]), kind) for kind in kinds]
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """Take the actions for ``step_wait``."""
+        self._actions = actions
+
+    def step_wait(self) -> StepReturn:
+        """Step all environments; those whose episode ends start the next one.
+
+        Returns:
+            Observations, rewards, dones and infos, as SB3 has them: where an episode ended, the
+            observation is the first of the next one, and the info has ``"terminal_observation"``.
+        """
+        observations, rewards, terminated, truncated, infos = self.vector_env.step(self._actions)
+        dones = terminated | truncated
+        listed = list(map(dict.copy, repeat(_NOTHING_ENDED, self.num_envs)))
+        if dones.any():
+            self._end_episodes(dones, truncated & ~terminated, infos, listed)
+        elif infos:
+            _hand_out(infos, listed)
+        return observations, rewards.astype(np.float32), dones, listed
+
+    def _end_episodes(
+        self,
+        dones: MaskArray,
+        cut_short: MaskArray,
+        infos: dict[str, Any],
+        listed: list[dict[str, Any]],
+    ) -> None:
+        """Sort infos of the last step from those of the reset that followed in the same call."""
+        last, last_infos = infos.pop("final_obs"), infos.pop("final_info")
+        _hand_out(last_infos, listed)
+        others = list(listed)
+        for index in np.flatnonzero(dones).tolist():
+            listed[index]["TimeLimit.truncated"] = bool(cut_short[index])
+            listed[index]["terminal_observation"] = last[index]
+            others[index] = self.reset_infos[index] = {}
+        _hand_out(infos, others)
+
+    def close(self) -> None:
+        """Free the FMU instances."""
+        self.vector_env.close()
+
+    # Single environments.
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Return an attribute, or a parameter of this episode, of some of the environments.
+
+        Raises:
+            AttributeError: If there is none of this name.
+        """
+        singles = self.vector_env._singles()
+        return [_attribute(singles[index], attr_name) for index in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Set an attribute or, from the next episode on, a parameter of the FMU.
+
+        Args:
+            attr_name: An attribute that hooks read, or the name of a parameter.
+            value: A number, for each of the environments.
+            indices: The environments, by default all.
+
+        Raises:
+            ConfigError: If it is a parameter that the others draw anew in each episode.
+        """
+        self._set(attr_name, dict.fromkeys(self._numbers(indices), value))
+
+    def _set(self, name: str, values: Mapping[int, Any]) -> None:
+        if len(values) < self.num_envs:
+            values = {**dict(enumerate(self._present(name))), **values}
+        complete = [values[index] for index in range(self.num_envs)]
+        same = all(value is complete[0] for value in complete) and np.ndim(complete[0]) == 0
+        self.vector_env.set_attr(name, complete[0] if same else complete)
+        if self._is_parameter(name):
+            self._set_parameters[name] = complete
+
+    def _is_parameter(self, name: str) -> bool:
+        env = self.vector_env._prototype
+        return not hasattr(env, name) and name in env.fmu.description.variables
+
+    def _present(self, name: str) -> list[Any]:
+        """What all environments have now, for those that are not to be changed."""
+        if not self._is_parameter(name):
+            return self.get_attr(name)
+        if name in self._set_parameters:
+            return self._set_parameters[name]
+        env = self.vector_env._prototype
+        if name in env._plan.drawn_names:
+            raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
+        start = env.fmu.variable(name).start_number
+        return [env._plan.constant_parameters.get(name, start)] * self.num_envs
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of some of the environments.
+
+        Numbers that the method writes to attributes and to episode variables are kept.
+
+        Raises:
+            ConfigError: If the method would part one environment from the others.
+        """
+        if method_name in _TOGETHER:
+            raise ConfigError(f"{method_name!r} cannot be called on single environments of many")
+        numbers = self._numbers(indices)
+        if method_name == "render":
+            pictures = self.vector_env.render() or [None] * self.num_envs
+            return [pictures[index] for index in numbers]
+        singles = self.vector_env._singles()
+        called = [_Called(singles[index], index) for index in numbers]
+        results = [call.method(method_name)(*method_args, **method_kwargs) for call in called]
+        if isinstance(self.vector_env._engine, BatchEngine):
+            self._keep(called, self.vector_env._engine)
+        return results
+
+    def _keep(self, called: list[_Called], engine: BatchEngine) -> None:
+        """Take over what methods wrote, for single environments are but views of a batch."""
+        written: dict[str, dict[int, Any]] = {}
+        for call in called:
+            for name, value in call.written_attributes().items():
+                written.setdefault(name, {})[call.index] = value
+            for name, value in call.written_variables().items():
+                row = np.array(engine._row(name))
+                row[call.index] = value
+                engine.env.variables[name] = row
+        for name, values in written.items():
+            self._set(name, values)
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
+        """Tell that no single environment has a wrapper."""
+        return [False for _ in self._numbers(indices)]
+
+    def _numbers(self, indices: Indices) -> list[int]:
+        return [range(self.num_envs)[index] for index in self._get_indices(indices)]
+
+    def get_images(self) -> list[Any]:
+        """Return a picture of each environment, or None without the render mode ``rgb_array``."""
+        if self.render_mode != "rgb_array":
+            warnings.warn(f"no pictures in the render mode {self.render_mode}", stacklevel=2)
+            return [None] * self.num_envs
+        return self.env_method("render")
+
+
+class _Called:
+    """One environment before and after a method of it was called."""
+
+    def __init__(self, env: FMUEnv, index: int) -> None:
+        self.index = index
+        self._env = env
+        self._attributes = dict(vars(env))
+        self._variables = dict(env.variables)
+
+    def method(self, name: str) -> Callable[..., Any]:
+        method: Callable[..., Any] = getattr(self._env, name)
+        return method
+
+    def written_attributes(self) -> dict[str, Any]:
+        written = _changes(self._attributes, vars(self._env))
+        for name in written:
+            if name.startswith("_") or name in _KEPT_FOR_ALL:
+                raise ConfigError(f"a method wrote {name!r}, which single environments do not own")
+        return written
+
+    def written_variables(self) -> dict[str, Any]:
+        return _changes(self._variables, self._env.variables)
+
+
+def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    missing = object()
+    return {name: v for name, v in after.items() if before.get(name, missing) is not v}
+
+
+def _attribute(env: FMUEnv, name: str) -> Any:
+    """An attribute of an environment, or else a parameter of its episode."""
+    if not hasattr(env, name) and name in env.parameters:
+        return env.parameters[name]
+    return getattr(env, name)
+
+
+def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
+    """Distribute the infos of a vector environment, arrays with masks, over dicts.
+
+    Args:
+        infos: The infos; the mask of ``name`` is ``_name``.
+        into: The dicts of the environments by number.
+    """
+    for name, values in infos.items():
+        mask = infos.get(f"_{name}")
+        if mask is None:  # it is a mask itself
+            continue
+        indices = np.flatnonzero(mask).tolist()
+        for index, value in zip(indices, _parts(values, indices), strict=True):
+            into[index][name] = value
+
+
+def _parts(values: Any, indices: list[int]) -> list[Any]:
+    """Each environment's part, with Python's numbers as single environments have them."""
+    if isinstance(values, Mapping):
+        parts: dict[int, Any] = {index: {} for index in indices}
+        _hand_out(values, parts)
+        return list(parts.values())
+    chosen = values[indices]
+    return chosen.tolist() if chosen.ndim == 1 else list(chosen)

@@ -1,0 +1,86 @@
+"""One instance of a pool, in the form of a pool of one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.adapters import Status
+from fmugym.model_description import Variable
+from fmugym.pool import Pool
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+
+__all__ = ["PoolColumn"]
+
+
+class PoolColumn:
+    """See ``Pool``; steps and resets leave the other instances alone.
+
+    Args:
+        pool: The pool of N instances.
+        index: Which of them.
+    """
+
+    num_instances = 1
+
+    def __init__(self, pool: Pool, index: int) -> None:
+        self._pool, self._index = pool, index
+        self.inputs: FloatArray = pool.inputs[:, index : index + 1]
+        self.outputs: FloatArray = pool.outputs[:, index : index + 1]
+        self.statuses: StatusArray = pool.statuses[index : index + 1]
+        self.observations = pool.observations[index : index + 1]
+
+    def _mask(self, value: bool) -> MaskArray:
+        mask = np.full(self._pool.num_instances, not value)
+        mask[self._index] = value
+        return mask
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``."""
+        all_values = np.repeat(values, self._pool.num_instances, axis=1)
+        self._pool.reset(variables, all_values, self._mask(True))
+        return self.outputs, self.statuses
+
+    def step(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.step``."""
+        if inputs is not None:
+            self.inputs[:] = inputs
+        self._pool.step(None, self._mask(False))
+        return self.outputs, self.statuses
+
+    def step_own(self) -> int:
+        """See ``Pool.step_own``."""
+        self.step()
+        self.observations[0] = self.outputs[: self.observations.shape[1], 0]
+        return int(self.statuses[0] > Status.WARNING)
+
+    def save(self) -> Any:
+        """See ``Pool.save``."""
+        return self._pool.save()
+
+    def restore(
+        self, snapshot: Any, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.restore``."""
+        self._pool.restore(snapshot, self._mask(True))
+        return self.outputs, self.statuses
+
+    def failure(self, index: int) -> str:
+        """See ``Pool.failure``."""
+        return self._pool.failure(self._index)
+
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
+        """See ``Pool.read``."""
+        return self._pool.read(variables)[:, self._index : self._index + 1]
+
+    def close(self) -> None:
+        """The pool is the vector environment's to close."""

@@ -1,0 +1,81 @@
+"""The benchmarks run and print their tables; what they measure is not asserted."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RUN = Path(__file__).parent.parent / "benchmarks" / "run.py"
+
+
+def run(*arguments):
+    command = [sys.executable, "-X", "utf8", RUN, "--quick", *arguments]
+    output = {"capture_output": True, "text": True, "encoding": "utf-8"}
+    return subprocess.run(command, timeout=120, **output)
+
+
+@pytest.fixture(name="ended", scope="module")
+def fixture_ended(tmp_path_factory):
+    """Two sections in one run, with the figures written to a file."""
+    path = tmp_path_factory.mktemp("benchmarks") / "figures.json"
+    return run("--only", "single", "--only", "reset", "--json", path), path
+
+
+def tables_in(text):
+    """The cells of each line of a table that is not the rule, by their first one."""
+    lines = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("|")]
+    return {cells[0].strip(): [cell.strip() for cell in cells[1:]] for cells in lines}
+
+
+def test_the_program_ends_well(ended):
+    result, _ = ended
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "fmugym CartPole-v0, gym.make",
+        "fmugym CartPole-v0, bare class",
+        "Gymnasium CartPole-v1, gym.make",
+        "Gymnasium CartPole-v1, bare class",
+        "FMPy's wrappers in a loop",
+        "fmugym's native pool, mask of all 1,024",
+        "Gymnasium make_vec (numpy), 1,024 envs",
+        "fmugym make, one env",
+    ],
+)
+def test_every_configuration_has_a_row_with_all_figures(ended, row):
+    cells = tables_in(ended[0].stdout)[row]
+    assert len(cells) >= 4
+    assert all(cells)
+
+
+def test_tables_are_at_most_100_columns_wide(ended):
+    assert max(map(len, ended[0].stdout.splitlines())) <= 100
+
+
+def test_the_base_is_compared_with_itself(ended):
+    assert tables_in(ended[0].stdout)["Gymnasium CartPole-v1, gym.make"][3] == "1.00x"
+
+
+def test_figures_are_written_to_the_file(ended):
+    sections = json.loads(ended[1].read_text(encoding="utf-8"))["sections"]
+    assert list(sections) == ["single", "reset"]
+    figures = sections["single"][0]["figures"]
+    assert all(one["steps_per_s"] > 0 and one["of_gymnasium"] > 0 for one in figures)
+
+
+def test_an_unknown_section_is_refused_with_the_names_of_those_there_are():
+    result = run("--only", "singel")
+    assert result.returncode == 2
+    assert "heavy" in result.stderr
+
+
+def test_heavy_steps_are_measured_on_an_fmu_made_for_it(temp_root):
+    result = run("--only", "heavy")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert {"10.0 us", "100 us", "1.00 ms"} <= tables_in(result.stdout).keys()
+    assert list(temp_root.iterdir()) == []
