@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["BUNDLED", "FMI_VERSIONS", "MODELS", "bundled_fmu"]
+__all__ = ["BUNDLED", "FMI_VERSIONS", "MODELS", "bundled_fmu", "is_bundled"]
 
 FMI_VERSIONS = ("1.0", "2.0", "3.0")
 """The FMI versions of the bundled FMUs."""
@@ -52,3 +52,8 @@ def bundled_fmu(model: str, fmi_version: str | float = "2.0") -> Path:
         raise ConfigError(f"there is no bundled {model} for FMI {version}, only for {there}")
     candidates = [folder / version / f"{model}.fmu" for folder in _FOLDERS]
     return next((path for path in candidates if path.exists()), candidates[0])
+
+
+def is_bundled(path: Path) -> bool:
+    """Whether an FMU is one of those that come with the package."""
+    return any(path.is_relative_to(folder) for folder in _FOLDERS)

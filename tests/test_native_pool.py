@@ -15,6 +15,7 @@ import fmu_tools
 import numpy as np
 import pytest
 
+import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
 from fmugym.adapters import Status
@@ -561,6 +562,29 @@ class TestIsolation:
         assert isolation.shares_globals(FMU(shared))
         assert not isolation.shares_globals(FMU(busy))
         assert list(temp_root.iterdir()) == []
+
+    def test_vector_environments_give_private_libraries_by_themselves(self, shared, caplog):
+        class Counting(fmugym.FMUEnv):
+            def __init__(self):
+                config = {"model_input_names": "work", "model_output_names": "total"}
+                bounds = {"work": (0.0, 10.0)}
+                super().__init__(shared, config | {"time_step": 0.1, "bounds": bounds})
+
+            def _is_done(self):
+                return False
+
+        envs = fmugym.FMUVectorEnv(Counting, 3)
+        assert "disturb each other" in caplog.text
+        single = Counting()
+        single.reset()
+        envs.reset()
+        for work in (0.0, 1.0, 2.0):
+            alone = single.step(work)[0].tolist()
+            assert envs.step(np.full((3, 1), work, np.float32))[0].tolist() == [alone] * 3
+        envs.close()
+        single.close()
+        with pytest.raises(FMULoadError, match="which only the native pool can give it"):
+            fmugym.FMUVectorEnv(Counting, 3, backend="python")
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):

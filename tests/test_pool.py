@@ -40,7 +40,8 @@ def make_pool(request):
             strings=tuple((fmu.variable(n), v) for n, v in (strings or {}).items()),
             **spec,
         )
-        pool = pools.make_pool(fmu, spec, num_instances, LOG, request.param)
+        options = {"backend": request.param, "private_libraries": False}
+        pool = pools.make_pool(fmu, spec, num_instances, LOG, **options)
         pool.variable = fmu.variable
         made.append(pool)
         return pool

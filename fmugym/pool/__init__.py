@@ -4,7 +4,8 @@ import functools
 import logging
 
 from fmugym.archive import FMU
-from fmugym.errors import FMULoadError, unknown_name
+from fmugym.bundled import is_bundled
+from fmugym.errors import FMULoadError, SimulationError, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray, Pool, PoolSpec, StatusArray
 from fmugym.pool.python import PythonPool
 
@@ -41,7 +42,9 @@ def make_pool(
         log: The logger that gets the FMU's messages.
         backend: ``"native"``, ``"python"``, or ``"auto"``: native where the extension was built.
         threads: See ``NativePool``; the Python pool has one thread.
-        private_libraries: See ``NativePool``; the Python pool has one library.
+        private_libraries: See ``NativePool``; by default where the FMU says that it can be
+            instantiated only once per process, or where two instances are found to disturb each
+            other. The Python pool has one library.
 
     Raises:
         ConfigError: If the backend is unknown.
@@ -49,9 +52,17 @@ def make_pool(
     """
     if backend not in ("auto", "native", "python"):
         raise unknown_name("backend", backend, ("auto", "native", "python"))
+    if private_libraries is None and num_instances > 1:
+        private_libraries = _needs_private_libraries(fmu, spec, log)
     if backend == "python" or (backend == "auto" and not has_native_pool()):
         if backend == "auto":
             _warn_of_slow_path()
+        if private_libraries:
+            fmu.close()
+            raise FMULoadError(
+                f"{fmu.path.name} needs a library of its own for each of {num_instances} "
+                "instances, which only the native pool can give it"
+            )
         return PythonPool(fmu, spec, num_instances, log)
     if not has_native_pool():
         raise FMULoadError(f"the native pool is not there: {_HOW_TO}")
@@ -60,6 +71,25 @@ def make_pool(
     return NativePool(
         fmu, spec, num_instances, log, threads=threads, private_libraries=private_libraries
     )
+
+
+def _needs_private_libraries(fmu: FMU, spec: PoolSpec, log: logging.Logger) -> bool:
+    from fmugym.pool.isolation import shares_globals
+
+    if is_bundled(fmu.path):
+        return False
+    if fmu.description.capabilities.can_be_instantiated_only_once_per_process:
+        return True
+    try:
+        shares = shares_globals(fmu, spec)
+    except SimulationError:  # it fails alone too, without the values that the caller will set
+        return False
+    if shares:
+        log.warning(
+            "the instances of %s disturb each other: each gets a copy of the library of its own",
+            fmu.path.name,
+        )
+    return shares
 
 
 @functools.cache
