@@ -573,7 +573,7 @@ class TestIsolation:
             def _is_done(self):
                 return False
 
-        envs = fmugym.FMUVectorEnv(Counting, 3)
+        envs = fmugym.FMUVectorEnv(Counting, 3, hooks="per_env")  # a probe would count too
         assert "disturb each other" in caplog.text
         single = Counting()
         single.reset()
