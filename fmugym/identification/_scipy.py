@@ -1,0 +1,22 @@
+"""SciPy, imported where it is used: the rest of the package does without."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__all__ = ["scipy_module"]
+
+
+def scipy_module(name: str) -> Any:
+    """Import a module of SciPy.
+
+    Raises:
+        ImportError: If SciPy is not there; the text names the extra that brings it.
+    """
+    try:
+        return importlib.import_module(f"scipy.{name}")
+    except ImportError:
+        raise ImportError(
+            'fmugym.identification needs SciPy: pip install "fmugym-toolbox[identification]"'
+        ) from None

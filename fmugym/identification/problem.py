@@ -1,0 +1,362 @@
+"""The least-squares problem behind an output-error fit.
+
+The initial states of the trajectories are eliminated: for given parameters each trajectory is
+fitted by its own initial state, and what the parameters' Jacobian has in the directions of that
+state is projected away (variable projection in Kaufman's form; Golub and Pereyra, "Separable
+nonlinear least squares", Inverse Problems 19, 2003). The number of trajectories thus does not
+enter the size of the optimization.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fmugym.errors import ConfigError, SimulationError, unknown_name
+from fmugym.identification._scipy import scipy_module
+from fmugym.identification.results import Comparison
+from fmugym.identification.simulation import Simulator
+from fmugym.identification.statistics import information_inverse
+from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.model_description import Variable
+from fmugym.pool.base import FloatArray
+
+__all__ = ["Experiment", "Limits", "Problem"]
+
+Limits = float | tuple[float, float] | tuple[float, float, float]
+
+DIFFERENCE = 1e-6
+"""Of the finite differences, as a fraction of a value's typical size."""
+
+FAILED = 1e3
+"""The residual, in units of the scale, of a simulation that fails: no step goes there."""
+
+MAX_ITERATIONS = 50
+"""Of the fits of the initial states."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What a fit and its predictions have in common; see ``fit_parameters``."""
+
+    fmu_path: str | os.PathLike[str]
+    initial_states: Mapping[str, str | float]
+    fixed: Mapping[str, float | str]
+    scales: Mapping[str, float]
+    time_step: float | None
+    drop_repeats: bool
+    backend: str
+
+    def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
+        """Leave out stale samples if that was asked for."""
+        common_names(trajectories)
+        return tuple(t.without_repeats() if self.drop_repeats else t for t in trajectories)
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """One trajectory's part of the problem at one point.
+
+    Attributes:
+        residual: Shape (m,); NaN where the simulation failed.
+        slopes: Of the residual with respect to the parameters or states, shape (m, k).
+    """
+
+    residual: FloatArray
+    slopes: FloatArray
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residuals."""
+        return float(self.residual @ self.residual)
+
+    def step(self, damping: float) -> FloatArray:
+        """Compute the step of Levenberg and Marquardt, shape (k,); none after a failure."""
+        matrix = self.slopes.T @ self.slopes
+        matrix += damping * np.diag(np.diag(matrix))
+        gradient = self.slopes.T @ self.residual
+        if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
+            return np.zeros(len(gradient))
+        return np.asarray(-np.linalg.lstsq(matrix, gradient, rcond=None)[0], np.float64)
+
+    def is_solved(self, step: FloatArray) -> bool:
+        """Whether a step promises next to nothing."""
+        gain = -step @ self.slopes.T @ self.residual
+        return not gain > 1e-10 * self.cost + 1e-20 * len(self.residual)
+
+    def project(self, count: int) -> FloatArray:
+        """Return the first slopes, less what the others can explain; shape (m, count)."""
+        wanted, others = self.slopes[:, :count], self.slopes[:, count:]
+        projected: FloatArray = wanted - others @ np.linalg.lstsq(others, wanted, rcond=None)[0]
+        return projected
+
+
+class Problem:
+    """Residuals, their Jacobian, and what follows from a solution.
+
+    Args:
+        experiment: What does not change.
+        parameters: What to fit; see ``fit_parameters``.
+        trajectories: What to fit it to.
+        fit_states: Whether to fit the initial states.
+
+    Attributes:
+        trajectories: Without stale samples.
+        bounds: Of each parameter by name.
+        start: The parameters to start from, shape (k,).
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        parameters: Mapping[str, Limits],
+        trajectories: Sequence[Trajectory],
+        fit_states: bool = True,
+    ) -> None:
+        self.trajectories = experiment.clean(trajectories)
+        self._state_names = list(experiment.initial_states)
+        self._states = _measured_states(experiment.initial_states, self.trajectories)
+        names = [*parameters, *self._state_names]
+        self._rows = range(len(names) if fit_states else len(parameters))
+        self._simulator = Simulator(
+            experiment.fmu_path,
+            self.trajectories,
+            names,
+            experiment.fixed,
+            1 + len(self._rows),
+            experiment.time_step,
+            experiment.backend,
+        )
+        try:
+            self._set_limits([self._simulator.description.variable(n) for n in names], parameters)
+            self._scales = _scales(experiment.scales, self.trajectories, self._simulator.outputs)
+        except BaseException:
+            self.close()
+            raise
+        self._last = np.empty(0), self._states
+
+    def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
+        fitted, states = variables[: len(parameters)], variables[len(parameters) :]
+        limits = [_limits(v, parameters[v.name]) for v in fitted]
+        self.bounds = {v.name: x[1:] for v, x in zip(fitted, limits, strict=True)}
+        self.start = np.array([x[0] for x in limits])
+        self._high = np.array([x[2] for x in limits] + [v.maximum for v in states])
+        self._low = np.array([x[1] for x in limits] + [v.minimum for v in states])
+        sizes = [max(abs(x[0]), v.nominal or 0.0) for v, x in zip(fitted, limits, strict=True)]
+        sizes += [v.nominal or 0.0 for v in states]
+        self._differences = DIFFERENCE * np.array([size or 1.0 for size in sizes])
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._simulator.close()
+
+    def solve(self, max_evaluations: int) -> Any:
+        """Minimize; returns what SciPy returns."""
+        self.compare(self.start, refit=False)  # fails early, with the FMU's reason
+        count = len(self.start)
+        return scipy_module("optimize").least_squares(
+            self._residuals,
+            self.start,
+            jac=self._jacobian,
+            bounds=(self._low[:count], self._high[:count]),
+            x_scale="jac",
+            max_nfev=max_evaluations,
+        )
+
+    def compare(
+        self,
+        parameters: FloatArray,
+        states: Sequence[Mapping[str, float]] | None = None,
+        *,
+        refit: bool = True,
+    ) -> Comparison:
+        """Simulate all trajectories.
+
+        Args:
+            parameters: Their values, shape (k,).
+            states: Initial states to simulate from, for each trajectory.
+            refit: Fit the initial states to the trajectories, if the problem does so at all.
+        """
+        values = self._states
+        if states is not None:
+            values = np.reshape([list(state.values()) for state in states], (len(states), -1)).T
+        elif refit:
+            values = self._fit_states(parameters)[0]
+        simulated = self._simulator.simulate(self._join(parameters, values))
+        if not all(np.isfinite(outputs).all() for outputs in simulated):
+            raise SimulationError(f"the FMU cannot be simulated: {self._simulator.failure}")
+        names = self._simulator.outputs
+        return Comparison(
+            self.trajectories,
+            tuple(dict(zip(names, outputs[0].T, strict=True)) for outputs in simulated),
+            tuple(dict(zip(self._state_names, s, strict=True)) for s in values.T.tolist()),
+        )
+
+    def covariance(self, solution: Any, clustered: bool) -> tuple[FloatArray, int]:
+        """Estimate the covariance of the parameters, and its degrees of freedom."""
+        inverse, undetermined = information_inverse(solution.jac)
+        num_states = (len(self._rows) - len(self.start)) * len(self.trajectories)
+        freedom = max(1, len(solution.fun) - len(self.start) - num_states)
+        covariance = inverse * (solution.fun @ solution.fun) / freedom
+        if clustered:
+            freedom = self._require_clusters()
+            scores = np.stack([jacobian.T @ r for jacobian, r in self._by_trajectory(solution)])
+            factor = len(self.trajectories) / freedom
+            covariance = inverse @ scores.T @ scores @ inverse * factor
+        unknown = np.flatnonzero(undetermined)
+        covariance[unknown, unknown] = np.inf
+        return covariance, freedom
+
+    def _require_clusters(self) -> int:
+        freedom = len(self.trajectories) - len(self.start)
+        if freedom < 1:
+            raise ConfigError(
+                "clustered standard errors need more trajectories than parameters: "
+                f"{len(self.trajectories)} trajectories, {len(self.start)} parameters"
+            )
+        return freedom
+
+    def _by_trajectory(self, solution: Any) -> list[tuple[FloatArray, FloatArray]]:
+        ends = np.cumsum([len(t) * len(self._simulator.outputs) for t in self.trajectories])[:-1]
+        return list(zip(np.split(solution.jac, ends), np.split(solution.fun, ends), strict=True))
+
+    def _residuals(self, parameters: FloatArray) -> FloatArray:
+        """What SciPy minimizes, with the initial states at their best."""
+        states, blocks = self._fit_states(parameters)
+        self._last = parameters.copy(), states
+        residuals = np.concatenate([block.residual for block in blocks])
+        return np.where(np.isfinite(residuals), residuals, FAILED)
+
+    def _jacobian(self, parameters: FloatArray) -> FloatArray:
+        """The residuals' derivative; SciPy asks for it where it goes on from."""
+        if not np.array_equal(parameters, self._last[0]):
+            self._residuals(parameters)
+        self._states = self._last[1]
+        blocks = self._evaluate(parameters, self._states, self._rows)
+        if not all(np.isfinite(block.slopes).all() for block in blocks):
+            raise SimulationError(f"a simulation nearby failed: {self._simulator.failure}")
+        return np.concatenate([block.project(len(parameters)) for block in blocks])
+
+    def _fit_states(self, parameters: FloatArray) -> tuple[FloatArray, list[_Block]]:
+        """Return the best initial states, shape (states, W), and the problem there."""
+        count = len(parameters)
+        rows = self._rows[count:]
+
+        def evaluate(states: FloatArray) -> list[_Block]:
+            return self._evaluate(parameters, states, rows)
+
+        limits = self._low[count:, np.newaxis], self._high[count:, np.newaxis]
+        if not rows:
+            return self._states, evaluate(self._states)
+        return _levenberg_marquardt(evaluate, self._states, limits)
+
+    def _evaluate(
+        self, parameters: FloatArray, states: FloatArray, rows: Sequence[int]
+    ) -> list[_Block]:
+        """Simulate, and differentiate with respect to some of the parameters and states."""
+        base = self._join(parameters, states)
+        signs = np.where(
+            base[:, 0] + self._differences[:, np.newaxis] > self._high[:, np.newaxis], -1, 1
+        )
+        steps = signs * self._differences[:, np.newaxis]
+        values = np.repeat(base, 1 + len(rows), axis=1)
+        for index, row in enumerate(rows):
+            values[row, 1 + index] += steps[row]
+        errors = [self._errors(s, w) for w, s in enumerate(self._simulator.simulate(values))]
+        return [_Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w]) for w, e in enumerate(errors)]
+
+    def _join(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
+        """Return the values of one simulation of each trajectory, shape (names, 1, W)."""
+        shared = np.tile(parameters[:, np.newaxis], len(self.trajectories))
+        return np.concatenate([shared, states])[:, np.newaxis]
+
+    def _errors(self, simulated: FloatArray, index: int) -> FloatArray:
+        """Return one trajectory's scaled residuals, shape (sets, n * outputs)."""
+        outputs = self.trajectories[index].outputs
+        measured = np.stack([outputs[name] for name in self._simulator.outputs], axis=1)
+        scaled: FloatArray = (simulated - measured) / self._scales
+        return scaled.reshape(len(scaled), -1)
+
+
+def _levenberg_marquardt(
+    evaluate: Callable[[FloatArray], list[_Block]],
+    states: FloatArray,
+    limits: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, list[_Block]]:
+    """Fit the initial state of every trajectory, each with a damping of its own.
+
+    Args:
+        evaluate: Returns the problem of each trajectory at given states.
+        states: To start from, shape (states, W).
+        limits: Least and largest states, shape (states, 1).
+
+    Returns:
+        The states, shape (states, W), and the problem there.
+    """
+    damping = np.full(states.shape[1], 1e-4)
+    blocks = evaluate(states)
+    for _ in range(MAX_ITERATIONS):
+        steps = [block.step(factor) for block, factor in zip(blocks, damping, strict=True)]
+        if all(block.is_solved(step) for block, step in zip(blocks, steps, strict=True)):
+            break
+        trial = np.clip(states + np.stack(steps, axis=1), *limits)
+        tried = evaluate(trial)
+        better = np.array([new.cost < old.cost for new, old in zip(tried, blocks, strict=True)])
+        states = np.where(better, trial, states)
+        blocks = [tried[w] if better[w] else block for w, block in enumerate(blocks)]
+        damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-9, 1e9)
+    return states, blocks
+
+
+def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
+    """Return start value, lower and upper bound of a parameter."""
+    numbers = tuple(float(number) for number in np.atleast_1d(limits))
+    if len(numbers) == 1:
+        numbers = (*numbers, variable.minimum, variable.maximum)
+    elif len(numbers) == 2:
+        numbers = (_start_between(variable, *numbers), *numbers)
+    if len(numbers) != 3 or not numbers[1] <= numbers[0] <= numbers[2] > numbers[1]:
+        raise ConfigError(
+            f"{variable.name!r}: expected a start, (low, high) or (start, low, high) "
+            f"with low <= start <= high, got {limits!r}"
+        )
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _start_between(variable: Variable, low: float, high: float) -> float:
+    if low <= variable.start_number <= high:
+        return variable.start_number
+    return (low + high) / 2
+
+
+def _measured_states(
+    initial_states: Mapping[str, str | float], trajectories: Sequence[Trajectory]
+) -> FloatArray:
+    """Return the initial states that the first samples tell, shape (states, W)."""
+    states = np.empty((len(initial_states), len(trajectories)))
+    for k, source in enumerate(initial_states.values()):
+        for w, trajectory in enumerate(trajectories):
+            if isinstance(source, str) and source not in trajectory.outputs:
+                raise unknown_name("measured output", source, trajectory.outputs)
+            states[k, w] = trajectory.outputs[source][0] if isinstance(source, str) else source
+    return states
+
+
+def _scales(
+    given: Mapping[str, float], trajectories: Sequence[Trajectory], outputs: Sequence[str]
+) -> FloatArray:
+    """Return the scale of each output, shape (outputs,)."""
+    for name in given:
+        if name not in outputs:
+            raise unknown_name("measured output", name, outputs)
+    spread = {
+        n: float(np.std(np.concatenate([t.outputs[n] for t in trajectories]))) for n in outputs
+    }
+    scales = np.array([given.get(name, spread[name] or 1.0) for name in outputs])
+    if not (np.isfinite(scales) & (scales > 0)).all():
+        raise ConfigError(f"scales must be positive and finite, got {dict(given)}")
+    return scales

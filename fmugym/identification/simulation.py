@@ -1,0 +1,220 @@
+"""Simulations of all trajectories at once, each under several sets of values."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fmugym.adapters import Status
+from fmugym.archive import FMU
+from fmugym.config import checked_value
+from fmugym.errors import ConfigError
+from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.model_description import Variable
+from fmugym.pool import make_pool
+from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
+
+__all__ = ["Simulator"]
+
+logger = logging.getLogger(__name__)
+
+WARNING = int(Status.WARNING)
+
+
+class Simulator:
+    """One pool with an instance for each trajectory and each set of values.
+
+    Simulated time begins at 0 with each trajectory's first sample and goes on in steps of the
+    same size. Values at the sampling instants are interpolated by cubics; there is nothing to
+    interpolate where the samples lie on the steps.
+
+    Args:
+        path: The FMU.
+        trajectories: With the same outputs and inputs all of them.
+        names: The variables of which each set has a value: parameters, start values or inputs.
+            The value of an input is added to what was logged of it.
+        fixed: Values of further parameters.
+        num_sets: Largest number of sets.
+        time_step: In seconds; None for the trajectories' median sampling interval.
+        backend: See ``fmugym.pool.make_pool``.
+
+    Attributes:
+        description: The FMU's model description.
+        outputs: The names of the outputs, in the order of the results.
+        failure: Why the last simulation failed that did.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        trajectories: Sequence[Trajectory],
+        names: Sequence[str],
+        fixed: Mapping[str, float | str],
+        num_sets: int,
+        time_step: float | None = None,
+        backend: str = "auto",
+    ) -> None:
+        if time_step is not None and not 0 < time_step < np.inf:
+            raise ConfigError(f"time_step must be positive and finite, got {time_step!r}")
+        fmu = FMU(path)
+        self.failure = ""
+        self.description = fmu.description
+        self.outputs, logged = common_names(trajectories)
+        step = time_step or median_interval(trajectories)
+        self._grids = [_Grid(trajectory, step) for trajectory in trajectories]
+        self._free = [_settable(fmu, name, fixed) for name in names]
+        self._start_rows = [k for k, v in enumerate(self._free) if v.causality != "input"]
+        offsets = [v.name for v in self._free if v.causality == "input"]
+        self._inputs = list(dict.fromkeys([*logged, *offsets]))
+        self._logged = self._logged_inputs(trajectories)
+        constants = [_settable(fmu, name, {}) for name in fixed]
+        self._variables = tuple([self._free[k] for k in self._start_rows] + constants)
+        self._constants = [checked_value(v, fixed[v.name]) for v in constants]
+        spec = PoolSpec(_inputs(fmu, self._inputs), _outputs(fmu, self.outputs), step)
+        self._pool = make_pool(fmu, spec, num_sets * len(trajectories), logger, backend)
+
+    def close(self) -> None:
+        """Free all instances."""
+        self._pool.close()
+
+    def simulate(self, values: FloatArray) -> list[FloatArray]:
+        """Simulate every trajectory under every set of values.
+
+        Args:
+            values: Shape (names, sets, trajectories).
+
+        Returns:
+            For each trajectory the outputs at its sampling instants, shape (sets, n, outputs);
+            NaN where a simulation failed.
+        """
+        num_sets = values.shape[1]
+        record = self._run(values.reshape(len(values), -1))
+        record = record.reshape(*record.shape[:2], num_sets, len(self._grids))
+        return [grid.sample(record[..., w]) for w, grid in enumerate(self._grids)]
+
+    def _note(self, failed: MaskArray) -> MaskArray:
+        """Keep the reason of the first failure."""
+        if failed.any():
+            self.failure = self._pool.failure(int(failed.argmax()))
+        return failed
+
+    def _run(self, values: FloatArray) -> FloatArray:
+        """Return the outputs at all steps, shape (steps + 1, outputs, columns of the values)."""
+        size, count = self._pool.num_instances, values.shape[1]
+        active = np.arange(size) < count
+        starts, offsets = self._arrange(values, size)
+        outputs, statuses = self._pool.reset(self._variables, starts, active)
+        record = np.empty((len(self._logged) + 1, len(outputs), count))
+        record[0] = outputs[:, :count]
+        failed = self._note(active & (statuses > WARNING))
+        ends = np.tile([grid.num_steps for grid in self._grids], size // len(self._grids))
+        for step, inputs in enumerate(self._logged):
+            skip = ~active | failed | (ends <= step)
+            everywhere = np.tile(inputs, size // len(self._grids))
+            outputs, statuses = self._pool.step(everywhere + offsets, skip)
+            record[step + 1] = outputs[:, :count]
+            failed |= self._note(~skip & (statuses > WARNING))
+        record[:, :, failed[:count]] = np.nan
+        return record
+
+    def _arrange(self, values: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
+        """Sort the values into start values and offsets of inputs, a column for each instance."""
+        starts = np.zeros((len(self._variables), size))
+        starts[len(self._start_rows) :] = np.reshape(self._constants, (-1, 1))
+        starts[: len(self._start_rows), : values.shape[1]] = values[self._start_rows]
+        offsets = np.zeros((len(self._inputs), size))
+        for variable, row in zip(self._free, values, strict=True):
+            if variable.causality == "input":
+                offsets[self._inputs.index(variable.name), : len(row)] = row
+        return starts, offsets
+
+    def _logged_inputs(self, trajectories: Sequence[Trajectory]) -> FloatArray:
+        """Return the inputs at each step, shape (steps, inputs, trajectories)."""
+        steps = max(grid.num_steps for grid in self._grids)
+        logged = np.zeros((steps, len(self._inputs), len(trajectories)))
+        for w, (trajectory, grid) in enumerate(zip(trajectories, self._grids, strict=True)):
+            for name, signal in trajectory.inputs.items():
+                logged[: grid.num_steps, self._inputs.index(name), w] = signal[grid.held]
+        return logged
+
+
+class _Grid:
+    """The steps of one trajectory, and the way back to its sampling instants.
+
+    Args:
+        trajectory: Of n samples.
+        step: Step size in seconds.
+
+    Attributes:
+        num_steps: Number of steps until the last sample is reached; at least three, as a cubic
+            needs.
+        held: The sample whose input holds during each step, shape (num_steps,).
+    """
+
+    def __init__(self, trajectory: Trajectory, step: float) -> None:
+        position = (trajectory.time - trajectory.time[0]) / step
+        whole = np.round(position)
+        position = np.where(np.abs(position - whole) < 1e-6, whole, position)
+        self.num_steps = max(3, int(np.ceil(position[-1])))
+        self.held = np.searchsorted(position, np.arange(self.num_steps), side="right") - 1
+        first = np.clip(np.floor(position).astype(int) - 1, 0, self.num_steps - 3)
+        self._points = first[:, np.newaxis] + np.arange(4)
+        self._weights = _lagrange_weights(position - first)
+
+    def sample(self, record: FloatArray) -> FloatArray:
+        """Interpolate.
+
+        Args:
+            record: Outputs at each step, shape (steps + 1, k, sets).
+
+        Returns:
+            Outputs at the sampling instants, shape (sets, n, k).
+        """
+        sampled = np.einsum("np,npks->snk", self._weights, record[self._points])
+        return np.ascontiguousarray(sampled)
+
+
+def _lagrange_weights(x: FloatArray) -> FloatArray:
+    """Return the weights of the points 0, 1, 2, 3 in the cubic at x, shape (n, 4)."""
+    points = np.arange(4.0)
+    weights = np.ones((len(x), 4))
+    for j in range(4):
+        for m in range(4):
+            if m != j:
+                weights[:, j] *= (x - points[m]) / (points[j] - points[m])
+    return weights
+
+
+def median_interval(trajectories: Sequence[Trajectory]) -> float:
+    """The median sampling interval of the trajectories, in seconds.
+
+    Rounded to a nanosecond, so that sampling instants that were rounded give no odd step size.
+    """
+    intervals = np.concatenate([np.diff(trajectory.time) for trajectory in trajectories])
+    return round(float(np.median(intervals)), 9) or float(np.median(intervals))
+
+
+def _settable(fmu: FMU, name: str, fixed: Mapping[str, float | str]) -> Variable:
+    variable = fmu.variable(name)
+    if not (variable.numeric and variable.settable_at_start):
+        raise ConfigError(f"{name!r} is no numeric parameter, start value or input of the FMU")
+    if name in fixed:
+        raise ConfigError(f"{name!r} is both fixed and to be fitted")
+    return variable
+
+
+def _inputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:
+    for name in names:
+        if fmu.variable(name).causality != "input":
+            raise ConfigError(f"{name!r} was logged as an input, but is none of the FMU")
+    return tuple(map(fmu.variable, names))
+
+
+def _outputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:
+    for name in names:
+        if not fmu.variable(name).numeric:
+            raise ConfigError(f"{name!r} cannot be compared with a measurement: not a number")
+    return tuple(map(fmu.variable, names))

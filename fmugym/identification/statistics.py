@@ -1,0 +1,107 @@
+"""Covariances of estimates, and the intervals that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fmugym.distributions import Normal
+from fmugym.errors import ConfigError
+from fmugym.identification._scipy import scipy_module
+from fmugym.pool.base import FloatArray, MaskArray
+
+__all__ = [
+    "Inverse",
+    "confidence_intervals",
+    "information_inverse",
+    "newey_west",
+    "normal_distributions",
+]
+
+RANK_TOLERANCE = 1e-9
+"""Singular values below this fraction of the largest are taken for zero."""
+
+
+class Inverse(NamedTuple):
+    """The inverse of an information matrix.
+
+    Attributes:
+        matrix: The (pseudo-)inverse of J' J, shape (k, k).
+        undetermined: The parameters that the data say nothing of, shape (k,).
+    """
+
+    matrix: FloatArray
+    undetermined: MaskArray
+
+
+def information_inverse(jacobian: FloatArray) -> Inverse:
+    """Invert J' J by a singular value decomposition of J with columns of length one.
+
+    Args:
+        jacobian: Of the residuals, shape (n, k).
+    """
+    lengths = np.linalg.norm(jacobian, axis=0)
+    safe = np.where(lengths > 0, lengths, 1.0)
+    _, values, rows = np.linalg.svd(jacobian / safe, full_matrices=False)
+    kept = values > RANK_TOLERANCE * values.max(initial=0.0)
+    root = rows[kept] / values[kept, np.newaxis] / safe
+    undetermined = (np.abs(rows[~kept]) > 1e-6).any(axis=0) | (lengths == 0)
+    return Inverse(root.T @ root, undetermined)
+
+
+def newey_west(scores: Sequence[FloatArray], lags: int) -> FloatArray:
+    """Sum the scores' autocovariances with Bartlett's weights.
+
+    Newey and West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation
+    consistent covariance matrix", Econometrica 55 (1987).
+
+    Args:
+        scores: Regressors times residuals, an array (n, k) for each experiment.
+        lags: The largest lag with a weight, in samples.
+
+    Returns:
+        The covariance of the scores' sum, shape (k, k).
+    """
+    total = sum(score.T @ score for score in scores)
+    for lag in range(1, lags + 1):
+        crossed = sum(score[lag:].T @ score[:-lag] for score in scores if len(score) > lag)
+        total = total + (1 - lag / (lags + 1)) * (crossed + np.transpose(crossed))
+    return np.asarray(total)
+
+
+def confidence_intervals(
+    values: Mapping[str, float], errors: Mapping[str, float], freedom: int, level: float
+) -> dict[str, tuple[float, float]]:
+    """Compute intervals from Student's t distribution.
+
+    Args:
+        values: Estimates by name.
+        errors: Their standard errors by name.
+        freedom: Degrees of freedom.
+        level: Probability that an interval covers the true value, between 0 and 1.
+
+    Returns:
+        Lower and upper end by name.
+    """
+    if not 0 < level < 1:
+        raise ConfigError(f"the level of confidence must lie between 0 and 1, got {level!r}")
+    factor = float(scipy_module("stats").t.ppf(0.5 + level / 2, freedom))
+    return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in values.items()}
+
+
+def normal_distributions(
+    values: Mapping[str, float],
+    errors: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]],
+) -> dict[str, Normal]:
+    """Make a truncated normal distribution of every estimate.
+
+    Raises:
+        ConfigError: If the data did not determine one of them.
+    """
+    for name, error in errors.items():
+        if not np.isfinite(error):
+            raise ConfigError(f"{name!r} has no distribution: the data do not determine it")
+    return {name: Normal(v, errors[name], *bounds[name]) for name, v in values.items()}
