@@ -1,0 +1,42 @@
+"""A simulated lab of pendulum cells with the client of the CloudPendulum lab.
+
+A program written for the lab runs here after one import was changed::
+
+    from fmugym.lab import CellType, Client
+
+    client = Client()
+    gym_token = client.start_gym("any text", 30, [CellType.SINGLE])
+    token, _ = client.start_episode(gym_token, "SimplePendulum", 5, initial_position=[1.0])
+    client.set_torque(0.01, token)
+    print(client.get_position(token))
+    client.stop_gym(gym_token)
+
+`Lab` makes labs of other kinds: ``Lab("ideal")`` has cells without friction, noise and delay,
+``Lab(clock=ManualClock())`` has a time that moves by hand.
+"""
+
+from fmugym.lab.client import Client
+from fmugym.lab.clock import Clock, ManualClock, RealClock
+from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
+from fmugym.lab.errors import LabError
+from fmugym.lab.lab import Lab, current_lab
+from fmugym.lab.presets import HARDWARE, IDEAL, Options
+from fmugym.lab.users import User
+
+__all__ = [
+    "HARDWARE",
+    "IDEAL",
+    "ActuatorInfo",
+    "CellInfo",
+    "CellType",
+    "Client",
+    "Clock",
+    "Lab",
+    "LabError",
+    "ManualClock",
+    "Options",
+    "RealClock",
+    "User",
+    "UserInfo",
+    "current_lab",
+]

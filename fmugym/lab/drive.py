@@ -1,0 +1,63 @@
+"""The drive of a cell: impedance control of each joint, within the limits of its torque."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fmugym.lab.presets import Options
+
+__all__ = ["Drive"]
+
+
+class Drive:
+    """The drive's control law, tau = kp (q* - q) + kd (qd* - qd) + tau_ff, for each joint.
+
+    Hardware evaluates it at 40 kHz, here it is ``Options.drive_step``. Holding a spring's torque
+    over a step would pump energy into the joint (a damping of -kp step / 2), so the angle is taken
+    in the middle of the step, where the present velocity leads to.
+
+    Args:
+        options: The limits and the step.
+        driven: Which joints have torque.
+
+    Attributes:
+        position: q* of each joint, in rad.
+        velocity: qd* of each joint, in rad/s.
+        torque: tau_ff of each joint, in N m.
+        kp: Of each joint, in N m/rad.
+        kd: Of each joint, in N m s/rad.
+    """
+
+    def __init__(self, options: Options, driven: Sequence[bool]) -> None:
+        zeros = [0.0] * len(driven)
+        self.position, self.velocity, self.torque = zeros[:], zeros[:], zeros[:]
+        self.kp, self.kd = zeros[:], zeros[:]
+        largest = options.torque_limit if options.saturate_torque else options.peak_torque
+        self._limits = [largest if is_driven else 0.0 for is_driven in driven]
+        self._ahead = 0.5 * options.drive_step
+
+    def evaluate(self, position: Sequence[float], velocity: Sequence[float]) -> list[float]:
+        """Return the torque of each joint over the next step, in N m.
+
+        Args:
+            position: True angles, in rad.
+            velocity: True angular velocities, in rad/s.
+        """
+        ahead = self._ahead
+        return [
+            min(
+                max(kp * (aim - q - v * ahead) + kd * (rate - v) + feed, -limit),
+                limit,
+            )
+            for q, v, kp, aim, kd, rate, feed, limit in zip(
+                position,
+                velocity,
+                self.kp,
+                self.position,
+                self.kd,
+                self.velocity,
+                self.torque,
+                self._limits,
+                strict=True,
+            )
+        ]

@@ -1,0 +1,96 @@
+"""The types of experiments, and the FMUs that stand for the cells they run on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from fmugym.lab.data import CellType
+
+__all__ = ["EXPERIMENTS", "PLANTS", "Experiment", "Plant"]
+
+_UNLIMITED_TORQUE: Final = 10.0  # N m; the lab's drive limits it, disturbances come on top
+_UNLIMITED_VELOCITY: Final = 1000.0  # rad/s; the lab ends a session long before
+
+
+@dataclass(frozen=True)
+class Plant:
+    """An FMU and the names of what the lab reads and writes, joint by joint.
+
+    Attributes:
+        model: The name of the bundled FMU.
+        torques: Inputs, in N m.
+        positions: Outputs, in rad, 0 hanging.
+        velocities: Outputs, in rad/s.
+        start_positions: Parameters, in rad.
+        parameters: More parameters and their values.
+        coulomb_friction: The parameter that ``Options.coulomb_friction`` sets, if any.
+        joint_names: What the joints are called.
+    """
+
+    model: str
+    torques: tuple[str, ...]
+    positions: tuple[str, ...]
+    velocities: tuple[str, ...]
+    start_positions: tuple[str, ...]
+    parameters: Mapping[str, float]
+    coulomb_friction: str | None
+    joint_names: tuple[str, ...]
+
+    @property
+    def joints(self) -> int:
+        """The number of joints."""
+        return len(self.torques)
+
+
+PLANTS: Final = {
+    CellType.SINGLE: Plant(
+        model="Pendulum",
+        torques=("tau",),
+        positions=("q",),
+        velocities=("q_dot",),
+        start_positions=("q_0",),
+        parameters={"tau_max": _UNLIMITED_TORQUE, "theta_dot_max": _UNLIMITED_VELOCITY, "g": 9.81},
+        coulomb_friction="c",
+        joint_names=("pivot",),
+    ),
+    CellType.DOUBLE: Plant(
+        model="DoublePendulum",
+        torques=("tau1", "tau2"),
+        positions=("q1", "q2"),
+        velocities=("q1_dot", "q2_dot"),
+        start_positions=("q1_0", "q2_0"),
+        parameters={
+            "tau_max1": _UNLIMITED_TORQUE,
+            "tau_max2": _UNLIMITED_TORQUE,
+            "q_dot_max": _UNLIMITED_VELOCITY,
+        },
+        coulomb_friction=None,
+        joint_names=("shoulder", "elbow"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A type of experiment.
+
+    Attributes:
+        cell_type: The kind of cell it needs.
+        driven: Which joints have torque.
+        parameters: Parameters of the plant it changes, and their values.
+    """
+
+    cell_type: CellType
+    driven: tuple[bool, ...]
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+EXPERIMENTS: Final = {
+    "DoubleIntegrator": Experiment(CellType.SINGLE, (True,), {"g": 0.0}),
+    "SimplePendulum": Experiment(CellType.SINGLE, (True,)),
+    "DoublePendulum": Experiment(CellType.DOUBLE, (True, True)),
+    "Acrobot": Experiment(CellType.DOUBLE, (False, True)),
+    "Pendubot": Experiment(CellType.DOUBLE, (True, False)),
+}

@@ -1,0 +1,183 @@
+"""Pictures of cells, alone and side by side."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.lab.data import CellType
+from fmugym.rendering import (
+    Canvas,
+    PendulumFrame,
+    PendulumScene,
+    Point,
+    Renderer,
+    World,
+    palette,
+)
+from fmugym.rendering._pygame import pygame
+from fmugym.rendering.canvas import direction
+from fmugym.rendering.window import Window
+
+__all__ = ["ArmScene", "CellFrame", "CellPicture", "CellScene", "LiveView"]
+
+_THICKNESS: Final = 0.09  # of a link, in lengths of it
+
+_drawing = threading.Lock()
+"""One picture at a time: pygame's fonts are not made for threads."""
+
+
+@dataclass(frozen=True)
+class CellFrame:
+    """One moment of a cell.
+
+    Args:
+        position: Angle of each joint, in rad, 0 hanging; the elbow's from the upper link on.
+        torque: Of each motor, in N m, counter-clockwise positive.
+        caption: What is written above.
+    """
+
+    position: Sequence[float]
+    torque: Sequence[float]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class ArmScene:
+    """Two links in series and the torques at their joints as curved arrows.
+
+    Args:
+        torque_limit: Torque whose arrow sweeps 150 degrees, in N m.
+    """
+
+    torque_limit: float
+    world = World(-1.5, -1.4, 1.5, 1.75)
+
+    def draw(self, canvas: Canvas, frame: CellFrame) -> None:
+        """Draw the circle of the tip, the torques and the links."""
+        canvas.ring((0.0, 0.0), 1.0, 0.014, palette.FAINT)
+        start: Point = (0.0, 0.0)
+        angle = -math.pi / 2
+        for q, torque in zip(frame.position, frame.torque, strict=True):
+            angle += q
+            self._draw_torque(canvas, start, angle, torque)
+            start = self._draw_link(canvas, start, angle)
+
+    def _draw_torque(self, canvas: Canvas, joint: Point, angle: float, torque: float) -> None:
+        sweep = math.radians(150.0) * min(max(torque / self.torque_limit, -1.0), 1.0)
+        begin = angle + math.copysign(0.15, torque)
+        canvas.arc_arrow(joint, 0.3, begin, sweep, 0.06, palette.ACCENT)
+
+    def _draw_link(self, canvas: Canvas, joint: Point, angle: float) -> Point:
+        along = direction(angle)
+        tip = (joint[0] + 0.5 * along[0], joint[1] + 0.5 * along[1])
+        canvas.line(joint, tip, _THICKNESS, palette.STEEL)
+        canvas.circle(joint, 0.09, palette.INK)
+        canvas.circle(tip, 0.09, palette.INK)
+        return tip
+
+
+@dataclass(frozen=True)
+class CellScene:
+    """A cell with its caption.
+
+    Args:
+        cell_type: The kind of cell.
+        torque_limit: Torque whose arrow sweeps 150 degrees, in N m.
+    """
+
+    cell_type: CellType
+    torque_limit: float
+    world = World(-1.5, -1.4, 1.5, 1.75)
+
+    def draw(self, canvas: Canvas, frame: CellFrame) -> None:
+        """Draw the arm, and the caption in the upper left corner."""
+        if self.cell_type is CellType.SINGLE:
+            pendulum = PendulumFrame(frame.position[0] - math.pi, frame.torque[0])
+            PendulumScene(self.torque_limit).draw(canvas, pendulum)
+        else:
+            ArmScene(self.torque_limit).draw(canvas, frame)
+        height = canvas.size[1]
+        canvas.caption((height // 20, height // 20), frame.caption, height // 12, palette.MUTED)
+
+
+class CellPicture:
+    """Draws one cell.
+
+    Args:
+        cell_id: Its number, for the caption.
+        cell_type: Its kind.
+        torque_limit: Torque whose arrow sweeps 150 degrees, in N m.
+    """
+
+    def __init__(self, cell_id: int, cell_type: CellType, torque_limit: float) -> None:
+        self._cell_id = cell_id
+        self._scene = CellScene(cell_type, torque_limit)
+        self._renderer: Renderer[CellFrame] | None = None
+
+    def draw(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        time: float,
+        size: tuple[int, int],
+    ) -> npt.NDArray[np.uint8]:
+        """Draw one moment.
+
+        Args:
+            position: Angle of each joint, in rad.
+            torque: Of each motor, in N m.
+            time: Time of the session, in s.
+            size: Width and height of the picture, in pixels.
+
+        Returns:
+            An array of shape (height, width, 3).
+        """
+        with _drawing:
+            if self._renderer is None or self._renderer.size != size:
+                self._renderer = Renderer(self._scene, size)
+            caption = f"cell {self._cell_id}   {time:.2f} s"
+            picture = self._renderer.render(CellFrame(position, torque, caption))
+        assert picture is not None
+        return picture
+
+
+class LiveView:
+    """The cells of a lease side by side, as arrays or in a window.
+
+    Args:
+        pictures: One of each cell, from left to right.
+        height: Of the picture, in pixels.
+    """
+
+    def __init__(self, pictures: Sequence[CellPicture], height: int = 240) -> None:
+        self._pictures, self._height = pictures, height
+        self._window: Window | None = None
+
+    def draw(
+        self, moments: Sequence[tuple[Sequence[float], Sequence[float], float]]
+    ) -> npt.NDArray[np.uint8]:
+        """Draw one moment of each cell: angles in rad, torques in N m, time in s."""
+        size = (self._height, self._height)
+        pairs = zip(self._pictures, moments, strict=True)
+        return np.concatenate([picture.draw(*moment, size) for picture, moment in pairs], axis=1)
+
+    def show(self, picture: npt.NDArray[np.uint8]) -> None:
+        """Show a picture in the window, at most 25 a second."""
+        size = (picture.shape[1], picture.shape[0])
+        if self._window is None:
+            self._window = Window(size, "fmugym.lab")
+        if not self._window.is_closed:
+            surface = pygame.image.frombuffer(picture.tobytes(), size, "RGB")
+            self._window.show(surface, 25)
+
+    def close(self) -> None:
+        """Close the window; more than one call is fine."""
+        if self._window is not None:
+            self._window.close()

@@ -1,0 +1,106 @@
+"""What the drive tells of its joints: late, coarse, noisy, and only every 2 ms anew."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fmugym.lab.presets import Options
+
+__all__ = ["Sample", "Sensors"]
+
+_BLOCK = 64  # random numbers drawn at once
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What was measured at one time.
+
+    Attributes:
+        time: Time of the session, in s.
+        position: Of each joint, in rad.
+        velocity: Of each joint, in rad/s.
+        torque: Of each motor, in N m.
+    """
+
+    time: float
+    position: list[float]
+    velocity: list[float]
+    torque: list[float]
+
+
+class Sensors:
+    """The sensors of one cell.
+
+    Args:
+        options: What is wrong with them.
+        joints: The number of joints.
+        rng: Where the noise comes from.
+
+    Attributes:
+        sample: The newest sample, which every reading repeats until the next one.
+    """
+
+    def __init__(self, options: Options, joints: int, rng: np.random.Generator) -> None:
+        self._options, self._joints, self._rng = options, joints, rng
+        self._step = options.drive_step
+        self._period = max(1, round(options.sample_period / self._step))
+        lag = options.velocity_lag
+        self._gain = 1.0 if lag == 0.0 else -math.expm1(-self._step / lag)
+        self._noise: list[list[float]] = []
+        self.sample = Sample(0.0, [0.0] * joints, [0.0] * joints, [0.0] * joints)
+
+    def restart(self, position: Sequence[float]) -> None:
+        """Begin a session with joints at rest, positions in rad."""
+        self._filtered = [0.0] * self._joints
+        self._count = 0
+        self._take(position, [0.0] * self._joints)
+
+    def observe(
+        self, position: Sequence[float], velocity: Sequence[float], torque: Sequence[float]
+    ) -> None:
+        """Follow the joints over one step of the drive.
+
+        Args:
+            position: True angles, in rad.
+            velocity: True angular velocities, in rad/s.
+            torque: True torques of the motors, in N m.
+        """
+        gain = self._gain
+        self._filtered = [f + gain * (v - f) for f, v in zip(self._filtered, velocity, strict=True)]
+        self._count += 1
+        if self._count >= self._due:
+            self._take(position, torque)
+
+    def _take(self, position: Sequence[float], torque: Sequence[float]) -> None:
+        options, (of_velocity, of_torque, early) = self._options, self._draw()
+        self.sample = Sample(
+            self._count * self._step,
+            list(map(_quantized, position, options.encoder_step)),
+            [
+                v + sigma * x
+                for v, sigma, x in zip(
+                    self._filtered, options.velocity_noise, of_velocity, strict=False
+                )
+            ],
+            [tau + options.torque_noise * x for tau, x in zip(torque, of_torque, strict=True)],
+        )
+        is_early = self._period > 1 and early < options.early_sample_share
+        self._due = self._count + (self._period // 2 if is_early else self._period)
+
+    def _draw(self) -> tuple[list[float], list[float], float]:
+        """Return normal numbers for velocity and torque and an even one from 0 to 1."""
+        n = self._joints
+        if not self._noise:
+            normal = self._rng.standard_normal((_BLOCK, 2 * n))
+            even = self._rng.random((_BLOCK, 1))
+            self._noise = np.concatenate([normal, even], axis=1).tolist()
+        row = self._noise.pop()
+        return row[:n], row[n : 2 * n], row[-1]
+
+
+def _quantized(position: float, step: float) -> float:
+    return step * round(position / step) if step else position

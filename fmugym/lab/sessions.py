@@ -1,0 +1,171 @@
+"""Leases, and the sessions that run on their cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from fmugym.lab.cell import Cell
+from fmugym.lab.errors import LabError
+from fmugym.lab.pictures import LiveView
+from fmugym.lab.recording import Recording
+from fmugym.lab.users import Account
+
+__all__ = ["Gym", "Session"]
+
+
+@dataclass(eq=False)
+class Gym:
+    """A lease of several cells.
+
+    Attributes:
+        token: The gym token.
+        account: Whose it is.
+        cells: The cells.
+        ends: When it ends by itself, in s of the lab's time.
+        ended: Why it ended, or None.
+        is_stopped: Whether it was stopped by its user.
+        view: Its cells side by side, or None while nobody looks.
+    """
+
+    token: str
+    account: Account
+    cells: list[Cell]
+    ends: float
+    ended: str | None = None
+    is_stopped: bool = False
+    view: LiveView | None = None
+    kind: ClassVar[str] = "gym"
+
+    def bring_to(self, now: float) -> None:
+        """End the lease if its time is over, in s of the lab's time."""
+        if self.ended is None and now >= self.ends:
+            self.end("its time is over")
+
+    def end(self, reason: str) -> None:
+        """End the lease."""
+        if self.ended is None:
+            self.ended = f"the gym has ended: {reason}"
+            if self.view is not None:
+                self.view.close()
+
+    def stop(self) -> None:
+        """End the lease for its user; see `Session.stop`."""
+        _stop(self)
+
+
+@dataclass(eq=False)
+class Session:
+    """One use of one cell: an experiment, or an episode of a gym.
+
+    Attributes:
+        token: The session or episode token.
+        cell: The cell.
+        experiment: The type of the experiment.
+        began: When it began, in s of the lab's time.
+        length: How long it may last, in s.
+        heartbeat: How long there may be no request, in s.
+        gym: The lease it belongs to, or None.
+        recording: Of the cell, or None.
+        ended: Why it ended, or None.
+        is_stopped: Whether it was stopped by its user.
+        duration: How long it lasted, in s, once it has ended.
+        log: What happened, one line each.
+    """
+
+    token: str
+    cell: Cell
+    experiment: str
+    began: float
+    length: float
+    heartbeat: float
+    gym: Gym | None
+    recording: Recording | None
+    ended: str | None = None
+    is_stopped: bool = False
+    duration: float = 0.0
+    log: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._last_request = self.began
+        self.note(f"{self.experiment} on cell {self.cell.cell_id}, {self.length:g} s")
+
+    @property
+    def kind(self) -> str:
+        """What error texts call it."""
+        return "experiment" if self.gym is None else "episode"
+
+    def note(self, text: str) -> None:
+        """Add a line to the log."""
+        if len(self.log) < 1000:
+            self.log.append(f"{self.cell.time:9.4f} s  {text}")
+
+    def request(self, now: float) -> None:
+        """Bring the cell to the present for a request, which is a heartbeat.
+
+        Args:
+            now: The lab's time, in s.
+
+        Raises:
+            LabError: If the session has ended.
+        """
+        self.bring_to(now)
+        if self.ended is not None:
+            raise LabError(self.ended)
+        self._last_request = now
+
+    def bring_to(self, now: float) -> None:
+        """Bring the cell to the present, and end the session if it must not last until then.
+
+        Args:
+            now: The lab's time, in s.
+        """
+        if self.ended is not None:
+            return
+        deadline, reason = self._deadline()
+        self.cell.advance(min(now, deadline) - self.began)
+        if self.cell.fault is not None:
+            self._end(self.cell.fault.text)
+        elif now >= deadline:
+            self.end(reason)
+
+    def end(self, reason: str) -> None:
+        """Bring the cell to rest and free it; nothing happens if that was done before.
+
+        Args:
+            reason: What later requests are told.
+        """
+        self._end(f"the {self.kind} has ended: {reason}")
+
+    def _end(self, reason: str) -> None:
+        if self.ended is not None:
+            return
+        self.note(reason)
+        self.ended, self.duration = reason, self.cell.time
+        if self.recording is not None:
+            self.recording.cut(self.duration)
+        self.cell.park()
+
+    def stop(self) -> None:
+        """End the session for its user, which is no error if it has ended by itself.
+
+        Raises:
+            LabError: If it was stopped before.
+        """
+        _stop(self)
+
+    def _deadline(self) -> tuple[float, str]:
+        deadlines = [
+            (self.began + self.length, f"its time of {self.length:g} s is over"),
+            (self._last_request + self.heartbeat, f"no request for {self.heartbeat:g} s"),
+        ]
+        if self.gym is not None:
+            deadlines.append((self.gym.ends, "the lease of its gym is over"))
+        return min(deadlines)
+
+
+def _stop(owner: Gym | Session) -> None:
+    if owner.is_stopped:
+        raise LabError(f"the {owner.kind} was stopped before")
+    owner.is_stopped = True
+    owner.end("it was stopped")

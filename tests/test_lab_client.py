@@ -1,0 +1,556 @@
+"""The client's methods, one by one: what they give, take and refuse."""
+
+import logging
+from datetime import timedelta
+
+import numpy as np
+import pytest
+from lab_tools import TOKEN, experiment, track
+
+from fmugym import ConfigError, FMUGymError
+from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, User, current_lab
+from fmugym.lab.disturbance import (
+    StateDependentPositionDisturbance,
+    StateDependentTorqueDisturbance,
+    TimedPositionDisturbance,
+    TimedTorqueDisturbance,
+)
+
+DOUBLES = ["DoublePendulum", "Acrobot", "Pendubot"]
+
+
+@pytest.fixture(name="lab")
+def fixture_lab():
+    with Lab("ideal", clock=ManualClock(), seed=0) as lab:
+        yield lab
+
+
+@pytest.fixture(name="single")
+def fixture_single(lab):
+    return experiment(lab)
+
+
+@pytest.fixture(name="double")
+def fixture_double(lab):
+    return experiment(lab, "DoublePendulum")
+
+
+def strict(**changes):
+    user = User(name="Ada", **changes)
+    return Lab("ideal", clock=ManualClock(), users={"secret": user, "plain": User(gym=False)})
+
+
+class TestImports:
+    def test_modules_are_named_as_those_of_the_real_client(self):
+        from fmugym.lab.client import Client as SameClient
+        from fmugym.lab.data import CellType as SameCellType
+
+        assert SameClient is Client
+        assert SameCellType is CellType
+
+    def test_errors_are_runtime_errors_of_this_package(self):
+        assert issubclass(LabError, RuntimeError)
+        assert issubclass(LabError, FMUGymError)
+
+
+class TestWhichLab:
+    def test_default_lab_is_made_once(self):
+        assert Client().lab is Client().lab is current_lab()
+        assert Client().lab.options.sample_period == 0.002  # the preset hardware
+
+    def test_default_lab_is_made_anew_after_a_close(self):
+        first = Client().lab
+        first.close()
+        assert Client().lab is not first
+
+    def test_block_and_argument_select(self, lab):
+        with Lab("ideal", clock=ManualClock()) as inner:
+            assert Client().lab is inner
+            assert Client(lab).lab is lab
+        assert Client().lab is lab
+
+    def test_end_of_the_outermost_block_closes(self):
+        lab = Lab("ideal", clock=ManualClock())
+        with lab, lab:
+            pass
+        with pytest.raises(LabError, match="the lab is closed"):
+            Client(lab).get_cells(TOKEN)
+        lab.close()
+
+    def test_requests_after_the_close_are_refused(self, lab):
+        client, token = experiment(lab)
+        lab.close()
+        for request in (client.get_position, client.stop_experiment):
+            with pytest.raises(LabError, match="closed"):
+                request(token)
+        with pytest.raises(LabError, match="closed"):
+            client.start_experiment(TOKEN, "SimplePendulum", 1)
+
+
+class TestOptions:
+    def test_unknown_preset(self):
+        with pytest.raises(ConfigError, match="unknown preset 'hardwear'; did you mean 'hardware'"):
+            Lab("hardwear")
+
+    def test_unknown_option(self):
+        with pytest.raises(ConfigError, match="did you mean 'heartbeat'"):
+            Lab(heart_beat=1.0)
+
+    @pytest.mark.parametrize("change", [{"heartbeat": -1}, {"get_time": (0.1, float("nan"))}])
+    def test_value_out_of_range(self, change):
+        with pytest.raises(ConfigError, match="must not be negative"):
+            Lab(**change)
+
+    def test_drive_step_out_of_range(self):
+        with pytest.raises(ConfigError, match=r"drive_step must be 0\.01 to 2 ms"):
+            Lab(drive_step=0.1)
+
+
+class TestUserInfo:
+    def test_has_all_fields(self, lab):
+        info = Client().get_user_info(TOKEN)
+        assert info.user_name == "guest"
+        assert info.number_of_attempts == 1000
+        assert info.max_experiment_length == 60.0
+        assert info.bucket_size == info.max_bucket_size == 20
+        assert info.refil_interval == 30.0
+        assert info.valid_until - info.valid_from == timedelta(days=365)
+        assert set(info.experiment_types) >= {"SimplePendulum", "Acrobot"}
+        assert info.max_gym_length == 3600.0
+        assert info.gym_bucket_size == info.gym_max_bucket_size == 20
+
+    def test_experiments_count_down_and_time_fills_up(self, lab):
+        client, token = experiment(lab)
+        client.stop_experiment(token)
+        info = client.get_user_info(TOKEN)
+        assert (info.number_of_attempts, info.bucket_size, info.gym_bucket_size) == (999, 19, 20)
+        lab.clock.advance(30.0)
+        info = client.get_user_info(TOKEN)
+        assert (info.number_of_attempts, info.bucket_size) == (999, 20)
+
+    def test_gyms_count_down_and_episodes_do_not(self, lab):
+        client = Client()
+        token = client.start_gym(TOKEN, 10, [CellType.SINGLE])
+        client.start_episode(token, "SimplePendulum", 1)
+        info = client.get_user_info(TOKEN)
+        assert (info.number_of_attempts, info.bucket_size, info.gym_bucket_size) == (1000, 20, 19)
+
+    def test_a_bucket_fills_up_bit_by_bit(self, lab):
+        client = Client()
+        for _ in range(5):
+            client.stop_experiment(client.start_experiment(TOKEN, "SimplePendulum", 1)[0])
+        sizes = []
+        for _ in range(4):
+            sizes.append(client.get_user_info(TOKEN).bucket_size)
+            lab.clock.advance(45.0)
+        assert sizes == [15, 16, 18, 19]
+
+    def test_users_do_not_share(self, lab):
+        experiment(lab)
+        assert Client().get_user_info("another").number_of_attempts == 1000
+
+    def test_no_attempts_left(self):
+        with strict(number_of_attempts=1):
+            client = Client()
+            client.start_experiment("secret", "SimplePendulum", 1)
+            with pytest.raises(LabError, match="'Ada' has no attempts left"):
+                client.start_experiment("secret", "SimplePendulum", 1)
+
+    def test_empty_buckets_say_when_to_try_again(self):
+        with strict(max_bucket_size=1, gym_max_bucket_size=1, refil_interval=10.0) as lab:
+            client = Client()
+            client.stop_experiment(client.start_experiment("secret", "SimplePendulum", 1)[0])
+            lab.clock.advance(2.5)
+            with pytest.raises(LabError, match="Too many requests, try again in 8 seconds"):
+                client.start_experiment("secret", "SimplePendulum", 1)
+            client.start_gym("secret", 5, [CellType.SINGLE])
+            with pytest.raises(LabError, match="Too many requests, try again in 10 seconds"):
+                client.start_gym("secret", 5, [CellType.SINGLE])
+            lab.clock.advance(7.6)
+            client.start_experiment("secret", "SimplePendulum", 1)
+
+
+class TestUserTokens:
+    @pytest.mark.parametrize("token", ["", None, 7])
+    def test_must_be_a_text(self, lab, token):
+        with pytest.raises(LabError, match="must be a text"):
+            Client().get_user_info(token)
+
+    def test_strict_lab_knows_its_users(self):
+        with strict():
+            assert Client().get_user_info("secret").user_name == "Ada"
+            with pytest.raises(LabError, match="unknown user token"):
+                Client().get_user_info("stranger")
+
+    def test_without_gym_permission(self):
+        with strict():
+            client = Client()
+            info = client.get_user_info("plain")
+            assert (info.max_gym_length, info.gym_bucket_size, info.gym_max_bucket_size) == (
+                0,
+                0,
+                0,
+            )
+            with pytest.raises(LabError, match="no gym permission"):
+                client.start_gym("plain", 5, [CellType.SINGLE])
+            client.start_experiment("plain", "SimplePendulum", 1)
+
+    def test_expire(self):
+        with strict(valid_for=100.0) as lab:
+            lab.clock.advance(101.0)
+            with pytest.raises(LabError, match="has expired"):
+                Client().get_cells("secret")
+
+    def test_experiment_types(self):
+        refused = pytest.raises(LabError, match=r"'Ada' may not start .* 'Acrobot'")
+        with strict(experiment_types=("SimplePendulum",)), refused:
+            Client().start_experiment("secret", "Acrobot", 1)
+
+
+class TestCells:
+    def test_of_the_default_lab(self, lab):
+        cells = Client().get_cells(TOKEN)
+        kinds = [cell.cell_type for cell in cells]
+        assert kinds.count(CellType.SINGLE) == 4
+        assert kinds.count(CellType.DOUBLE) == 2
+        assert len({cell.cell_id for cell in cells}) == 6
+
+    def test_can_be_chosen(self, lab):
+        client, token = experiment(lab, cell_id=103)
+        assert "cell 103" in client.get_logs(token)
+
+    @pytest.mark.parametrize("cell_id", [99, 201])
+    def test_must_fit(self, lab, cell_id):
+        with pytest.raises(LabError, match=f"no cell of type SINGLE and number {cell_id}"):
+            experiment(lab, cell_id=cell_id)
+
+    def test_numbers_can_be_chosen(self):
+        with Lab("ideal", clock=ManualClock(), cells={CellType.SINGLE: 9}):
+            assert len(Client().get_cells(TOKEN)) == 9
+            with pytest.raises(LabError, match="no cell of type DOUBLE for Acrobot"):
+                Client().start_experiment(TOKEN, "Acrobot", 1)
+
+
+class TestStartingGyms:
+    def test_token_has_19_digits(self, lab):
+        token = Client().start_gym(TOKEN, 10, [CellType.SINGLE])
+        assert isinstance(token, str)
+        assert token.isdecimal()
+        assert len(token) == 19
+
+    def test_livestream_is_logged_and_not_printed(self, lab, capsys, caplog):
+        with caplog.at_level(logging.INFO, "fmugym.lab"):
+            token = Client().start_gym(TOKEN, 10, [CellType.SINGLE, CellType.DOUBLE])
+        assert capsys.readouterr() == ("", "")
+        assert "livestream: fmugym-lab://cells/101+201" in caplog.text
+        assert token not in caplog.text
+        assert lab.livestream_url(token) == "fmugym-lab://cells/101+201"
+
+    def test_too_long(self, lab):
+        with pytest.raises(LabError, match="gym_time 7200 is outside the limits"):
+            Client().start_gym(TOKEN, 7200, [CellType.SINGLE])
+
+    def test_more_cells_than_there_are(self, lab):
+        with pytest.raises(LabError, match="has 4 cells of type SINGLE, not 5"):
+            Client().start_gym(TOKEN, 10, [CellType.SINGLE] * 5)
+
+    @pytest.mark.parametrize("cells", [[], ["single"], [1]])
+    def test_not_a_list_of_cell_types(self, lab, cells):
+        with pytest.raises(LabError, match="list of cell types"):
+            Client().start_gym(TOKEN, 10, cells)
+
+    def test_refused_requests_cost_nothing(self, lab):
+        client = Client()
+        with pytest.raises(LabError):
+            client.start_gym(TOKEN, 10, [CellType.SINGLE] * 5)
+        with pytest.raises(LabError):
+            client.start_experiment(TOKEN, "SimplePendulum", 1000)
+        info = client.get_user_info(TOKEN)
+        assert (info.number_of_attempts, info.bucket_size, info.gym_bucket_size) == (1000, 20, 20)
+
+
+class TestStartingSessions:
+    def test_gives_token_and_url(self, lab):
+        token, url = Client().start_experiment(TOKEN, "SimplePendulum", 5)
+        assert token.isdecimal()
+        assert len(token) == 19
+        assert url == "fmugym-lab://cells/101"
+
+    def test_blocks_through_the_preparation(self, lab):
+        client, token = experiment(lab, preparation_time=4.0, initial_position=[1.0])
+        assert lab.clock.time() == 4.0
+        assert client.get_position(token) == pytest.approx(1.0, abs=1e-12)
+
+    def test_positional_arguments_are_those_of_the_lab(self, lab):
+        client = Client()
+        token, _ = client.start_experiment(TOKEN, "SimplePendulum", 5.0, 1.0, False, [0.5, 0.0])
+        assert client.get_position(token) == pytest.approx(0.5)
+
+    def test_initial_state_of_two_joints(self, lab):
+        client, token = experiment(lab, "DoublePendulum", initial_state=[0.5, -0.2, 0.0, 0.0])
+        assert client.get_position(token) == pytest.approx([0.5, -0.2])
+
+    def test_arms_cannot_be_thrown(self, lab):
+        with pytest.raises(LabError, match="initial_position has 2 entries"):
+            experiment(lab, initial_state=[0.5, 1.0])
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"length": 61.0}, "61.0 is outside the limits"),
+            ({"length": 0.0}, "0.0 is outside the limits"),
+            ({"length": float("nan")}, "nan is outside the limits"),
+            ({"initial_position": [7.0]}, "initial_position 7.0 is outside the limits"),
+            ({"initial_position": [0.1, 0.2]}, "initial_position has 2 entries, .* 1 joints"),
+            ({"initial_position": ["up"]}, "must be a number for each joint"),
+            ({"preparation_time": -1.0}, "preparation_time -1.0 is outside the limits"),
+            ({"disturbances": "earthquake"}, "unknown disturbance preset 'earthquake'"),
+            ({"kind": "SimplePendlum"}, "did you mean 'SimplePendulum'"),
+        ],
+    )
+    def test_mistakes(self, lab, arguments, message):
+        with pytest.raises(LabError, match=message):
+            experiment(lab, **arguments)
+
+    def test_rate_limit(self):
+        with Lab("ideal", clock=ManualClock(), starts_per_window=3, start_window=10.0) as lab:
+            client = Client()
+            gym = client.start_gym(TOKEN, 60, [CellType.SINGLE])
+            for _ in range(2):
+                client.stop_episode(client.start_episode(gym, "SimplePendulum", 1)[0])
+                lab.clock.advance(1.0)
+            with pytest.raises(LabError, match="Too many requests, try again in 8 seconds"):
+                client.start_episode(gym, "SimplePendulum", 1)
+            lab.clock.advance(8.1)
+            client.start_episode(gym, "SimplePendulum", 1)
+
+
+class TestGetters:
+    def test_float_for_one_actuator(self, single):
+        client, token = single
+        for get in (client.get_position, client.get_velocity, client.get_torque):
+            assert type(get(token)) is float
+
+    @pytest.mark.parametrize("kind", DOUBLES)
+    def test_list_for_two(self, lab, kind):
+        client, token = experiment(lab, kind)
+        for get in (client.get_position, client.get_velocity, client.get_torque):
+            values = get(token)
+            assert type(values) is list
+            assert [type(value) for value in values] == [float, float]
+
+    def test_lists_are_the_callers_own(self, double):
+        client, token = double
+        client.get_position(token).clear()
+        assert len(client.get_position(token)) == 2
+
+    def test_actuator_info(self, lab, single):
+        client, token = single
+        (info,) = client.get_actuator_info(token)
+        assert (info.torque_limit, info.velocity_limit) == (0.15, 50.0)
+        client, token = experiment(lab, "Acrobot")
+        shoulder, elbow = client.get_actuator_info(token)
+        assert (shoulder.name, shoulder.torque_limit) == ("shoulder", 0.0)
+        assert (elbow.name, elbow.torque_limit) == ("elbow", 0.15)
+        assert "GL35" in str(info)
+
+    def test_logs(self, single):
+        client, token = single
+        client.set_impedance_controller_params([0.5], [0.01], token)
+        first, second = client.get_logs(token).splitlines()
+        assert "SimplePendulum on cell 101, 30 s" in first
+        assert "kp [0.5] N m/rad, kd [0.01] N m s/rad" in second
+
+
+class TestSetters:
+    @pytest.mark.parametrize("value", [0.02, [0.02], (0.02,), np.array([0.02]), np.float32(0.02)])
+    def test_one_actuator_takes_many_forms(self, lab, single, value):
+        client, token = single
+        client.set_torque(value, token)
+        lab.clock.advance(0.01)
+        assert client.get_torque(token) == pytest.approx(0.02)
+
+    def test_an_integer_is_a_number(self, single):
+        client, token = single
+        client.set_position(1, token)
+        client.set_impedance_controller_params(0, 0, token)
+
+    def test_none_leaves_a_joint_unchanged(self, lab, double):
+        client, token = double
+        client.set_torque([0.01, 0.02], token)
+        client.set_torque([None, -0.02], token)
+        lab.clock.advance(0.001)
+        assert client.get_torque(token) == pytest.approx([0.01, -0.02])
+        client.set_impedance_controller_params([0.1, None], [None, 0.01], token)
+        assert "kp [0.1, 0.0] N m/rad, kd [0.0, 0.01]" in client.get_logs(token)
+
+    @pytest.mark.parametrize("setter", ["set_position", "set_velocity", "set_torque"])
+    @pytest.mark.parametrize("value", [0.1, [0.1], [0.1, 0.1, 0.1], []])
+    def test_wrong_length_for_two(self, double, setter, value):
+        client, token = double
+        with pytest.raises(RuntimeError, match=r"has \d entries, the cell has 2 joints"):
+            getattr(client, setter)(value, token)
+
+    def test_wrong_length_for_one(self, single):
+        client, token = single
+        with pytest.raises(RuntimeError, match="has 2 entries, the cell has 1 joints"):
+            client.set_torque([0.1, 0.1], token)
+        with pytest.raises(RuntimeError, match="kd has 2 entries"):
+            client.set_impedance_controller_params([0.1], [0.1, 0.1], token)
+
+    @pytest.mark.parametrize("value", [float("nan"), [float("inf")], "much", [[]], {"a": 1}])
+    def test_not_a_number(self, single, value):
+        client, token = single
+        with pytest.raises(RuntimeError, match=r"must be|has 0 entries"):
+            client.set_torque(value, token)
+
+    def test_negative_gains(self, single):
+        client, token = single
+        with pytest.raises(RuntimeError, match="kp -1 is outside the limits"):
+            client.set_impedance_controller_params(-1.0, 0.0, token)
+
+    def test_clamped_to_the_limits(self, lab, single):
+        client, token = single
+        client.set_torque(-99.0, token)
+        lab.clock.advance(0.01)
+        assert client.get_torque(token) == -0.15
+
+    def test_refused_beyond_the_limits(self):
+        with Lab("ideal", clock=ManualClock(), clamp_setters=False) as lab:
+            client, token = experiment(lab)
+            with pytest.raises(RuntimeError, match=r"torque 0.2 is outside the limits of \+-0.15"):
+                client.set_torque(0.2, token)
+            with pytest.raises(RuntimeError, match="position -7 is outside the limits"):
+                client.set_position(-7.0, token)
+            with pytest.raises(RuntimeError, match="velocity 51 is outside the limits"):
+                client.set_velocity(51.0, token)
+            client.set_torque(0.15, token)
+
+    @pytest.mark.parametrize(("kind", "passive"), [("Acrobot", 0), ("Pendubot", 1)])
+    def test_passive_joints_get_no_torque(self, lab, kind, passive):
+        client, token = experiment(lab, kind)
+        client.set_torque([0.02, 0.02], token)
+        lab.clock.advance(0.001)
+        torque = client.get_torque(token)
+        assert torque[passive] == 0.0
+        assert torque[1 - passive] == 0.02
+
+
+def drive_on(lab, client, token, duration=5.0):
+    """Read until something is refused; returns the error."""
+    with pytest.raises(LabError) as refused:
+        track(lab, client, token, duration)
+    return refused.value
+
+
+class TestLimits:
+    def test_position(self, lab):
+        client, token = experiment(lab, "DoubleIntegrator", initial_position=[6.0])
+        client.set_torque(0.01, token)
+        text = str(drive_on(lab, client, token))
+        kind, value, explanation = text.split(";", 2)
+        assert kind == "PositionLimitViolation"
+        assert float(value.removeprefix("value=")) == pytest.approx(2 * np.pi, abs=0.01)
+        assert "Position Limit Violation" in explanation
+
+    def test_velocity(self):
+        with Lab("ideal", clock=ManualClock(), velocity_limit=5.0) as lab:
+            client, token = experiment(lab, initial_position=[-3.0])
+            text = str(drive_on(lab, client, token))
+        assert text.startswith("VelocityLimitViolation;value=5.0")
+        assert "Velocity Limit Violation" in text
+
+    def test_torque_saturates(self, lab, single):
+        client, token = single
+        client.set_position(1.0, token)
+        client.set_impedance_controller_params(100.0, 1.0, token)
+        lab.clock.advance(0.001)
+        assert client.get_torque(token) == 0.15
+
+    def test_torque_beyond_the_limit_where_it_does_not_saturate(self):
+        with Lab("ideal", clock=ManualClock(), saturate_torque=False) as lab:
+            client, token = experiment(lab)
+            client.set_position(1.0, token)
+            client.set_impedance_controller_params(100.0, 0.0, token)
+            text = str(drive_on(lab, client, token))
+        assert text.startswith("TorqueLimitViolation;value=0.45;Torque Limit Violation")
+
+    def test_a_violation_ends_the_session_and_frees_the_cell(self, lab):
+        client, token = experiment(lab, "DoubleIntegrator", initial_position=[6.2], cell_id=102)
+        client.set_torque(0.1, token)
+        first = drive_on(lab, client, token)
+        with pytest.raises(LabError) as second:
+            client.set_torque(0.0, token)
+        assert str(second.value) == str(first)
+        assert client.stop_experiment(token) == ""
+        client, token = experiment(lab, cell_id=102)
+        assert client.get_position(token) == 0.0
+
+    def test_a_fault_of_the_model_ends_the_session(self, lab):
+        client, token = experiment(lab)
+        cell = lab._bookings.cells[0]
+        cell._pool.inputs[:] = 0.0
+        cell.drive.torque[0] = float("nan")
+        cell.drive._limits[0] = float("nan")
+        lab.clock.advance(0.1)
+        with pytest.raises(LabError, match="the cell failed: "):
+            client.get_position(token)
+
+
+class TestDisturbances:
+    def test_torque_for_a_time(self, lab):
+        push = TimedTorqueDisturbance(start_time=1.0, duration=0.2, torque=[0.02])
+        client, token = experiment(lab, "DoubleIntegrator", disturbances=[push])
+        lab.clock.advance(1.0)
+        assert client.get_velocity(token) == 0.0
+        lab.clock.advance(0.1)
+        assert client.get_velocity(token) == pytest.approx(0.02 / 6e-4 * 0.1, rel=0.05)
+        assert client.get_torque(token) == 0.0  # the motor does not feel it
+        lab.clock.advance(0.1)
+        speed = client.get_velocity(token)
+        lab.clock.advance(0.1)
+        assert 0.9 * speed < client.get_velocity(token) < speed  # friction only
+
+    def test_preset(self, lab):
+        client, token = experiment(lab, disturbances="default_simple_pendulum")
+        track(lab, client, token, 4.9, 0.5)
+        assert client.get_position(token) == pytest.approx(0.0, abs=1e-12)
+        track(lab, client, token, 0.6, 0.2)
+        assert abs(client.get_position(token)) > 0.1
+
+    def test_position_at_a_time(self, lab):
+        pull = TimedPositionDisturbance(0.5, [0.8], duration=1.0)
+        client, token = experiment(lab, disturbances=pull)
+        track(lab, client, token, 1.4, 0.2)
+        assert client.get_position(token) == pytest.approx(0.72, abs=0.05)  # it sags
+
+    def test_pull_to_rest_by_default(self, lab):
+        pull = TimedPositionDisturbance(0.5, duration=1.0)
+        client, token = experiment(lab, initial_position=[1.0], disturbances=[pull])
+        track(lab, client, token, 1.4, 0.2)
+        assert client.get_position(token) == pytest.approx(0.0, abs=0.05)
+
+    def test_torque_at_a_position(self, lab):
+        push = StateDependentTorqueDisturbance([0.0], 0.1, [0.05], tolerance=0.2, earliest=0.5)
+        calm, quiet = experiment(lab, initial_position=[1.0])
+        client, token = experiment(lab, initial_position=[1.0], disturbances=[push])
+        for _ in range(20):
+            lab.clock.advance(0.05)
+            pair = client.get_velocity(token), calm.get_velocity(quiet)
+        assert abs(pair[0] - pair[1]) > 1.0
+
+    def test_position_at_a_position(self, lab):
+        pull = StateDependentPositionDisturbance([0.0], [0.5], duration=1.0)
+        client, token = experiment(lab, initial_position=[1.0], disturbances=[pull])
+        track(lab, client, token, 1.1, 0.1)
+        assert client.get_position(token) == pytest.approx(0.44, abs=0.05)
+
+    def test_pull_without_a_position(self, lab):
+        pull = StateDependentPositionDisturbance([0.0, 0.0], duration=1.0)
+        client, token = experiment(lab, "Acrobot", disturbances=[pull])
+        track(lab, client, token, 0.5, 0.1)
+        assert client.get_position(token) == pytest.approx([0.0, 0.0], abs=1e-6)
+
+    def test_wrong_length(self, lab):
+        with pytest.raises(LabError, match="torque has 2 entries for 1 joints"):
+            experiment(lab, disturbances=[TimedTorqueDisturbance(0.0, 1.0, [0.1, 0.1])])

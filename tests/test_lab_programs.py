@@ -1,0 +1,103 @@
+"""Whole programs in the lab: one in the form of the published tutorial, and the examples."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmugym.lab import Client, Lab, ManualClock
+
+HERE = Path(__file__).parent
+EXAMPLES = HERE.parent / "examples"
+LENGTH = 0.10  # m
+TOLERANCE = {"ideal": 0.015, "hardware": 0.03}
+
+each_preset = pytest.mark.parametrize("preset", TOLERANCE)
+
+
+def run(script, *arguments, folder, **environment):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", script, *map(str, arguments)],
+        cwd=folder,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+@pytest.fixture(name="identification")
+def fixture_identification(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import lab_identification
+
+    return lab_identification
+
+
+class TestIdentification:
+    @each_preset
+    @pytest.mark.parametrize("seed", range(4))
+    def test_finds_the_length(self, identification, preset, seed):
+        angles = np.random.default_rng(seed).uniform(-np.pi, np.pi, 12)
+        clock = ManualClock()
+        with Lab(preset, clock=clock, seed=seed):
+            swings = identification.collect("my token", angles, clock)
+            assert Client().get_user_info("my token").gym_bucket_size == 19
+        assert len(swings) == 12
+        assert clock.time() < 30.0
+        _, p2 = identification.fit(swings)
+        assert 9.81 / p2 == pytest.approx(LENGTH, rel=TOLERANCE[preset])
+
+    def test_ideal_cells_give_the_viscous_friction(self, identification):
+        clock = ManualClock()
+        with Lab("ideal", clock=clock, seed=0):
+            p1, _ = identification.fit(identification.collect("t", [2.0, 1.0, -1.5, -2.5], clock))
+        assert p1 == pytest.approx(4e-4 / 6e-4, rel=0.02)
+
+    def test_coulomb_regressor_removes_most_of_the_bias(self, identification):
+        clock = ManualClock()
+        with Lab("hardware", clock=clock, seed=0):
+            swings = identification.collect("t", np.linspace(-3.0, 3.0, 12), clock)
+        biased, _ = identification.fit(swings)
+        better, _, coulomb = identification.fit(swings, with_coulomb=True)
+        truth = 4e-4 / 6e-4
+        assert abs(better - truth) < 0.4 * abs(biased - truth)
+        assert 1e-3 < coulomb * 6e-4 < 4e-3
+
+    @each_preset
+    def test_as_a_program(self, tmp_path, preset):
+        printed = run(EXAMPLES / "lab_identification.py", "--fast", "--preset", preset,
+                      folder=tmp_path)  # fmt: skip
+        assert "12 swings" in printed
+        lengths = [float(cm) / 100 for cm in re.findall(r"length = ([.\d]+) cm", printed)]
+        assert lengths == pytest.approx([LENGTH] * 2, rel=TOLERANCE[preset])
+        assert list(tmp_path.iterdir()) == []
+
+
+class TestEpisodes:
+    @pytest.mark.parametrize(
+        ("preset", "seed", "gain"), [("hardware", 0, 2), ("hardware", 1, 2), ("ideal", 0, 1)]
+    )
+    def test_learns_to_swing_higher(self, tmp_path, preset, seed, gain):
+        arguments = f"--fast --preset {preset} --seed {seed}".split()
+        printed = run(EXAMPLES / "lab_episodes.py", *arguments, folder=tmp_path)
+        first, best = map(
+            float, re.findall(r"([.\d]+) rods at first, ([.\d]+) at best", printed)[0]
+        )
+        assert best > gain * first
+        assert printed.count("episode ") == 10
+        assert list(tmp_path.iterdir()) == []
+
+    def test_gives_a_video_if_asked(self, tmp_path):
+        pytest.importorskip("PIL", reason="writes videos")
+        printed = run(EXAMPLES / "lab_episodes.py", "--fast", "--videos", "seen", folder=tmp_path)
+        (video,) = (tmp_path / "seen").iterdir()
+        assert video.as_uri() in printed
+        assert video.stat().st_size > 1000
