@@ -97,8 +97,10 @@ class TestHeartbeat:
 class TestEnds:
     def test_by_time(self, lab, client):
         _, token = experiment(lab, length=5.0)
-        keep_alive(lab, client, token, 4.0)
-        lab.clock.advance(1.0)
+        keep_alive(lab, client, token, 5.0)
+        lab.clock.advance(0.09)
+        client.get_position(token)
+        lab.clock.advance(0.02)
         with pytest.raises(LabError, match="the experiment has ended: its time of 5 s is over"):
             client.get_position(token)
         assert client.stop_experiment(token) == ""
@@ -233,7 +235,7 @@ class TestWaiting:
         client.start_gym(TOKEN, 10, SINGLE * 3)
         assert lab.clock.time() == 0.0
         client.start_gym(TOKEN, 10, SINGLE)
-        assert lab.clock.time() == pytest.approx(1.5, abs=0.03)
+        assert lab.clock.time() == pytest.approx(1.6, abs=0.03)
 
     def test_a_cell_of_an_abandoned_session_is_freed(self, lab, client):
         with Lab("ideal", clock=lab.clock, cells={CellType.SINGLE: 1}):
@@ -246,7 +248,7 @@ class TestWaiting:
         gym = client.start_gym(TOKEN, 10, SINGLE)
         client.start_episode(gym, "SimplePendulum", 1.5)
         client.start_episode(gym, "SimplePendulum", 5)
-        assert lab.clock.time() == pytest.approx(1.5, abs=0.03)
+        assert lab.clock.time() == pytest.approx(1.6, abs=0.03)
 
     def test_until_the_lease_is_over(self, lab, client):
         gym = client.start_gym(TOKEN, 1, SINGLE)
@@ -311,11 +313,12 @@ class TestThreads:
             client.get_position(tokens[0])
 
     def test_close_while_others_work(self):
-        lab, refused = Lab("ideal", speed=5.0), []
+        lab, at_work, refused = Lab("ideal"), threading.Barrier(5), []
 
         def work():
             own = Client(lab)
             token, _ = own.start_experiment(TOKEN, "SimplePendulum", 60)
+            at_work.wait(10)
             try:
                 while True:
                     own.get_position(token)
@@ -325,7 +328,7 @@ class TestThreads:
         threads = [threading.Thread(target=work) for _ in range(4)]
         for thread in threads:
             thread.start()
-        time.sleep(0.1)
+        at_work.wait(10)
         lab.close()
         for thread in threads:
             thread.join(10)
@@ -376,7 +379,7 @@ class TestNothingLeaks:
                 if kind == "stopped":
                     client.stop_episode(token)
                 elif kind == "left to its time":
-                    lab.clock.advance(0.6)
+                    lab.clock.advance(0.7)
                     client.stop_episode(token)
 
             for number in range(20):

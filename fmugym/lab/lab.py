@@ -388,6 +388,7 @@ class Lab:
                 began=now,
                 length=request.length,
                 heartbeat=self.options.heartbeat,
+                grace=self.options.session_grace,
                 gym=gym,
                 recording=recording,
             )

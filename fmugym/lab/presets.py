@@ -21,6 +21,8 @@ class Options:
 
     Attributes:
         heartbeat: A session ends after this time without any request, in s.
+        session_grace: How much longer than its time a session lasts, in s: a last request that the
+            network or a busy machine delays shall not come too late.
         homing_time: How long a cell takes to get to its start position, in s.
         starts_per_window: How many experiments, gyms and episodes a user may start within
             ``start_window``; None for any number.
@@ -52,6 +54,7 @@ class Options:
     """
 
     heartbeat: float = 2.0
+    session_grace: float = 0.1
     homing_time: float = 0.0
     starts_per_window: int | None = None
     start_window: float = 10.0

@@ -65,6 +65,7 @@ class Session:
         began: When it began, in s of the lab's time.
         length: How long it may last, in s.
         heartbeat: How long there may be no request, in s.
+        grace: How much longer than `length` it lasts, in s.
         gym: The lease it belongs to, or None.
         recording: Of the cell, or None.
         ended: Why it ended, or None.
@@ -79,6 +80,7 @@ class Session:
     began: float
     length: float
     heartbeat: float
+    grace: float
     gym: Gym | None
     recording: Recording | None
     ended: str | None = None
@@ -143,7 +145,7 @@ class Session:
         self.note(reason)
         self.ended, self.duration = reason, self.cell.time
         if self.recording is not None:
-            self.recording.cut(self.duration)
+            self.recording.cut(min(self.duration, self.length))
         self.cell.park()
 
     def stop(self) -> None:
@@ -156,7 +158,7 @@ class Session:
 
     def _deadline(self) -> tuple[float, str]:
         deadlines = [
-            (self.began + self.length, f"its time of {self.length:g} s is over"),
+            (self.began + self.length + self.grace, f"its time of {self.length:g} s is over"),
             (self._last_request + self.heartbeat, f"no request for {self.heartbeat:g} s"),
         ]
         if self.gym is not None:
