@@ -144,12 +144,18 @@ static void free_instance(const Library *library, void *component) {
     functions_of(library)->free_instance(component);
 }
 
+static Status exchange(const Library *library, void *component, const Exchange *e,
+                       Stage *stage) {
+    return exchange_by(&fmi1, library, component, e, stage);
+}
+
 const Fmi fmi1 = {
     .boolean_size = sizeof(char),
     .bind = bind,
     .instantiate = instantiate,
     .initialize = initialize,
     .do_step = do_step,
+    .exchange = exchange,
     .get = get,
     .set = set,
     .set_string = set_string,

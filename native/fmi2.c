@@ -206,12 +206,18 @@ static size_t state_size(const Library *library, void *component, void *state) {
     return sane(f->state_size(component, state, &size)) <= STATUS_WARNING ? size : 0;
 }
 
+static Status exchange(const Library *library, void *component, const Exchange *e,
+                       Stage *stage) {
+    return exchange_by(&fmi2, library, component, e, stage);
+}
+
 const Fmi fmi2 = {
     .boolean_size = sizeof(int),
     .bind = bind,
     .instantiate = instantiate,
     .initialize = initialize,
     .do_step = do_step,
+    .exchange = exchange,
     .get = get,
     .set = set,
     .set_string = set_string,

@@ -185,12 +185,18 @@ static size_t state_size(const Library *library, void *instance, void *state) {
     return sane(f->state_size(instance, state, &size)) <= STATUS_WARNING ? size : 0;
 }
 
+static Status exchange(const Library *library, void *instance, const Exchange *e,
+                       Stage *stage) {
+    return exchange_by(&fmi3, library, instance, e, stage);
+}
+
 const Fmi fmi3 = {
     .boolean_size = sizeof(bool),
     .bind = bind,
     .instantiate = instantiate,
     .initialize = initialize,
     .do_step = do_step,
+    .exchange = exchange,
     .get = get,
     .set = set,
     .set_string = set_string,

@@ -714,6 +714,7 @@ static PyObject *play_turn(PyPool *self, const Py_buffer *buffers) {
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
         .start = &((PyAccess *)self->start)->access,
         .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
+        .mask = {(const char *)self->play.ended, 1},
         .observations = buffers[SEEN].buf,
         .turn = &turn,
     };

@@ -18,11 +18,11 @@ ptrdiff_t play_find_bad_action(const Turn *turn) {
 }
 
 /* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
-static void draw(const Play *play, size_t index) {
+void play_draw(const Play *play, size_t index) {
     const Draws *d = &play->draws;
 
-    if ((size_t)d->used[index] >= d->episodes) {
-        return; /* nobody has drawn ahead: the episode starts as the last one */
+    if (d->draws == 0 || (size_t)d->used[index] >= d->episodes) {
+        return; /* nothing is random, or nobody has drawn ahead: the episode starts as the last one */
     }
     const size_t episode = index * d->episodes + (size_t)d->used[index];
     const double *fractions = d->block + episode * d->draws;
@@ -58,38 +58,32 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
         }
     }
     for (size_t index = begin; index < begin + count; index++) {
-        if (play->ended[index] && play->draws.draws > 0) {
-            draw(play, index);
-        }
         play->step_counts[index] = play->ended[index] ? 0 : play->step_counts[index] + 1;
     }
 }
 
-Ends play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
+void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch, Ends *ends) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
     const double *dones = scratch->judgement[results[DONE]];
     const double *cuts = scratch->judgement[results[TRUNCATED]];
     const double *rewards = scratch->judgement[results[REWARD]];
-    Ends ends = {0, 0};
 
     program_run(&play->judgement, &source, begin, count, scratch->judgement);
-    for (size_t j = 0; j < count; j++) {
+    for (size_t j = 0; j < count; j++) { /* without branches, which nobody could foresee */
         const size_t index = begin + j;
-        const bool started = play->ended[index];
+        const bool going = !play->ended[index];
         const bool over = play->step_counts[index] >= play->limit;
-        const bool done = !started && dones[j] != 0.0;
-        const bool cut = !started && (over || cuts[j] != 0.0);
+        const bool done = going & (dones[j] != 0.0);
+        const bool cut = going & (over | (cuts[j] != 0.0));
+        const bool ended = done | cut;
 
-        turn->rewards[index] = started ? 0.0 : rewards[j];
+        turn->rewards[index] = going ? rewards[j] : 0.0;
         turn->terminated[index] = done;
         turn->truncated[index] = cut;
-        play->ended[index] = done || cut;
-        if (play->ended[index]) {
-            ends.ended++;
-            ends.used_up += (size_t)play->draws.used[index] == play->draws.episodes;
-        }
+        play->ended[index] = ended;
+        ends->ended += ended;
+        ends->used_up += ended & ((size_t)play->draws.used[index] == play->draws.episodes);
     }
-    return ends;
 }

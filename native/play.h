@@ -58,8 +58,11 @@ typedef struct {
 void play_open(const Turn *turn, PlayScratch *scratch);
 
 /* Both for a run of at most PROGRAM_WIDTH environments: before their instances are reset or
- * stepped, and after. */
+ * stepped, and after; the second adds to ends. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
-Ends play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
+void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch, Ends *ends);
+
+/* Sets the start values of an episode from what was drawn ahead, before its instance is reset. */
+void play_draw(const Play *play, size_t index);
 
 #endif

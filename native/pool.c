@@ -17,7 +17,8 @@ static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states
 
 enum {
     TRIALS = 5,
-    STACK_VALUES = 128,
+    STACK_VALUES = 512,
+    RUN = PROGRAM_WIDTH, /* instances of a run */
     MANY = 64,         /* instances from which on every call is measured */
     MEASURE_EVERY = 16 /* calls with fewer */
 };
@@ -195,22 +196,29 @@ static Status return_to_instantiated(Pool *pool, Instance *me) {
 
 /* Steps */
 
-static Status step_once(Pool *pool, Instance *me) {
+/* The order of operations of PoolSpec.communication_point; a division by 1 changes nothing. */
+static double communication_point(const Pool *pool, const Instance *me) {
     const Settings *s = &pool->settings;
-    /* the order of operations of PoolSpec.communication_point; a division by 1 changes nothing */
     const double since_start = (double)me->steps * s->time_step;
-    const double time = s->experiment.start_time +
-                        (s->substeps == 1 ? since_start : since_start / (double)s->substeps);
-    const Status status = s->fmi->do_step(me->library, me->component, time, pool->step_size);
+    return s->experiment.start_time +
+           (s->substeps == 1 ? since_start : since_start / (double)s->substeps);
+}
 
-    me->steps++;
-    if (status > STATUS_WARNING) {
-        fail(pool, me, "the step", status);
-        if (me->failure != NULL) {
-            me->failure->time = time;
-        }
+static Status fail_step(Pool *pool, Instance *me, double time, Status status) {
+    fail(pool, me, "the step", status);
+    if (me->failure != NULL) {
+        me->failure->time = time;
     }
     return status;
+}
+
+static Status step_once(Pool *pool, Instance *me) {
+    const double time = communication_point(pool, me);
+    const Status status =
+        pool->settings.fmi->do_step(me->library, me->component, time, pool->step_size);
+
+    me->steps++;
+    return status > STATUS_WARNING ? fail_step(pool, me, time, status) : status;
 }
 
 static Status advance(Pool *pool, Instance *me) {
@@ -221,12 +229,20 @@ static Status advance(Pool *pool, Instance *me) {
     return status;
 }
 
+/* Sums of zeros, or of NaN; four of them, which no value has to wait for. */
 static bool all_finite(const double *values, size_t count) {
-    double sum = 0.0;
-    for (size_t i = 0; i < count; i++) {
-        sum += values[i] - values[i]; /* 0, or NaN */
+    double sums[4] = {0.0, 0.0, 0.0, 0.0};
+    size_t i = 0;
+
+    for (; i + 4 <= count; i += 4) {
+        for (size_t j = 0; j < 4; j++) {
+            sums[j] += values[i + j] - values[i + j];
+        }
     }
-    return sum == 0.0;
+    for (; i < count; i++) {
+        sums[0] += values[i] - values[i];
+    }
+    return sums[0] + sums[1] + sums[2] + sums[3] == 0.0;
 }
 
 static Status note_not_finite(Instance *me, const double *values, size_t count) {
@@ -237,13 +253,24 @@ static Status note_not_finite(Instance *me, const double *values, size_t count) 
     return STATUS_NOT_FINITE;
 }
 
-/* Scratch memory of one thread: values, and as much for their typed form. */
+/* Scratch memory of one thread. */
 typedef struct {
-    double *values;
-    void *typed;
+    double *values; /* of one instance, */
+    void *typed;    /* and their typed form */
+    double *inputs; /* of a run of instances, one after the other */
+    double *outputs;
 } Scratch;
 
-static Status read_outputs(Pool *pool, Instance *me, Status status, Scratch scratch) {
+static void copy_outputs(const Pool *pool, const Instance *me, double *values) {
+    const Settings *s = &pool->settings;
+    const double *place = s->output_values + index_of(pool, me);
+
+    for (size_t i = 0; i < s->outputs->count; i++, place += s->count) {
+        values[i] = *place;
+    }
+}
+
+static Status read_outputs(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
     const size_t count = s->outputs->count;
     const Status got =
@@ -259,7 +286,7 @@ static Status read_outputs(Pool *pool, Instance *me, Status status, Scratch scra
     for (size_t i = 0; i < count; i++, place += s->count) {
         *place = scratch.values[i];
     }
-    return status;
+    return STATUS_OK;
 }
 
 static void gather(const Matrix *matrix, size_t column, size_t rows, double *values) {
@@ -269,15 +296,26 @@ static void gather(const Matrix *matrix, size_t column, size_t rows, double *val
     }
 }
 
-static Status step_instance(Pool *pool, Instance *me, const Matrix *inputs, Scratch scratch) {
-    const Access *access = pool->settings.inputs;
+/* Inputs, one step and outputs as one call of the FMI version. */
+static Status exchange(Pool *pool, Instance *me, Exchange *e) {
+    Stage stage;
+    const Status status = pool->settings.fmi->exchange(me->library, me->component, e, &stage);
 
-    if (me->phase != PHASE_STEPPING) {
-        return refuse(me, "a step was asked for before a reset has mended the instance");
+    me->steps += stage != SETTING_INPUTS;
+    if (status <= STATUS_WARNING) {
+        return status;
     }
-    gather(inputs, index_of(pool, me), access->count, scratch.values);
-    const Status set =
-        access_set(access, me->library, me->component, scratch.values, scratch.typed);
+    if (stage == DOING_STEP) {
+        return fail_step(pool, me, e->time, status);
+    }
+    return fail(pool, me, stage == SETTING_INPUTS ? "setting the inputs" : "reading the outputs",
+                status);
+}
+
+static Status exchange_in_parts(Pool *pool, Instance *me, const Exchange *e, void *typed) {
+    const Settings *s = &pool->settings;
+    const Status set = access_set(s->inputs, me->library, me->component, e->inputs, typed);
+
     if (set > STATUS_WARNING) {
         return fail(pool, me, "setting the inputs", set);
     }
@@ -285,7 +323,16 @@ static Status step_instance(Pool *pool, Instance *me, const Matrix *inputs, Scra
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         return status;
     }
-    return read_outputs(pool, me, status, scratch);
+    const Status got = access_get(s->outputs, me->library, me->component, e->outputs, typed);
+    return got > STATUS_WARNING ? fail(pool, me, "reading the outputs", got) : status;
+}
+
+static Status step_instance(Pool *pool, Instance *me, Exchange *e, Scratch scratch) {
+    if (me->phase != PHASE_STEPPING) {
+        return refuse(me, "a step was asked for before a reset has mended the instance");
+    }
+    e->time = communication_point(pool, me);
+    return pool->direct ? exchange(pool, me, e) : exchange_in_parts(pool, me, e, scratch.typed);
 }
 
 /* Initialization */
@@ -445,13 +492,6 @@ static Status start_anew(Pool *pool, Instance *me, const Access *start, bool aga
     return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
 }
 
-static void copy_outputs(const Pool *pool, const Instance *me, double *values) {
-    const Settings *s = &pool->settings;
-    for (size_t i = 0; i < s->outputs->count; i++) {
-        values[i] = s->output_values[i * s->count + index_of(pool, me)];
-    }
-}
-
 /* Compares a restored instance with the initialized one; returns whether it may go on so. */
 static bool passes_trial(Pool *pool, Instance *me, uint64_t restoration, Scratch scratch) {
     Trial *trial = &pool->trial;
@@ -478,7 +518,7 @@ static Status restart(Pool *pool, Instance *me, const Access *start, bool again,
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
     me->steps = pool->settings.warm_up_steps * pool->settings.substeps;
-    status = read_outputs(pool, me, STATUS_OK, scratch);
+    status = read_outputs(pool, me, scratch);
     if (status == STATUS_OK && me->saved != NULL && owns_trial(pool, me)) {
         copy_outputs(pool, me, pool->trial.outputs);
     }
@@ -494,7 +534,7 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
         return status;
     }
     me->steps = pool->settings.warm_up_steps * pool->settings.substeps;
-    return read_outputs(pool, me, STATUS_OK, scratch);
+    return read_outputs(pool, me, scratch);
 }
 
 /* By the cheapest way that gives the same as a fresh instance. */
@@ -555,35 +595,28 @@ static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
         return status;
     }
     me->steps = task->snapshot->steps[index];
-    return read_outputs(task->pool, me, STATUS_OK, scratch);
+    return read_outputs(task->pool, me, scratch);
 }
 
-static Status do_one(Task *task, size_t index, bool in_mask, Scratch scratch) {
-    const Call *call = task->call;
-    Instance *me = &task->pool->instances[index];
-
-    if (task->operation == RESTORE) {
-        return restore_instance(task, me, scratch);
-    }
-    if (task->operation == RESET || in_mask) {
-        return reset_instance(task->pool, me, call->start, &call->start_values, scratch);
-    }
-    return step_instance(task->pool, me, &call->inputs, scratch);
+static size_t note_status(Task *task, size_t index, Status status) {
+    task->pool->settings.status[index] = (int8_t)status;
+    return status > STATUS_WARNING;
 }
 
-static size_t work_through(Task *task, size_t begin, size_t end, Scratch scratch) {
+/* Resets or restores instances that need not be neighbours. */
+static size_t start_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;
     size_t troubled = 0;
 
     for (size_t i = begin; i < end; i++) {
-        const size_t index = task->listed ? pool->chosen[i] : i;
-        const bool in_mask = !task->listed && is_in(call->mask, index);
-        if (!(task->operation == STEP && in_mask)) {
-            const Status status = do_one(task, index, in_mask, scratch);
-            pool->settings.status[index] = (int8_t)status;
-            troubled += status > STATUS_WARNING;
-        }
+        const size_t index = pool->chosen[i];
+        Instance *me = &pool->instances[index];
+        const Status status =
+            task->operation == RESTORE
+                ? restore_instance(task, me, scratch)
+                : reset_instance(pool, me, call->start, &call->start_values, scratch);
+        troubled += note_status(task, index, status);
         if (call->observations != NULL) {
             write_observation(pool, index, call->observations);
         }
@@ -591,37 +624,152 @@ static size_t work_through(Task *task, size_t begin, size_t end, Scratch scratch
     return troubled;
 }
 
-static size_t play_run(Task *task, size_t begin, size_t count, Scratch scratch,
-                       PlayScratch *registers) {
+/* Runs: neighbours whose inputs and outputs are moved together, in loops that become vector
+ * instructions. */
+
+static void gather_inputs(const Task *task, size_t begin, size_t count, double *inputs) {
+    const Matrix *matrix = &task->call->inputs;
+    const size_t width = task->pool->settings.inputs->count;
+
+    for (size_t i = 0; i < width; i++) {
+        const char *place = matrix->data + (ptrdiff_t)i * matrix->row_stride +
+                            (ptrdiff_t)begin * matrix->column_stride;
+        for (size_t j = 0; j < count; j++, place += matrix->column_stride) {
+            memcpy(&inputs[j * width + i], place, sizeof *inputs);
+        }
+    }
+}
+
+/* Those that cannot be left as they are: their outputs stay as before. */
+static size_t take_not_finite(Task *task, size_t begin, size_t count, double *outputs) {
     Pool *pool = task->pool;
-    const Call *call = task->call;
+    const size_t width = pool->settings.outputs->count;
     size_t troubled = 0;
 
-    play_prepare(call->turn, begin, count, registers);
-    for (size_t index = begin; index < begin + count; index++) {
-        const Status status = do_one(task, index, call->turn->play->ended[index], scratch);
-        pool->settings.status[index] = (int8_t)status;
-        troubled += status > STATUS_WARNING;
-        write_observation(pool, index, call->observations);
+    for (size_t j = 0; j < count; j++, outputs += width) {
+        Instance *me = &pool->instances[begin + j];
+        if (!all_finite(outputs, width)) {
+            const bool counted = pool->settings.status[begin + j] > STATUS_WARNING;
+            troubled += note_status(task, begin + j, note_not_finite(me, outputs, width)) && !counted;
+            copy_outputs(pool, me, outputs);
+        }
     }
-    const Ends ends = play_judge(call->turn, begin, count, registers);
-    if (ends.ended > 0) {
-        atomic_add(&task->ended, ends.ended);
-        atomic_add(&task->used_up, ends.used_up);
+    return troubled;
+}
+
+static void keep_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
+    const Settings *s = &task->pool->settings;
+    const size_t width = s->outputs->count;
+
+    for (size_t i = 0; i < width; i++) {
+        double *row = s->output_values + i * s->count + begin;
+        for (size_t j = 0; j < count; j++) {
+            row[j] = outputs[j * width + i];
+        }
+    }
+}
+
+static void convert(const double *values, size_t count, float *converted) {
+    for (size_t i = 0; i < count; i++) {
+        converted[i] = (float)values[i];
+    }
+}
+
+static void write_observations(const Task *task, size_t begin, size_t count,
+                               const double *outputs) {
+    const size_t width = task->pool->settings.outputs->count;
+    const size_t observed = task->pool->settings.num_observed;
+    float *rows = task->call->observations + begin * observed;
+
+    if (observed == width) {
+        convert(outputs, count * width, rows);
+        return;
+    }
+    for (size_t j = 0; j < count; j++) {
+        convert(outputs + j * width, observed, rows + j * observed);
+    }
+}
+
+/* Resets those in the mask and steps the others; or, in a plain step, leaves those in the mask. */
+static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
+    Pool *pool = task->pool;
+    const Call *call = task->call;
+    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
+    const size_t in_width = in->count, out_width = out->count;
+    Exchange e = {.input_references = in->groups[0].references,
+                  .output_references = out->groups[0].references,
+                  .number_of_inputs = in_width,
+                  .number_of_outputs = out_width,
+                  .step = pool->step_size,
+                  .inputs = scratch.inputs,
+                  .outputs = scratch.outputs};
+    size_t troubled = 0;
+
+    for (size_t index = begin; index < begin + count; index++) {
+        Instance *me = &pool->instances[index];
+        const bool in_mask = is_in(call->mask, index);
+        Status status = STATUS_OK;
+
+        if (!in_mask) {
+            status = step_instance(pool, me, &e, scratch);
+            troubled += note_status(task, index, status);
+        } else if (task->operation != STEP) {
+            if (call->turn != NULL) {
+                play_draw(call->turn->play, index);
+            }
+            status = reset_instance(pool, me, call->start, &call->start_values, scratch);
+            troubled += note_status(task, index, status);
+        }
+        if (in_mask || (status > STATUS_WARNING && status != STATUS_TERMINATED)) {
+            copy_outputs(pool, me, e.outputs);
+        }
+        e.inputs += in_width;
+        e.outputs += out_width;
+    }
+    return troubled;
+}
+
+static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
+    gather_inputs(task, begin, count, scratch.inputs);
+    size_t troubled = do_each(task, begin, count, scratch);
+
+    if (!all_finite(scratch.outputs, count * task->pool->settings.outputs->count)) {
+        troubled += take_not_finite(task, begin, count, scratch.outputs);
+    }
+    keep_outputs(task, begin, count, scratch.outputs);
+    if (task->call->observations != NULL) {
+        write_observations(task, begin, count, scratch.outputs);
+    }
+    return troubled;
+}
+
+static size_t length_of_run(size_t first, size_t end) {
+    return end - first < RUN ? end - first : RUN;
+}
+
+static size_t step_through(Task *task, size_t begin, size_t end, Scratch scratch) {
+    size_t troubled = 0;
+    for (size_t first = begin; first < end; first += RUN) {
+        troubled += do_run(task, first, length_of_run(first, end), scratch);
     }
     return troubled;
 }
 
 static size_t play_through(Task *task, size_t begin, size_t end, Scratch scratch) {
+    const Turn *turn = task->call->turn;
     PlayScratch registers;
+    Ends ends = {0, 0};
     size_t troubled = 0;
 
-    play_open(task->call->turn, &registers);
-    for (size_t first = begin; first < end; first += PROGRAM_WIDTH) {
-        const size_t left = end - first;
-        const size_t count = left < PROGRAM_WIDTH ? left : PROGRAM_WIDTH;
-        troubled += play_run(task, first, count, scratch, &registers);
+    play_open(turn, &registers);
+    for (size_t first = begin; first < end; first += RUN) {
+        const size_t count = length_of_run(first, end);
+        play_prepare(turn, first, count, &registers);
+        troubled += do_run(task, first, count, scratch);
+        play_judge(turn, first, count, &registers, &ends);
     }
+    atomic_add(&task->ended, ends.ended);
+    atomic_add(&task->used_up, ends.used_up);
     return troubled;
 }
 
@@ -643,17 +791,26 @@ static size_t most_values(const Task *task) {
     return most > start ? most : start;
 }
 
+static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
+    if (task->listed) {
+        return start_listed(task, begin, end, scratch);
+    }
+    return task->operation == PLAY ? play_through(task, begin, end, scratch)
+                                   : step_through(task, begin, end, scratch);
+}
+
 static size_t work_with_memory(Task *task, size_t begin, size_t end) {
-    const size_t most = most_values(task);
+    const Settings *s = &task->pool->settings;
+    const size_t most = most_values(task), run = task->listed ? 0 : length_of_run(begin, end);
+    const size_t in = run * s->inputs->count, size = 2 * most + in + run * s->outputs->count;
     double stack[STACK_VALUES];
-    double *memory = 2 * most <= STACK_VALUES ? stack : malloc(2 * most * sizeof *memory);
+    double *memory = size <= STACK_VALUES ? stack : malloc(size * sizeof *memory);
 
     if (memory == NULL) {
         return give_chunk_up(task, begin, end);
     }
-    const Scratch scratch = {memory, memory + most};
-    const size_t troubled = task->operation == PLAY ? play_through(task, begin, end, scratch)
-                                                    : work_through(task, begin, end, scratch);
+    const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in};
+    const size_t troubled = work_with(task, begin, end, scratch);
     if (memory != stack) {
         free(memory);
     }
@@ -1050,6 +1207,7 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     mutex_reset(&pool->lock);
     pool->settings = *settings;
     pool->step_size = settings->time_step / (double)settings->substeps;
+    pool->direct = settings->substeps == 1 && settings->inputs->direct && settings->outputs->direct;
     pool->open = true;
     snprintf(error, size, "out of memory");
     if (!log_open(&pool->log, settings->count) || !allocate(pool)) {

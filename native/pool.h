@@ -103,6 +103,7 @@ typedef struct Pool {
     struct Pool *next; /* in the list of all pools */
     Settings settings;
     double step_size; /* of a communication step */
+    bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
     bool open;
     Log log;

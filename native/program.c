@@ -142,12 +142,16 @@ static void compute(uint16_t operation, const double *restrict a, const double *
     }
 }
 
+static double start_of_register(const Program *program, Instruction i) {
+    return i.operation == LOAD_CONSTANT ? program->constants[i.operands[0]] : 0.0;
+}
+
 void program_prepare(const Program *program, Registers registers) {
-    memset(registers, 0, program->length * sizeof registers[0]);
     for (size_t place = 0; place < program->length; place++) {
         const Instruction i = program->code[place];
-        for (size_t j = 0; i.operation == LOAD_CONSTANT && j < PROGRAM_WIDTH; j++) {
-            registers[place][j] = program->constants[i.operands[0]];
+        const double start = start_of_register(program, i);
+        for (size_t j = 0; i.operation <= LOAD_CONSTANT && j < PROGRAM_WIDTH; j++) {
+            registers[place][j] = start;
         }
     }
 }

@@ -68,7 +68,8 @@ typedef struct {
 
 typedef double Registers[PROGRAM_LENGTH][PROGRAM_WIDTH];
 
-/* Once before the first run with these registers: constants stay in their place. */
+/* Once before the first run with these registers: constants stay in their place, and where there are
+ * fewer instances than a register is wide, the rest is 0. */
 void program_prepare(const Program *program, Registers registers);
 
 /* Whether every operand refers to something that there is. */

@@ -50,7 +50,7 @@ PLATFORMS = {
 
 COMPILER_OPTIONS = [
     *("-std=c23", "-Wall", "-Wextra", "-Wpedantic", "-Werror"),
-    *("-O2", "-g0", "-ffp-contract=off", "-fno-math-errno"),
+    *("-O2", "-g0", "-fomit-frame-pointer", "-ffp-contract=off", "-fno-math-errno"),
     *("-shared", "-fPIC", "-fvisibility=hidden"),
     *("-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "-s"),
 ]
@@ -69,15 +69,6 @@ def description_file(model: str, fmi_version: str) -> Path:
     return RESOURCES / model / f"FMI{fmi_version[0]}.xml"
 
 
-def source_files(model: str, fmi_version: str) -> list[str]:
-    """Return the C files of one model and FMI version, relative to this folder."""
-    shim = f"fmi{fmi_version[0]}.c"
-    shared = sorted(
-        path.name for path in (RESOURCES / "src").glob("*.c") if not path.name.startswith("fmi")
-    )
-    return [f"{model}/model.c", *(f"src/{name}" for name in [shim, *shared])]
-
-
 def build_library(model: str, fmi_version: str, platform: str, folder: Path) -> Path:
     """Compile one shared library.
 
@@ -93,7 +84,7 @@ def build_library(model: str, fmi_version: str, platform: str, folder: Path) -> 
     target, extension, _, _ = PLATFORMS[platform]
     command = [sys.executable, "-m", "ziglang", "cc", "-target", target, *COMPILER_OPTIONS]
     command += [f"-DFMI_VERSION={fmi_version[0]}", f"-I{model}", "-Isrc"]
-    command += ["-isystem", str(header_folder()), *source_files(model, fmi_version), "-lm"]
+    command += ["-isystem", str(header_folder()), "src/fmu.c", "-lm"]
     if extension == ".dylib":  # by default the path of the output file enters the library
         command.append(f"-Wl,-install_name,@rpath/{model}{extension}")
     # zig writes import libraries and debug files next to a DLL; only the library leaves this folder

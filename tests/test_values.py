@@ -91,7 +91,7 @@ class TestLateDict:
             self.calls += 1
             return {"a": 1, "b": 2}
 
-        return LateDict(fill)
+        return LateDict.of(fill)
 
     @pytest.mark.parametrize(
         "look",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.pool.base import MaskArray
+from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.values import LateDict
 from fmugym.vector.batch import BatchEngine, StepResult
 from fmugym.vector.probe import sample_states
@@ -94,7 +96,10 @@ class CompiledEngine(BatchEngine):
         self._names = plan.drawn_names
         rows = [plan.parameter_names.index(name) for name in self._names]
         together = rows == list(range(len(rows)))
-        self._drawn_rows = slice(len(rows)) if together else np.array(rows, np.intp)
+        copy: Any = self._start_values.take  # faster than an index, and slower than a slice
+        self._copy_drawn: Callable[[], FloatArray] = (
+            self._start_values[: len(rows)].copy if together else partial(copy, rows, 0)
+        )
         pool: Any = self._pool
         self._play = pool.prepare_play(
             plan.model_variables,
@@ -132,13 +137,11 @@ class CompiledEngine(BatchEngine):
 
     def _drawn(self, mask: MaskArray) -> LateDict:
         """The values of now, which later steps write again; few ever look at them."""
-        values = np.array(self._start_values[self._drawn_rows])
+        return LateDict.of(self._named, self._copy_drawn(), mask)
 
-        def fill() -> dict[str, Any]:
-            named = dict(zip(self._names, values, strict=True))
-            return named | {f"_{name}": mask.copy() for name in named}
-
-        return LateDict(fill)
+    def _named(self, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
+        named = dict(zip(self._names, values, strict=True))
+        return named | {f"_{name}": mask.copy() for name in named}
 
     def note_attributes(self) -> None:
         """The programs have the former values in them."""

@@ -53,8 +53,11 @@ Instance *instance_create(size_t size, const char *name);
 bool accepts(const Instance *instance, const char *function, const char *token);
 Status reset(Instance *instance, const char *function);
 
+/* What is rare is kept out of the way of the rest. */
+#define RARE [[gnu::cold, gnu::noinline]]
+
 /* Logging. report passes on a message in the status's category, and returns the status. */
-Status report(const Instance *instance, Status status, const char *function, const char *format,
+RARE Status report(const Instance *instance, Status status, const char *function, const char *format,
               ...);
 Status set_logging(Instance *instance, const char *function, bool on, size_t number,
                    const char *const categories[]);

@@ -47,6 +47,21 @@ static Status not_settable(const Instance *instance, const char *function, uint3
                                                                    : " after initialization");
 }
 
+/* Gets values of which some are unknown or calculated on demand. */
+RARE static Status get_any_reals(Instance *instance, const char *function,
+                                 const uint32_t references[], size_t number, double values[]) {
+    for (size_t i = 0; i < number; i++) {
+        if (references[i] >= NUMBER_OF_REALS) {
+            return unknown_reference(instance, function, references[i]);
+        }
+        if (refresh(instance, function) != STATUS_OK) {
+            return STATUS_ERROR;
+        }
+        values[i] = instance->simulation.reals.values[references[i]];
+    }
+    return STATUS_OK;
+}
+
 Status get_reals(Instance *instance, const char *function, const uint32_t references[],
                  size_t number, double values[]) {
     const Status status = check_phase(instance, function, READABLE);
@@ -54,16 +69,11 @@ Status get_reals(Instance *instance, const char *function, const uint32_t refere
         return status;
     }
     /* After initialization only the accelerations are computed on demand. */
-    uint32_t ready = instance->simulation.phase == PHASE_INITIALIZATION ? 0 : FIRST_ACCELERATION;
+    const uint32_t ready =
+        instance->simulation.phase == PHASE_INITIALIZATION ? 0 : FIRST_ACCELERATION;
     for (size_t i = 0; i < number; i++) {
         if (references[i] >= ready) {
-            if (references[i] >= NUMBER_OF_REALS) {
-                return unknown_reference(instance, function, references[i]);
-            }
-            if (refresh(instance, function) != STATUS_OK) {
-                return STATUS_ERROR;
-            }
-            ready = NUMBER_OF_REALS;
+            return get_any_reals(instance, function, references, number, values);
         }
         values[i] = instance->simulation.reals.values[references[i]];
     }
@@ -77,7 +87,7 @@ static void assign(Reals *reals, const uint32_t references[], size_t number,
     }
 }
 
-/* Sets values of which some are tunable parameters. */
+/* Sets tunable parameters, and values that come with them. */
 static Status tune(Instance *instance, const char *function, const uint32_t references[],
                    size_t number, const double values[]) {
     Simulation *s = &instance->simulation;
@@ -93,26 +103,33 @@ static Status tune(Instance *instance, const char *function, const uint32_t refe
     return STATUS_OK;
 }
 
-Status set_reals(Instance *instance, const char *function, const uint32_t references[],
-                 size_t number, const double values[]) {
-    int kinds = 0;
-
-    if (instance == NULL) {
-        return STATUS_ERROR;
-    }
-    const int32_t phase = instance->simulation.phase;
+/* Sets values of which one at least is tunable, or must not be set. */
+RARE static Status set_any_reals(Instance *instance, const char *function,
+                                 const uint32_t references[], size_t number,
+                                 const double values[]) {
     for (size_t i = 0; i < number; i++) {
         if (references[i] >= NUMBER_OF_REALS) {
             return unknown_reference(instance, function, references[i]);
         }
         const int settable = real_settable[references[i]];
-        if (!(settable & phase)) {
+        if (!(settable & instance->simulation.phase)) {
             return not_settable(instance, function, references[i], settable);
         }
-        kinds |= settable;
     }
-    if (phase == PHASE_STEP && (kinds & TUNES)) {
-        return tune(instance, function, references, number, values);
+    return tune(instance, function, references, number, values);
+}
+
+Status set_reals(Instance *instance, const char *function, const uint32_t references[],
+                 size_t number, const double values[]) {
+    if (instance == NULL) {
+        return STATUS_ERROR;
+    }
+    const int32_t phase = instance->simulation.phase;
+    for (size_t i = 0; i < number; i++) {
+        const int settable = references[i] < NUMBER_OF_REALS ? real_settable[references[i]] : 0;
+        if (!(settable & phase) || (phase == PHASE_STEP && (settable & TUNES))) {
+            return set_any_reals(instance, function, references, number, values);
+        }
     }
     assign(&instance->simulation.reals, references, number, values);
     instance->simulation.stale = true;
