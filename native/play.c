@@ -1,5 +1,7 @@
 #include "play.h"
 
+#include "platform.h"
+
 enum { DONE, TRUNCATED, REWARD };
 
 ptrdiff_t play_find_bad_action(const Turn *turn) {
@@ -62,28 +64,43 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     }
 }
 
+/* Without branches, which nobody could foresee. */
+WIDE static Ends judge(const Turn *turn, size_t begin, size_t count, const double *dones,
+                       const double *cuts, const double *rewards) {
+    const Play *play = turn->play;
+    const int64_t *step_counts = play->step_counts + begin, *used = play->draws.used + begin;
+    const int64_t limit = play->limit, episodes = (int64_t)play->draws.episodes;
+    uint8_t *restrict ended = play->ended + begin;
+    uint8_t *restrict terminated = turn->terminated + begin;
+    uint8_t *restrict truncated = turn->truncated + begin;
+    double *restrict given = turn->rewards + begin;
+    int64_t number = 0, used_up = 0;
+
+    for (size_t j = 0; j < count; j++) {
+        given[j] = ended[j] ? 0.0 : rewards[j];
+    }
+    for (size_t j = 0; j < count; j++) {
+        const bool going = !ended[j];
+        terminated[j] = going & (dones[j] != 0.0);
+        truncated[j] = going & ((step_counts[j] >= limit) | (cuts[j] != 0.0));
+        ended[j] = terminated[j] | truncated[j];
+    }
+    for (size_t j = 0; j < count; j++) {
+        number += ended[j];
+        used_up += ended[j] & (used[j] == episodes);
+    }
+    return (Ends){(size_t)number, (size_t)used_up};
+}
+
 void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch, Ends *ends) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
-    const double *dones = scratch->judgement[results[DONE]];
-    const double *cuts = scratch->judgement[results[TRUNCATED]];
-    const double *rewards = scratch->judgement[results[REWARD]];
 
     program_run(&play->judgement, &source, begin, count, scratch->judgement);
-    for (size_t j = 0; j < count; j++) { /* without branches, which nobody could foresee */
-        const size_t index = begin + j;
-        const bool going = !play->ended[index];
-        const bool over = play->step_counts[index] >= play->limit;
-        const bool done = going & (dones[j] != 0.0);
-        const bool cut = going & (over | (cuts[j] != 0.0));
-        const bool ended = done | cut;
-
-        turn->rewards[index] = going ? rewards[j] : 0.0;
-        turn->terminated[index] = done;
-        turn->truncated[index] = cut;
-        play->ended[index] = ended;
-        ends->ended += ended;
-        ends->used_up += ended & ((size_t)play->draws.used[index] == play->draws.episodes);
-    }
+    const Ends more = judge(turn, begin, count, scratch->judgement[results[DONE]],
+                            scratch->judgement[results[TRUNCATED]],
+                            scratch->judgement[results[REWARD]]);
+    ends->ended += more.ended;
+    ends->used_up += more.used_up;
 }

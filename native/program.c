@@ -3,6 +3,8 @@
 #include <math.h>
 #include <string.h>
 
+#include "platform.h"
+
 static size_t number_of_operands(uint16_t operation) {
     if (operation <= LOAD_CONSTANT) {
         return 0;
@@ -98,7 +100,7 @@ static void load(const Source *s, Instruction i, size_t begin, size_t count, dou
     }                                                                                              \
     break
 
-static void compute(uint16_t operation, const double *restrict a, const double *restrict b,
+WIDE static void compute(uint16_t operation, const double *restrict a, const double *restrict b,
                     const double *restrict c, double *restrict to) {
     switch (operation) {
     case OP_ADD:

@@ -20,7 +20,7 @@ enum {
     SLOTS = 64, /* jobs at the same time; with more, a caller works alone */
     MOST_HELPERS = 255,
     STACK_SIZE = 8 << 20, /* of the main thread on most systems: FMUs may count on it */
-    HELPER_SPIN = 5000, /* ns to look for more work before going to sleep */
+    HELPER_SPIN = 20000, /* ns to look for more work before going to sleep */
     CALLER_SPIN = 5000  /* ns to wait for the last chunks before going to sleep */
 };
 
