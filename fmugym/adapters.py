@@ -181,8 +181,8 @@ class _Native:
         self.instances: list[Instance] = []
 
     def load(self, instance_class: type[Instance]) -> None:
-        folder = self.fmu.extract()
-        description = self.fmu.description
+        self.fmu.prepare_library()
+        folder, description = self.fmu.extract(), self.fmu.description
         self.slave = instance_class.slave_class.__new__(instance_class.slave_class)
         arguments = {
             "guid": description.instantiation_token,
@@ -405,6 +405,52 @@ class Instance(ABC):
             raise SimulationError(
                 f"{self._log.instance_name}: cannot {doing} while {self.phase.name.lower()}"
             )
+
+    # Directional derivatives, where the FMU offers them (FMI 2.0 and 3.0).
+
+    def jacobian(
+        self, unknowns: Sequence[Variable], knowns: Sequence[Variable]
+    ) -> npt.NDArray[np.float64]:
+        """Differentiate variables by others, at the present communication point.
+
+        Args:
+            unknowns: What is differentiated: outputs or derivatives of states, scalar reals.
+            knowns: By what: continuous inputs or states, scalar reals.
+
+        Returns:
+            The partial derivatives, shape (len(unknowns), len(knowns)), in the variables' units.
+
+        Raises:
+            SimulationError: If the FMU provides no directional derivatives, or fails.
+        """
+        if not self._description.capabilities.provides_directional_derivatives:
+            raise SimulationError(
+                f"{self._description.model_name} provides no directional derivatives"
+            )
+        self._require(Phase.STEPPING, "differentiate")
+        result = np.zeros((len(unknowns), len(knowns)))
+        for column, known in zip(result.T, knowns, strict=True):
+            column[:] = self._partial_derivatives(unknowns, known)
+        return result
+
+    def _partial_derivatives(
+        self, unknowns: Sequence[Variable], known: Variable
+    ) -> npt.NDArray[np.float64]:
+        count, reference, seed = len(unknowns), known.value_reference, ctypes.c_double(1.0)
+        sensitivity = np.zeros(count)
+        status = self._function("GetDirectionalDerivative")(
+            self._component,
+            (ctypes.c_uint32 * count)(*(v.value_reference for v in unknowns)),
+            ctypes.c_size_t(count),
+            ctypes.byref(ctypes.c_uint32(reference)),
+            ctypes.c_size_t(1),
+            ctypes.byref(seed),
+            *self._trailing_arguments(1),
+            sensitivity.ctypes.data_as(ctypes.c_void_p),
+            *self._trailing_arguments(count),
+        )
+        self.check(f"the derivative by {known.name!r}", status)
+        return sensitivity
 
     # FMU state, where the FMU offers it (FMI 2.0 and 3.0).
 

@@ -7,11 +7,9 @@ leaves out, and holds the rules for which variable may be set when.
 from __future__ import annotations
 
 import io
-import lzma
 import math
 import re
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,26 +20,10 @@ import fmpy
 from fmpy.validation import validate_model_description
 from lxml import etree
 
-from fmugym.errors import FMULoadError, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, unknown_name
+from fmugym.safe_zip import ZIP_ERRORS, ArchiveLimits
 
 __all__ = ["Capabilities", "ModelDescription", "Variable", "read_model_description"]
-
-ZIP_ERRORS = (
-    OSError,
-    EOFError,
-    RuntimeError,
-    ValueError,
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-)
-"""What Python's zipfile raises for a damaged archive."""
-
-MAX_XML_BYTES = 64 * 2**20
-"""Largest ``modelDescription.xml`` that is read, in bytes."""
-
-MAX_VARIABLES = 100_000
-"""Largest number of variables that is read; beyond it parsing takes many seconds."""
 
 _KINDS = {
     "Real": "real",
@@ -53,6 +35,10 @@ _KINDS = {
     "Binary": "binary",
     "Clock": "clock",
 }
+_MARKUP_PER_VARIABLE = 25
+"""Elements and attributes that a variable may have for each of the most variables."""
+
+_EXPERIMENT = ("startTime", "stopTime", "tolerance", "stepSize")
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 
 
@@ -106,10 +92,21 @@ class Variable:
 
     @property
     def start_number(self) -> float:
-        """The start value of a numeric variable; 0 where there is none."""
-        if self.start is None:
-            return 0.0
-        return float({"true": "1", "false": "0"}.get(self.start, self.start))
+        """The start value of a numeric variable; 0 where there is none.
+
+        Raises:
+            ConfigError: If it is not a finite number.
+        """
+        text = "0" if self.start is None else self.start
+        try:
+            number = float({"true": "1", "false": "0"}.get(text, text))
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise ConfigError(
+                f"the start value of {self.name!r} is {text!r}, expected a finite number"
+            )
+        return number
 
     @property
     def integer_limits(self) -> tuple[int, int]:
@@ -137,7 +134,9 @@ class ModelDescription:
     """The part of a model description that an environment needs.
 
     ``interfaces`` holds the names of the FMI interface types the FMU offers. ``model_identifier``
-    and ``capabilities`` are those of co-simulation. Times are in seconds, None where not given.
+    and ``capabilities`` are those of co-simulation. ``state_derivatives`` names, for each scalar
+    continuous state that the FMU declares, its derivative. Times are in seconds, None where not
+    given or of no use.
     """
 
     fmi_version: str
@@ -154,6 +153,7 @@ class ModelDescription:
     fixed_internal_step_size: float | None
     capabilities: Capabilities
     variables: Mapping[str, Variable]
+    state_derivatives: Mapping[str, str]
     findings: tuple[str, ...]
 
     @cached_property
@@ -180,7 +180,7 @@ class ModelDescription:
             ) from None
 
 
-def read_model_description(path: Path) -> ModelDescription:
+def read_model_description(path: Path, limits: ArchiveLimits | None = None) -> ModelDescription:
     """Read the model description of an FMU; nothing of the FMU is executed or extracted.
 
     The FMU may break rules of the standard as foreign FMUs often do: what FMPy's validation finds
@@ -188,6 +188,7 @@ def read_model_description(path: Path) -> ModelDescription:
 
     Args:
         path: The FMU.
+        limits: What is too large to be read; by default ``ArchiveLimits()``.
 
     Returns:
         The model description.
@@ -195,12 +196,14 @@ def read_model_description(path: Path) -> ModelDescription:
     Raises:
         FMULoadError: If the XML is missing, unreadable or not that of a co-simulation FMU.
     """
-    xml = _read_xml(path)
+    limits = ArchiveLimits() if limits is None else limits
+    xml = _read_xml(path, limits.max_xml_bytes)
+    _check_markup(path, xml, limits.max_variables)
     try:
         root = etree.fromstring(xml, etree.XMLParser(resolve_entities=False, no_network=True))
     except etree.XMLSyntaxError as error:
         raise FMULoadError(f"{path.name}: modelDescription.xml is not valid XML: {error}") from None
-    _check_root(path, root)
+    _check_root(path, root, limits.max_variables)
     try:
         return _convert(_parse_with_fmpy(xml), root)
     except FMULoadError:
@@ -212,14 +215,14 @@ def read_model_description(path: Path) -> ModelDescription:
         ) from error
 
 
-def _read_xml(path: Path) -> bytes:
+def _read_xml(path: Path, limit: int) -> bytes:
     try:
         with zipfile.ZipFile(path) as archive:
             info = archive.getinfo("modelDescription.xml")
-            if info.file_size > MAX_XML_BYTES:
+            if info.file_size > limit:
                 raise FMULoadError(
-                    f"{path.name}: modelDescription.xml has {info.file_size} bytes, "
-                    f"more than the limit of {MAX_XML_BYTES}"
+                    f"{path.name}: modelDescription.xml has {info.file_size} bytes, the limit is "
+                    f"{limit}; if you trust it, raise max_xml_bytes of ArchiveLimits"
                 )
             xml = archive.read(info)
     except KeyError:
@@ -231,11 +234,21 @@ def _read_xml(path: Path) -> bytes:
     return xml
 
 
+def _check_markup(path: Path, xml: bytes, max_variables: int) -> None:
+    """Each element or attribute takes a quarter of a kilobyte once parsed, however short it is."""
+    count, limit = xml.count(b"<") + xml.count(b"="), _MARKUP_PER_VARIABLE * max_variables + 1000
+    if count > limit:
+        raise FMULoadError(
+            f"{path.name}: modelDescription.xml has some {count} elements and attributes, the "
+            f"limit is {limit}; if you trust it, raise max_variables of ArchiveLimits"
+        )
+
+
 def _doctype_error(path: Path) -> FMULoadError:
     return FMULoadError(f"{path.name}: modelDescription.xml has a DOCTYPE, which FMI forbids")
 
 
-def _check_root(path: Path, root: Any) -> None:
+def _check_root(path: Path, root: Any, limit: int) -> None:
     if root.getroottree().docinfo.doctype:  # in an encoding in which it was not seen before
         raise _doctype_error(path)
     version = root.get("fmiVersion", "")
@@ -245,8 +258,11 @@ def _check_root(path: Path, root: Any) -> None:
             f"found <{root.tag} fmiVersion={version!r}>"
         )
     count = len(root.find("ModelVariables")) if root.find("ModelVariables") is not None else 0
-    if count > MAX_VARIABLES:
-        raise FMULoadError(f"{path.name}: {count} variables, the limit is {MAX_VARIABLES}")
+    if count > limit:
+        raise FMULoadError(
+            f"{path.name} has {count} variables, the limit is {limit}; if you trust it, raise "
+            "max_variables of ArchiveLimits"
+        )
 
 
 def _parse_with_fmpy(xml: bytes) -> Any:
@@ -282,8 +298,15 @@ def _convert(source: Any, root: Any) -> ModelDescription:
         fixed_internal_step_size=_optional_float(co_simulation.fixedInternalStepSize),
         capabilities=_capabilities(source, root),
         variables=variables,
+        state_derivatives=_state_derivatives(source),
         findings=_findings(source),
     )
+
+
+def _state_derivatives(source: Any) -> dict[str, str]:
+    """Read ModelStructure's derivatives; one that does not say of which state is left out."""
+    derivatives = [unknown.variable for unknown in source.derivatives]
+    return {d.derivative.name: d.name for d in derivatives if d.derivative and not d.shape}
 
 
 def _interfaces(source: Any) -> tuple[str, ...]:
@@ -303,7 +326,11 @@ def _c_identifier(name: str | None) -> str:
 
 
 def _time(experiment: Any, attribute: str) -> float | None:
-    return None if experiment is None else _optional_float(getattr(experiment, attribute))
+    """A value of the default experiment; None also for one with which nothing can be simulated."""
+    value = None if experiment is None else _optional_float(getattr(experiment, attribute))
+    positive = attribute in {"stepSize", "tolerance"}
+    usable = value is not None and math.isfinite(value) and (value > 0 or not positive)
+    return value if usable else None
 
 
 def _optional_float(text: Any) -> float | None:
@@ -400,6 +427,19 @@ def _items(source: Any) -> tuple[tuple[str, int], ...]:
 
 
 def _findings(source: Any) -> tuple[str, ...]:
+    return _unused_times(source.defaultExperiment) + _broken_rules(source)
+
+
+def _unused_times(experiment: Any) -> tuple[str, ...]:
+    given = {name: getattr(experiment, name, None) for name in _EXPERIMENT}
+    return tuple(
+        f"{name} of the default experiment is {text}, which cannot be used"
+        for name, text in given.items()
+        if text is not None and _time(experiment, name) is None
+    )
+
+
+def _broken_rules(source: Any) -> tuple[str, ...]:
     try:
         return tuple(validate_model_description(source))
     except Exception as error:  # the validation itself stumbles over some invalid files

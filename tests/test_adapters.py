@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_library
 
-from fmugym import FMU, FMULoadError, SimulationError
+from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.adapters import Access, Library, Phase, Status
 
 LOG = logging.getLogger("fmugym.test")
@@ -260,6 +260,27 @@ class TestFMUState:
     def test_fmi_1_has_none(self, instance):
         with pytest.raises(SimulationError, match="Probe cannot get and set its state"):
             instance(1).save_state()
+
+
+class TestDirectionalDerivatives:
+    """What they are is in ``test_linearization.py``; here is when they are."""
+
+    @with_state
+    def test_of_outputs_after_a_step(self, library, version):
+        shared = library(path=bundled_fmu("Pendulum", version))
+        made = shared.instantiate()
+        q, theta, theta_dot = map(made._description.variable, ["q", "theta", "theta_dot"])
+        with pytest.raises(SimulationError, match="cannot differentiate while instantiated"):
+            made.jacobian([q], [theta])
+        made.initialize(0.0, None, None, lambda: write(made, theta_dot_0=1.0))
+        made.step(0.0, 0.1)
+        assert made.jacobian([q, theta_dot], [theta_dot, theta]).tolist() == [[0, 1], [1, 0]]
+        assert made.jacobian([], [theta]).shape == (0, 1)
+
+    @all_versions
+    def test_none_where_the_fmu_has_none(self, instance, version):
+        with pytest.raises(SimulationError, match="Probe provides no directional derivatives"):
+            instance(version).jacobian([], [])
 
 
 class TestLoading:

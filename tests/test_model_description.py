@@ -5,9 +5,9 @@ import math
 import fmpy
 import numpy as np
 import pytest
-from fmu_tools import ITEMS, MAJOR_VERSIONS, edited_fmu, probe_fmu, write_fmu
+from fmu_tools import ITEMS, MAJOR_VERSIONS, edited_fmu, probe_fmu, read_fmu, write_fmu
 
-from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu, model_description
+from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, bundled_fmu
 from fmugym.bundled import BUNDLED, FMI_VERSIONS
 
 
@@ -47,6 +47,13 @@ class TestBundledModels:
         assert (variables["x"].minimum, variables["x"].maximum) == (-math.inf, math.inf)
         assert variables["f"].nominal == 10.0
         assert variables["theta"].unit == "rad"
+
+    @pytest.mark.parametrize("version", FMI_VERSIONS)
+    def test_states_and_their_derivatives(self, version):
+        """FMI 1.0 has no ModelStructure to declare them in."""
+        declared = describe(bundled_fmu("Pendulum", version)).state_derivatives
+        pairs = [("theta", "theta_dot"), ("theta_dot", "theta_ddot")]
+        assert list(declared.items()) == ([] if version == "1.0" else pairs)
 
     @pytest.mark.parametrize("version", FMI_VERSIONS)
     def test_capabilities(self, version):
@@ -149,6 +156,20 @@ class TestTypes:
 
 
 class TestOtherFacts:
+    @pytest.mark.parametrize("value", ["0", "-0.1", "NaN", "1e999"])
+    def test_step_sizes_that_no_one_can_use(self, tmp_path, value):
+        experiment = f'<DefaultExperiment stepSize="{value}"/><ModelVariables>'
+        fmu = FMU(probe_fmu(tmp_path, 2, {"<ModelVariables>": experiment}))
+        assert fmu.description.step_size is None
+        assert any("stepSize of the default experiment is" in f for f in fmu.description.findings)
+
+    @pytest.mark.parametrize("value", ["low", "", "NaN", "1e999"])
+    def test_start_values_that_are_no_numbers(self, tmp_path, value):
+        """They can be read, and matter only where they are used."""
+        fmu = FMU(probe_fmu(tmp_path, 2, {'start="0"': f'start="{value}"'}))
+        with pytest.raises(ConfigError, match=f"start value of 'a' is '{value}', expected"):
+            _ = fmu.variable("a").start_number
+
     def test_default_experiment_need_not_start_at_zero(self, tmp_path):
         experiment = '<DefaultExperiment startTime="1.0" stopTime="2" tolerance="1e-4"/>'
         edits = {"<ModelVariables>": f"{experiment}<ModelVariables>"}
@@ -245,13 +266,11 @@ class TestRefused:
         )
         refused(with_xml(tmp_path, xml.encode(encoding)), "DOCTYPE")
 
-    def test_xml_of_enormous_size(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(model_description, "MAX_XML_BYTES", 100)
-        refused(probe_fmu(tmp_path), "more than the limit of 100")
-
-    def test_too_many_variables(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(model_description, "MAX_VARIABLES", 3)
-        refused(probe_fmu(tmp_path), "variables, the limit is 3")
+    def test_markup_that_would_fill_the_memory(self, tmp_path):
+        """Four bytes of an element are a quarter of a kilobyte once they are parsed."""
+        path = with_xml(tmp_path, f"<fmiModelDescription>{'<a/>' * 10_000}</fmiModelDescription>")
+        with pytest.raises(FMULoadError, match=r"some 10002 elements.* the limit is 1250; .*max_v"):
+            FMU(path, limits=ArchiveLimits(max_variables=10))
 
     @pytest.mark.parametrize(
         ("old", "new"),
@@ -275,7 +294,7 @@ class TestRefused:
     @pytest.mark.parametrize("part", ["ModelVariables", "ModelStructure"])
     def test_missing_parts(self, tmp_path, part):
         path = probe_fmu(tmp_path, 2)
-        xml = model_description._read_xml(path).decode()
+        xml = read_fmu(path)["modelDescription.xml"].decode()
         start, end = xml.index(f"<{part}"), xml.index(f"</{part}>") if part[5] == "V" else None
         cut = xml[:start] + (xml[end + len(part) + 3 :] if end else "</fmiModelDescription>")
         changed = edited_fmu(path, tmp_path / "cut", add={"modelDescription.xml": cut})

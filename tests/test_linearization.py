@@ -1,0 +1,176 @@
+"""Linear models: against closed forms, central differences, and what FMUs do in a step."""
+
+import logging
+
+import foreign_tank
+import numpy as np
+import pytest
+from fmu_tools import edited_fmu, probe_fmu
+from pythonfmu.builder import FmuBuilder
+from scipy.linalg import expm
+
+import fmugym
+from fmugym.bundled import BUNDLED
+from fmugym.pool import PoolSpec, make_pool
+
+M, L, B, G, V_C = 0.06, 0.1, 4e-4, 9.81, 0.05  # of the bundled pendulum
+with_derivatives = pytest.mark.parametrize(
+    ("model", "version"), [pair for pair in BUNDLED if pair[1] != "1.0"], ids="-".join
+)
+each_version = pytest.mark.parametrize("version", ["2.0", "3.0"])
+
+POINTS = {
+    "CartPole": {"x_0": 0.1, "x_dot_0": -0.3, "phi_0": 0.4, "phi_dot_0": 0.7, "f": 3.0},
+    "Pendulum": {"theta_0": 1.2, "theta_dot_0": -0.08, "tau": 0.02},
+    "DoublePendulum": {"q1_0": 0.9, "q1_dot_0": -0.06, "q2_0": 1.3, "q2_dot_0": 0.04,
+                       "tau1": 0.05, "tau2": -0.02},
+}  # fmt: skip
+
+
+def linearize(model, version, **arguments):
+    return fmugym.linearize(fmugym.bundled_fmu(model, version), **arguments)
+
+
+@each_version
+@pytest.mark.parametrize("angle", [0.0, 1.0, np.pi, -2.5])
+@pytest.mark.parametrize(("velocity", "coulomb"), [(0.0, 0.0), (0.03, 2e-3), (-4.0, 3e-3)])
+def test_the_pendulum_against_the_closed_form(version, angle, velocity, coulomb):
+    at = {"theta_0": angle, "theta_dot_0": velocity, "c": coulomb, "tau": 0.01}
+    model = linearize("Pendulum", version, at=at)
+    damping = B + coulomb / V_C / np.cosh(velocity / V_C) ** 2
+    moment = 0.01 - B * velocity - coulomb * np.tanh(velocity / V_C)
+    inertia = M * L**2
+    expected = [[0.0, 1.0, 0.0], [G / L * np.cos(angle), -damping / inertia, 1 / inertia]]
+    assert np.hstack([model.A, model.B]) == pytest.approx(np.array(expected), rel=1e-12)
+    assert model.f == pytest.approx([velocity, G / L * np.sin(angle) + moment / inertia], rel=1e-12)
+    assert model.x0.tolist() == [angle, velocity]
+    assert model.u0.tolist() == [0.01]
+
+
+@with_derivatives
+def test_against_central_differences_of_the_fmu(model, version):
+    """At a point that is no equilibrium, by other start values and inputs."""
+    point = POINTS[model]
+    linear = linearize(model, version, at=point)
+    eps = 1e-6
+    values = np.array(list(point.values()))
+    ways = np.array([values + s * eps * row for row in np.eye(len(values)) for s in (1, -1)])
+    found = derivatives(model, version, list(point), ways.T, linear)
+    slopes = (found[:, ::2] - found[:, 1::2]) / (2 * eps)
+    varied = [name.removesuffix("_0") for name in point]
+    order = [varied.index(name) for name in (*linear.states, *linear.inputs)]
+    jacobian = np.hstack([linear.A, linear.B])
+    assert jacobian == pytest.approx(slopes[:, order], rel=1e-6, abs=1e-5)
+
+
+def derivatives(model, version, names, columns, linear):
+    """The FMU's own derivatives of the states, for columns of start values and inputs."""
+    fmu = fmugym.FMU(fmugym.bundled_fmu(model, version))
+    pool = make_pool(fmu, PoolSpec((), (), 0.01), columns.shape[1], logging.getLogger("test"))
+    pool.reset(tuple(map(fmu.variable, names)), columns)
+    values = pool.read(tuple(map(fmu.variable, linear.derivatives)))
+    pool.close()
+    return values
+
+
+@each_version
+def test_a_step_from_near_upright_is_that_of_the_linear_model(version):
+    linear = linearize("Pendulum", version)
+    system = np.zeros((3, 3))
+    system[:2] = np.hstack([linear.A, linear.B])
+    fmu = fmugym.FMU(fmugym.bundled_fmu("Pendulum", version))
+    assert linear.states == ("theta", "theta_dot")
+    spec = PoolSpec((fmu.variable("tau"),), tuple(map(fmu.variable, linear.states)), 0.02)
+    pool = make_pool(fmu, spec, 3, logging.getLogger("test"))
+    deviations = np.diag([1e-4, 1e-3, 1e-5])
+    pool.reset(tuple(map(fmu.variable, ["theta_0", "theta_dot_0"])), deviations[:2])
+    stepped, _ = pool.step(deviations[2:])
+    assert stepped == pytest.approx((expm(0.02 * system) @ deviations)[:2], rel=1e-5)
+    pool.close()
+
+
+@each_version
+def test_the_states_may_be_chosen_and_ordered(version):
+    point = POINTS["DoublePendulum"]
+    all_ = linearize("DoublePendulum", version, at=point)
+    assert all_.states == ("q1", "q2", "q1_dot", "q2_dot")
+    assert all_.derivatives == ("q1_dot", "q2_dot", "q1_ddot", "q2_ddot")
+    elbow = linearize("DoublePendulum", version, states=["q2_dot", "q2"], inputs="tau2", at=point)
+    assert elbow.derivatives == ("q2_ddot", "q2_dot")
+    assert elbow.A.tolist() == all_.A[np.ix_([3, 1], [3, 1])].tolist()
+    assert elbow.B.tolist() == all_.B[np.ix_([3, 1], [1])].tolist()
+    assert linearize("DoublePendulum", version, inputs=[]).B.shape == (4, 0)
+
+
+@each_version
+def test_units(version):
+    units = {"theta": "rad", "theta_dot": "rad/s", "theta_ddot": "rad/s2", "tau": "N.m"}
+    assert linearize("Pendulum", version).units == units
+
+
+@each_version
+def test_an_item_of_an_enumeration_may_be_named(version):
+    """A rod that turns about its end has 3/2 of the point mass's g / l."""
+    rod = linearize("Pendulum", version, at={"body": "uniform_rod"})
+    assert rod.A[1, 0] == pytest.approx(1.5 * G / L, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"states": ["thet"]}, "unknown variable of Pendulum 'thet'; did you mean 'theta'?"),
+        ({"states": ["q"]}, "'q' is no continuous state of Pendulum but a continuous output; "
+                            "expected some of: 'theta', 'theta_dot'"),
+        ({"inputs": ["b"]}, "'b' is no continuous input of Pendulum but a tunable parameter; "
+                            "expected some of: 'tau'"),
+        ({"at": {"q_O": 1.0}}, "did you mean 'q_0'?"),
+        ({"at": {"theta": 1.0}}, "'theta' cannot be set: it is a continuous output"),
+        ({"at": {"m": "heavy"}}, "'m' must be a number, got 'heavy'"),
+        ({"at": {"m": np.nan}}, "'m' must be finite"),
+        ({"at": {"body": "rod"}}, "unknown item of 'body' 'rod'"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_named(arguments, message):
+    with pytest.raises(fmugym.ConfigError) as error:
+        linearize("Pendulum", "2.0", **arguments)
+    assert message in str(error.value)
+
+
+def test_fmi_1_has_no_derivatives():
+    with pytest.raises(fmugym.ConfigError, match=r"Pendulum \(FMI 1\.0\) cannot be linearized: it"):
+        linearize("Pendulum", "1.0")
+
+
+def test_an_fmu_of_another_exporter_without_derivatives(tmp_path):
+    path = FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path)
+    with pytest.raises(fmugym.ConfigError, match="it provides no directional derivatives"):
+        fmugym.linearize(path)
+
+
+def test_an_fmu_that_declares_no_states(tmp_path):
+    claim = {'modelIdentifier="Probe"': 'modelIdentifier="Probe" providesDirectionalDerivative="1"'}
+    with pytest.raises(fmugym.ConfigError, match="declares no scalar derivatives of continuous"):
+        fmugym.linearize(probe_fmu(tmp_path, edits=claim))
+
+
+def test_a_derivative_of_no_named_state_is_left_out(tmp_path):
+    path = edited_fmu("Pendulum", tmp_path, {' nominal="1" derivative="3"': ' nominal="1"'})
+    assert fmugym.linearize(path).states == ("theta_dot",)
+
+
+def test_an_fmu_that_fails(tmp_path, temp_root):
+    """The probe claims to provide derivatives; its String is set before it fails."""
+    edits = {
+        'modelIdentifier="Probe"': 'modelIdentifier="Probe" providesDirectionalDerivative="true"',
+        "<ModelStructure/>": '<ModelStructure><Derivatives><Unknown index="9"/></Derivatives>'
+                             "</ModelStructure>",
+        '<ScalarVariable name="mix" valueReference="10" causality="output" '
+        'variability="continuous"><Real ': '<ScalarVariable name="mix" valueReference="10" '
+        'causality="output" variability="continuous"><Real derivative="10"',
+    }  # fmt: skip
+    path = probe_fmu(tmp_path, edits=edits)
+    with pytest.raises(fmugym.SimulationError, match="the derivative by 'sum' returned Error"):
+        fmugym.linearize(path, at={"label": "derived", "gain": 2.0})
+    with pytest.raises(fmugym.SimulationError, match="initialization returned Error"):
+        fmugym.linearize(path, at={"init_status": 3})
+    assert list(temp_root.iterdir()) == []
