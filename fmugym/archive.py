@@ -1,54 +1,35 @@
 """An FMU file: opened once, checked, extracted to a folder of its own and cleaned up.
 
-Reading the description never executes the FMU. Loading it (``fmugym.adapters``) does: an FMU is
-native code that runs with all the rights of the process.
+Reading the description never executes the FMU. Loading it (``fmugym.adapters``, ``fmugym.pool``)
+does: an FMU is native code that runs with all the rights of the process.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import shutil
-import stat
-import tempfile
 import weakref
 import zipfile
-from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import BinaryIO, cast
 
 import fmpy
 
-from fmugym.errors import FMULoadError
-from fmugym.model_description import (
-    ZIP_ERRORS,
-    ModelDescription,
-    Variable,
-    read_model_description,
-)
+from fmugym.errors import ConfigError, FMULoadError
+from fmugym.model_description import ModelDescription, Variable, read_model_description
+from fmugym.probing import DEFAULT_TIMEOUT, Candidate, check_timeout, probe
+from fmugym.safe_zip import ZIP_ERRORS, ArchiveLimits, checked_entries
+from fmugym.shared_library import check_library, load_globally, missing_libraries
+from fmugym.temporary import make_folder, remove_folder
 
 __all__ = ["FMU"]
 
 logger = logging.getLogger(__name__)
 
-MAX_ENTRIES: Final = 20_000
-"""Largest number of files in an archive."""
-
-MAX_EXTRACTED_BYTES: Final = 4 * 2**30
-"""Largest size of an archive's files together, uncompressed."""
-
-MAX_RATIO: Final = 1000
-"""Largest ratio of uncompressed to compressed size; deflate reaches 1032 on zeros."""
-
 _NEVER_NEEDED = {"documentation", "sources"}
-
-_MAGIC = {
-    ".so": (b"\x7fELF",),
-    ".dll": (b"MZ",),
-    ".dylib": (b"\xcf\xfa\xed\xfe", b"\xca\xfe\xba\xbe", b"\xce\xfa\xed\xfe"),
-}
-_ELF_MACHINES = {3: "x86", 40: "arm", 62: "x86_64", 183: "aarch64", 243: "riscv64"}
 
 
 class FMU:
@@ -56,19 +37,39 @@ class FMU:
 
     Args:
         path: The ``.fmu`` file.
+        limits: What is too large to be opened; by default ``ArchiveLimits()``.
+        preload: Shared libraries to be loaded before the FMU's, for symbols or libraries that it
+            does not find by itself: paths, or names that the system's loader finds.
+        probe_timeout: Seconds that an FMU which is not known yet may take for a first load and step
+            in a process of its own; None to go without. See ``fmugym.probing``.
 
     Attributes:
         path: The file's absolute path.
         description: The model description.
+        limits, preload, probe_timeout: As given; ``preload`` a tuple with absolute paths.
 
     Raises:
+        ConfigError: If an argument does not fit.
         FMULoadError: If the file is missing, not a sound FMU archive, or offers no co-simulation.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        limits: ArchiveLimits | None = None,
+        preload: Sequence[str | os.PathLike[str]] = (),
+        probe_timeout: float | None = DEFAULT_TIMEOUT,
+    ) -> None:
         self.path = Path(path).absolute()
-        self._entries = _checked_entries(self.path)
-        self.description: ModelDescription = read_model_description(self.path)
+        self.limits = ArchiveLimits() if limits is None else limits
+        if not isinstance(self.limits, ArchiveLimits):
+            raise ConfigError(f"limits must be ArchiveLimits, got {limits!r}")
+        check_timeout(probe_timeout)
+        self.preload = _absolute(preload)
+        self.probe_timeout = probe_timeout
+        self._entries = checked_entries(self.path, self.limits)
+        self.description: ModelDescription = read_model_description(self.path, self.limits)
         self._folder: Path | None = None
         self._remove_folder: weakref.finalize[..., FMU] | None = None
         if self.description.findings:
@@ -126,25 +127,66 @@ class FMU:
                 f"{self.path.name} has no library for this platform ({self.library}); "
                 f"it was built for: {', '.join(self.platforms) or 'no platform at all'}"
             )
-        folder = Path(tempfile.mkdtemp(prefix="fmugym-"))
-        self._remove_folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        self._check_library()
+        folder = make_folder()
+        self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
         try:
             self._extract_to(folder)
-            _check_library(folder / self.library)
         except BaseException:
             self.close()
             raise
         self._folder = folder
         return folder
 
+    def _check_library(self) -> None:
+        """Look at the library where it is: nothing is written of what cannot be loaded."""
+        with self._opened() as archive, archive.open(self.library) as file:
+            size = archive.getinfo(self.library).file_size
+            check_library(cast(BinaryIO, file), size, f"{self.path.name}: {self.library}")
+
     def _extract_to(self, folder: Path) -> None:
         wanted = [name for name in self._entries if self._needed(PurePosixPath(name))]
+        with self._opened() as archive:
+            archive.extractall(folder, wanted)
+            (folder / "resources").mkdir(exist_ok=True)  # tools pass its path in any case
+
+    @contextmanager
+    def _opened(self) -> Iterator[zipfile.ZipFile]:
         try:
             with zipfile.ZipFile(self.path) as archive:
-                archive.extractall(folder, wanted)
+                yield archive
         except ZIP_ERRORS as error:
             raise FMULoadError(f"{self.path.name} cannot be extracted: {error}") from None
-        (folder / "resources").mkdir(exist_ok=True)  # tools pass its path even where it is absent
+
+    def prepare_library(self) -> Path:
+        """Make ready what this process is about to load: every way to load an FMU begins here.
+
+        An FMU that is not known yet is tried in a process of its own, the libraries of ``preload``
+        are loaded, and those that the FMU's library needs are looked for.
+
+        Returns:
+            The path of the library, in the folder of ``extract``.
+
+        Raises:
+            FMULoadError: As ``extract``; or if the trial's process did not survive, a library of
+                ``preload`` cannot be loaded, or others are missing.
+        """
+        library = self.extract() / self.library
+        probe(self.candidate)
+        for path in self.preload:
+            load_globally(path)
+        missing = missing_libraries(library)
+        if missing:
+            raise FMULoadError(
+                f"{self.path.name} needs shared libraries that are not found here: "
+                f"{', '.join(missing)}; install them, or name their files in preload=[...]"
+            )
+        return library
+
+    @property
+    def candidate(self) -> Candidate:
+        """What ``fmugym.probing`` is to try."""
+        return Candidate(self.path, self.limits, self.preload, self.probe_timeout)
 
     def _needed(self, name: PurePosixPath) -> bool:
         if name.parts[0] == "binaries":
@@ -158,72 +200,9 @@ class FMU:
             self._remove_folder()
 
 
-def _checked_entries(path: Path) -> tuple[str, ...]:
-    """Check every entry of the archive before anything of it is written."""
-    if not path.is_file():
-        raise FMULoadError(f"there is no FMU at {path}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
-    except ZIP_ERRORS as error:
-        raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
-    _check_sizes(path, entries)
-    for entry in entries:
-        _check_entry(path, entry)
-    names = [entry.filename for entry in entries if not entry.is_dir()]
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        raise FMULoadError(f"{path.name} has two files of one name: {twice[0]!r}")
-    return tuple(names)
-
-
-def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    if len(entries) > MAX_ENTRIES:
-        raise FMULoadError(f"{path.name} has {len(entries)} files, the limit is {MAX_ENTRIES}")
-    size = sum(entry.file_size for entry in entries)
-    if size > MAX_EXTRACTED_BYTES:
-        raise FMULoadError(
-            f"{path.name} unpacks to {size} bytes, the limit is {MAX_EXTRACTED_BYTES}"
-        )
-    if size > 2**20 and size > MAX_RATIO * path.stat().st_size:
-        raise FMULoadError(
-            f"{path.name} unpacks to more than {MAX_RATIO} times its size; it is not a sound FMU"
-        )
-
-
-def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
-    name = PurePosixPath(entry.filename)
-    if not name.parts:
-        raise FMULoadError(f"{path.name} has a file without a name: {entry.filename!r}")
-    if name.is_absolute() or ".." in name.parts or "\\" in entry.filename or ":" in entry.filename:
-        raise FMULoadError(f"{path.name} has a file outside of its own folder: {entry.filename!r}")
-    if stat.S_ISLNK(entry.external_attr >> 16):
-        raise FMULoadError(f"{path.name} has a symbolic link: {entry.filename!r}")
-    if entry.flag_bits & 1:
-        raise FMULoadError(f"{path.name} is encrypted: {entry.filename!r}")
-
-
-def _check_library(library: Path) -> None:
-    """Look at the header: loading a foreign or cut library fails with a misleading text."""
-    with library.open("rb") as file:
-        header = file.read(64)
-    if not header.startswith(_MAGIC[library.suffix]):
-        raise FMULoadError(f"{library.name} is not a shared library of this system")
-    if library.suffix == ".so":
-        _check_elf(library, header)
-
-
-def _check_elf(library: Path, header: bytes) -> None:
-    if len(header) < 64:
-        raise FMULoadError(f"{library.name} is cut short ({len(header)} bytes)")
-    machine = int.from_bytes(header[18:20], "little")
-    built_for = _ELF_MACHINES.get(machine, f"ELF machine {machine}")
-    if built_for != fmpy.architecture:
-        raise FMULoadError(
-            f"{library.name} was built for {built_for}, this process runs on {fmpy.architecture}"
-        )
-    section_table = int.from_bytes(header[40:48], "little")
-    section_size = int.from_bytes(header[58:60], "little")
-    count = int.from_bytes(header[60:62], "little")
-    if section_table + section_size * count > library.stat().st_size:
-        raise FMULoadError(f"{library.name} is cut short ({library.stat().st_size} bytes)")
+def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
+    """A bare name is left to the system's loader."""
+    if isinstance(libraries, str):
+        raise ConfigError(f"preload must be a list of paths, got {libraries!r}")
+    paths = [os.fspath(library) for library in libraries]
+    return tuple(os.path.abspath(path) if os.path.dirname(path) else path for path in paths)

@@ -31,6 +31,8 @@ __all__ = [
     "to_input_types",
 ]
 
+_LARGEST_EXACT_INTEGER = 2.0**53
+
 
 def action_space(interface: Interface) -> spaces.Space[Any]:
     """Make the action space of an environment's inputs.
@@ -69,10 +71,18 @@ def discrete_values(interface: Interface, variables: Sequence[Variable]) -> Sequ
     (variable,) = variables
     if variable.kind == "enumeration" and variable.items:
         return sorted(value for _, value in variable.items)
-    if variable.kind in {"integer", "enumeration"} and _bounded(interface, variable):
-        low, high = interface.bounds(variable)
-        return range(math.ceil(low), math.floor(high) + 1)  # not a list: it may be long
+    if variable.kind in {"integer", "enumeration"} and _countable(interface, variable):
+        return _integers(variable, *interface.bounds(variable))
     return None
+
+
+def _integers(variable: Variable, low: float, high: float) -> range:
+    values = range(math.ceil(low), math.floor(high) + 1)  # not a list: it may be long
+    if not values:
+        raise ConfigError(
+            f"{variable.name!r} has no integer from {low} to {high}; give it 'bounds'"
+        )
+    return values
 
 
 def _space(interface: Interface, variables: tuple[Variable, ...]) -> spaces.Space[Any]:
@@ -96,6 +106,11 @@ def _box_limits(interface: Interface, variable: Variable) -> tuple[float, float]
 
 def _bounded(interface: Interface, variable: Variable) -> bool:
     return all(map(math.isfinite, interface.bounds(variable)))
+
+
+def _countable(interface: Interface, variable: Variable) -> bool:
+    """Whether a ``Discrete`` can have an element for each integer within the limits."""
+    return all(abs(limit) <= _LARGEST_EXACT_INTEGER for limit in interface.bounds(variable))
 
 
 def to_input_types(

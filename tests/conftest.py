@@ -7,6 +7,9 @@ import tempfile
 import fmu_tools
 import pytest
 
+# Nearly every test makes an FMU that nobody has met; test_probing.py turns their trials on.
+os.environ["FMUGYM_PROBE"] = "off"
+
 
 @pytest.fixture(scope="session")
 def probe(tmp_path_factory):

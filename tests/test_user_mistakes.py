@@ -156,7 +156,7 @@ def library_is_text(probe, folder):
         (no_zip, r"some\.fmu is not an FMU \(a zip archive\)"),
         (no_fmu, r"some\.fmu is not an FMU: it has no modelDescription\.xml"),
         (exchange_only, "has no co-simulation interface; export the model for co-simulation"),
-        (library_is_text, "is not a shared library of this system"),
+        (library_is_text, r"Probe\.(so|dll|dylib) is not a shared library, expected one of "),
         (lambda _, folder: folder / "absent.fmu", r"there is no FMU at .*absent\.fmu"),
         (lambda *_: "absent.fmu", r"there is no FMU at .*absent\.fmu"),
     ],

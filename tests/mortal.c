@@ -1,0 +1,155 @@
+/* An FMU of FMI 2.0 for tests of first meetings: what it does is in its token.
+
+   Reals: 0 "u" (input), 1 "y" (output). Lines go to standard output and to the FMI logger. */
+
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+typedef void (*Logger)(void *, const char *, int, const char *, const char *, ...);
+
+typedef struct {
+    Logger logger;
+} Callbacks;
+
+typedef struct {
+    double values[2];
+    char token[32];
+} Mortal;
+
+static int instances;
+
+static void fall_asleep(void) {
+    const struct timespec hour = {3600, 0};
+    for (;;) {
+        nanosleep(&hour, NULL);
+    }
+}
+
+static void do_as_told(const char *token, const char *call) {
+    char wanted[64];
+    snprintf(wanted, sizeof wanted, "segfault in %s", call);
+    if (strcmp(token, wanted) == 0) {
+        raise(SIGSEGV);
+    }
+    snprintf(wanted, sizeof wanted, "hang in %s", call);
+    if (strcmp(token, wanted) == 0) {
+        fall_asleep();
+    }
+}
+
+void *fmi2Instantiate(const char *name, int type, const char *token, const char *resources,
+                      const Callbacks *callbacks, int visible, int logging) {
+    instances++;
+    if (strcmp(token, "licence") == 0) {
+        callbacks->logger(NULL, name, 3, "licence", "no licence for %d seats", 5);
+        printf("so much for that\n"); /* not flushed */
+        abort();
+    }
+    if (strcmp(token, "refuse") == 0) {
+        callbacks->logger(NULL, name, 3, "licence", "all %d seats are taken", 5);
+        return NULL;
+    }
+    if (strcmp(token, "exit") == 0) {
+        printf("good bye\n");
+        exit(0);
+    }
+    if (strcmp(token, "noise") == 0) {
+        for (int i = 0; i < 100000; i++) {
+            printf("{\"complete\": false} %d\n", i);
+        }
+        fflush(stdout);
+    }
+    if (strcmp(token, "deaf") == 0) {
+        for (int i = 0; i < 100; i++) {
+            close(i);
+        }
+    }
+    if (strcmp(token, "lonely") == 0 && instances > 1) {
+        abort();
+    }
+    do_as_told(token, "instantiate");
+    Mortal *me = calloc(1, sizeof *me);
+    snprintf(me->token, sizeof me->token, "%s", token);
+    return me;
+}
+
+void fmi2FreeInstance(Mortal *me) {
+    do_as_told(me->token, "free");
+    free(me);
+}
+
+int fmi2SetupExperiment(Mortal *me, int tolerance_defined, double tolerance, double start,
+                        int stop_defined, double stop) {
+    return 0;
+}
+
+int fmi2EnterInitializationMode(Mortal *me) {
+    return strcmp(me->token, "needy") == 0 ? 3 : 0;
+}
+
+int fmi2ExitInitializationMode(Mortal *me) {
+    do_as_told(me->token, "initialization");
+    return 0;
+}
+
+int fmi2DoStep(Mortal *me, double time, double step_size, int no_set_state) {
+    do_as_told(me->token, "step");
+    me->values[1] = me->values[0];
+    return 0;
+}
+
+int fmi2GetReal(Mortal *me, const unsigned *vr, size_t count, double *values) {
+    for (size_t i = 0; i < count; i++) {
+        values[i] = me->values[vr[i]];
+    }
+    return 0;
+}
+
+int fmi2SetReal(Mortal *me, const unsigned *vr, size_t count, const double *values) {
+    for (size_t i = 0; i < count; i++) {
+        me->values[vr[i]] = values[i];
+    }
+    return 0;
+}
+
+#define STUB(name)                                                                                 \
+    int fmi2##name(void) {                                                                         \
+        return 0;                                                                                  \
+    }
+
+STUB(Terminate)
+STUB(Reset)
+STUB(SetDebugLogging)
+STUB(GetInteger)
+STUB(GetBoolean)
+STUB(GetString)
+STUB(SetInteger)
+STUB(SetBoolean)
+STUB(SetString)
+STUB(GetFMUstate)
+STUB(SetFMUstate)
+STUB(FreeFMUstate)
+STUB(SerializedFMUstateSize)
+STUB(SerializeFMUstate)
+STUB(DeSerializeFMUstate)
+STUB(GetDirectionalDerivative)
+STUB(SetRealInputDerivatives)
+STUB(GetRealOutputDerivatives)
+STUB(CancelStep)
+STUB(GetStatus)
+STUB(GetRealStatus)
+STUB(GetIntegerStatus)
+STUB(GetBooleanStatus)
+STUB(GetStringStatus)
+
+const char *fmi2GetVersion(void) {
+    return "2.0";
+}
+
+const char *fmi2GetTypesPlatform(void) {
+    return "default";
+}
