@@ -23,6 +23,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import heavy
+import isolation
 import loaded
 import memory
 import reset
@@ -36,6 +37,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "vector": vector.tables,
     "reset": reset.tables,
     "heavy": heavy.tables,
+    "isolation": isolation.tables,
     "memory": memory.tables,
     "loaded": loaded.tables,
 }

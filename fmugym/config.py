@@ -13,7 +13,14 @@ import numpy as np
 from fmugym.distributions import is_distribution
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.model_description import ModelDescription, Variable
-from fmugym.pool.base import PoolSpec, whole_number_of_steps
+from fmugym.pool.base import (
+    DEFAULT_CALL_TIMEOUT,
+    ISOLATIONS,
+    PoolSpec,
+    whole_number_of_steps,
+)
+from fmugym.probing import DEFAULT_TIMEOUT
+from fmugym.safe_zip import ArchiveLimits
 
 __all__ = ["EnvConfig"]
 
@@ -47,6 +54,14 @@ class EnvConfig:
         bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
         fault_reward: Reward of a step that failed.
+        archive_limits: What is too large to be opened; by default ``ArchiveLimits()``.
+        preload: Shared libraries to be loaded before the FMU's; a relative path is relative to the
+            class's file.
+        probe_timeout: Seconds of real time that an FMU which is not known yet may take for a first
+            load and step in a process of its own; None to go without.
+        isolation: Where the FMU runs: ``"process"`` or ``"none"``; see ``fmugym.pool.make_pool``.
+        call_timeout: Seconds of real time that a call of an FMU may take where it runs in a worker
+            process; None for ever.
     """
 
     model_input_names: tuple[str, ...]
@@ -66,6 +81,11 @@ class EnvConfig:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     on_fault: str = "truncate"
     fault_reward: float = 0.0
+    archive_limits: ArchiveLimits | None = None
+    preload: tuple[str, ...] = ()
+    probe_timeout: float | None = DEFAULT_TIMEOUT
+    isolation: str | None = None
+    call_timeout: float | None = DEFAULT_CALL_TIMEOUT
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any] | EnvConfig) -> EnvConfig:
@@ -94,7 +114,7 @@ class EnvConfig:
         return cls(**config)
 
     def __post_init__(self) -> None:
-        for key in ("model_input_names", "model_output_names", "monitor_names"):
+        for key in ("model_input_names", "model_output_names", "monitor_names", "preload"):
             object.__setattr__(self, key, _names(key, getattr(self, key)))
         for key in ("model_parameters", "episode_variables", "bounds"):
             object.__setattr__(self, key, _mapping(key, getattr(self, key)))
@@ -104,15 +124,18 @@ class EnvConfig:
             _check_value(f"episode variable {name!r}", value)
         if self.on_fault not in ON_FAULT:
             raise unknown_name("on_fault policy", self.on_fault, ON_FAULT)
+        if self.isolation not in (None, *ISOLATIONS):
+            raise unknown_name("isolation", self.isolation, ISOLATIONS)
 
     def _check_numbers(self) -> None:
         for key in ("positive_reward", "negative_reward", "fault_reward"):
             _check_number(key, getattr(self, key))
         _check_number("warm_up", self.warm_up, minimum=0)
-        for key in ("time_step", "start_time", "stop_time", "tolerance"):
+        times = ("time_step", "start_time", "stop_time", "probe_timeout", "call_timeout")
+        for key in (*times, "tolerance"):
             value = getattr(self, key)
             if value is not None:
-                _check_number(key, value, positive=key in {"time_step", "tolerance"})
+                _check_number(key, value, positive=key not in {"start_time", "stop_time"})
         _check_count("substeps", self.substeps)
         if self.max_episode_steps is not None:
             _check_count("max_episode_steps", self.max_episode_steps)
@@ -184,8 +207,16 @@ class Interface:
         return step
 
     def bounds(self, variable: Variable) -> tuple[float, float]:
-        """The limits of a variable: the config's, or else the FMU's."""
+        """The limits of a variable: the config's, or else the FMU's.
+
+        Raises:
+            ConfigError: If the FMU's contradict each other.
+        """
         low, high = self.config.bounds.get(variable.name, (variable.minimum, variable.maximum))
+        if not low <= high:
+            raise ConfigError(
+                f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds'"
+            )
         return low, high
 
     def pool_spec(self) -> PoolSpec:

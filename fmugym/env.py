@@ -70,6 +70,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         config: See ``EnvConfig``.
         log_level: Level of this class's logger, which gets the FMU's messages.
         render_mode: One of the class's ``metadata["render_modes"]``, or None.
+        backend: What stands in for the FMU, which then only describes the variables: an object
+            with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
+            it. Or the name of a way to step the FMU, see ``fmugym.pool.make_pool``.
 
     Attributes:
         fmu: The FMU; ``fmu.description`` is what it says of itself.
@@ -119,6 +122,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     _per_env_attributes: Mapping[str, Any] = MappingProxyType({})
     """In a vector environment: attributes that hold one value for each environment."""
 
+    _has_info: bool
     _pool: Pool | None = None
     _renderer: Renderer[Any] | None = None
 
@@ -135,28 +139,45 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         log_level: int = logging.WARNING,
         *,
         render_mode: str | None = None,
+        backend: Any = None,
     ) -> None:
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
         self.logger.setLevel(log_level)
         self.config = EnvConfig.from_dict(config)
         self.render_mode = self._checked_render_mode(render_mode)
-        self.fmu = FMU(_find_fmu(type(self), fmu_path))
+        self.fmu = self._open_fmu(fmu_path)
         self._require_fmi_version()
         self._interface = self.config.resolve(self.fmu.description)
         self._spec = self._interface.pool_spec()
         self._warn_of_peculiarities()
         self._prepare_values()
         self._prepare_spaces()
-        num_instances, pool_options = _pool_request.get()
+        num_instances, requested = _pool_request.get()
+        isolation = {n: getattr(self.config, n) for n in ("isolation", "call_timeout")}
+        pool_options = isolation | requested
+        if backend is not None:
+            pool_options = {**pool_options, "backend": backend}
         self._pool = make_pool(self.fmu, self._spec, num_instances, self.logger, **pool_options)
         self._step_pool = self._pool.step_own
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
         self._observation_row = self._pool.observations[0]
+        self._halt = getattr(self._pool, "halt", _nothing)
+        self._is_paced = bool(pool_info(self._pool))
+        self._has_info = self._has_info or self._is_paced
 
     def _checked_render_mode(self, mode: str | None) -> str | None:
         if mode is not None and mode not in self.metadata["render_modes"]:
             raise unknown_name("render mode", mode, self.metadata["render_modes"])
         return mode
+
+    def _open_fmu(self, path: str | os.PathLike[str]) -> FMU:
+        cls, config = type(self), self.config
+        return FMU(
+            _find_file(cls, path),
+            limits=config.archive_limits,
+            preload=[_find_file(cls, p) if os.path.dirname(p) else p for p in config.preload],
+            probe_timeout=config.probe_timeout,
+        )
 
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
@@ -360,11 +381,15 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         plan = self._plan_of_reset(options)
         episode = plan.draw(self.np_random)
         self._ended = True  # should the FMU fail in what follows
-        pool.reset(plan.model_variables, episode.start_values)
-        if pool.statuses.item(0) > Status.WARNING:
-            raise SimulationError(pool.failure(0))
-        self._begin_episode(episode)
-        observation, info = self._observation_and_info()
+        try:
+            pool.reset(plan.model_variables, episode.start_values)
+            if pool.statuses.item(0) > Status.WARNING:
+                raise SimulationError(pool.failure(0))
+            self._begin_episode(episode)
+            observation, info = self._observation_and_info()
+        except BaseException:
+            self._halt()
+            raise
         info["drawn"] = episode.drawn
         if self.render_mode == "human":
             self.render()
@@ -416,7 +441,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._in_hooks = True
         try:
             observation = _given(self._get_observation(), "_get_observation")
-            return observation, _given(self._get_info(), "_get_info")
+            return observation, self._info()
         finally:
             self._in_hooks = False
 
@@ -444,6 +469,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             troubled = self._step_pool()
             self.step_count += 1
             result = self._evaluate(pool, pool.statuses.item(0) if troubled else 0)
+        except BaseException:  # whatever is real must not go on without its controller
+            self._halt()
+            raise
         finally:
             self._in_hooks = False
         if self.render_mode is not None:
@@ -534,7 +562,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             observation: Any = self._observation_row.copy()
         else:
             observation = _given(self._get_observation(), "_get_observation")
-        info = _given(self._get_info(), "_get_info") if self._has_info else {}
+        info = self._info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
         if terminated or truncated:
@@ -543,6 +571,13 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             _given(done, "_is_done")
             _given(reward, "_reward_policy")
         return observation, float(reward), terminated, truncated, info
+
+    def _info(self) -> dict[str, Any]:
+        """What the hook tells, and the pool."""
+        info: dict[str, Any] = _given(self._get_info(), "_get_info")
+        if self._is_paced:
+            info = info | {name: value.item(0) for name, value in pool_info(self._pool).items()}
+        return info
 
     @property
     def time(self) -> float:
@@ -557,7 +592,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             raise SimulationError(reason)
         self.logger.warning("%s", reason)
         self.done = policy == "terminate"
-        info = self._get_info() | {"fault": reason}
+        info = self._info() | {"fault": reason}
         reward = float(self.config.fault_reward)
         return self._get_observation(), reward, self.done, not self.done, info
 
@@ -655,6 +690,15 @@ class FMI3CSEnv(FMUEnv):
     fmi_version = 3
 
 
+def _nothing() -> None:
+    """What is to be halted where all is simulated."""
+
+
+def pool_info(pool: Any) -> dict[str, npt.NDArray[Any]]:
+    """What a pool tells of each step, each of shape (N,); only paced ones do."""
+    return pool.info() if hasattr(pool, "info") else {}
+
+
 def _given(value: Any, hook: str) -> Any:
     if value is None:
         raise ConfigError(f"{hook} returned None; is its return statement missing?")
@@ -705,9 +749,9 @@ def _is_element(action: Any, elements: range) -> bool:
         return False
 
 
-def _find_fmu(cls: type, fmu_path: str | os.PathLike[str]) -> Path:
+def _find_file(cls: type, file: str | os.PathLike[str]) -> Path:
     """Find a relative path beside the file of the class, or of a class that it derives from."""
-    path = Path(fmu_path).expanduser()
+    path = Path(file).expanduser()
     if path.is_absolute():
         return path
     folders = [Path(inspect.getfile(c)).parent for c in cls.__mro__ if _has_file(c)]

@@ -79,3 +79,11 @@ def test_heavy_steps_are_measured_on_an_fmu_made_for_it(temp_root):
     assert (result.returncode, result.stderr) == (0, "")
     assert {"10.0 us", "100 us", "1.00 ms"} <= tables_in(result.stdout).keys()
     assert list(temp_root.iterdir()) == []
+
+
+def test_isolation_is_measured_with_its_faults():
+    result = run("--only", "isolation")
+    assert (result.returncode, result.stderr) == (0, "")
+    rows = tables_in(result.stdout)
+    assert len(rows["1 cart-pole"]) == 4
+    assert any("hangs" in row for row in rows)

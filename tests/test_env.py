@@ -12,7 +12,12 @@ from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
 from fmugym.bundled import FMI_VERSIONS
 from fmugym.testing import check_fmu_env
 
-ENV_IDS = ["fmugym/CartPole-v0", "fmugym/ModelicaCartPole-v0", "fmugym/Pendulum-v0"]
+ENV_IDS = [
+    "fmugym/CartPole-v0",
+    "fmugym/CloudPendulum-v0",
+    "fmugym/ModelicaCartPole-v0",
+    "fmugym/Pendulum-v0",
+]
 
 
 class Swing(fmugym.FMUEnv):

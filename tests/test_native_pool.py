@@ -583,8 +583,8 @@ class TestIsolation:
             assert envs.step(np.full((3, 1), work, np.float32))[0].tolist() == [alone] * 3
         envs.close()
         single.close()
-        with pytest.raises(FMULoadError, match="which only the native pool can give it"):
-            fmugym.FMUVectorEnv(Counting, 3, backend="python")
+        with pytest.raises(FMULoadError, match="which only the native pool or isolation='process'"):
+            fmugym.FMUVectorEnv(Counting, 3, backend="python", isolation="none")
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):

@@ -24,7 +24,15 @@ all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
 
 
-@pytest.fixture(params=["python", "native"])
+OPTIONS = {
+    "python": {"backend": "python"},
+    "native": {"backend": "native"},
+    "process": {"backend": "auto", "isolation": "process", "workers": 2},
+}
+"""Of ``make_pool``, by implementation."""
+
+
+@pytest.fixture(params=OPTIONS)
 def make_pool(request):
     """Make pools of one implementation that are closed after the test."""
     if request.param == "native" and not pools.has_native_pool():
@@ -40,8 +48,8 @@ def make_pool(request):
             strings=tuple((fmu.variable(n), v) for n, v in (strings or {}).items()),
             **spec,
         )
-        options = {"backend": request.param, "private_libraries": False}
-        pool = pools.make_pool(fmu, spec, num_instances, LOG, **options)
+        options = OPTIONS[request.param]
+        pool = pools.make_pool(fmu, spec, num_instances, LOG, private_libraries=False, **options)
         pool.variable = fmu.variable
         made.append(pool)
         return pool
@@ -287,12 +295,12 @@ class TestSnapshots:
 
     @with_state
     def test_snapshots_are_freed(self, make_pool, probe, version):
-        pool = make_pool(probe(version), ["a"], ["live"], 2)
+        pool = make_pool(probe(version), ["a"], ["live"])
         set_up(pool)
         snapshots = [pool.save() for _ in range(3)]
-        assert step(pool)[0].tolist() == [[6, 6]]
+        assert step(pool)[0].tolist() == [[3]]
         del snapshots[1:]
-        assert step(pool)[0].tolist() == [[2, 2]]
+        assert step(pool)[0].tolist() == [[1]]
 
     @with_state
     def test_only_into_the_same_instances(self, make_pool, probe, version):

@@ -21,7 +21,12 @@ from fmugym.vector import FMUVectorEnv
 BACKENDS = ("python", "native") if has_native_pool() else ("python",)
 WAYS = [(backend, hooks) for backend in BACKENDS for hooks in ("array", "per_env")]
 WAYS += [("native", "auto")] if has_native_pool() else []  # compiled, where that is possible
-IDS = ("fmugym/CartPole-v0", "fmugym/Pendulum-v0", "fmugym/ModelicaCartPole-v0")
+IDS = (
+    "fmugym/CartPole-v0",
+    "fmugym/Pendulum-v0",
+    "fmugym/ModelicaCartPole-v0",
+    "fmugym/CloudPendulum-v0",
+)
 MODES = tuple(AutoresetMode)
 ABSURD = 1e308
 

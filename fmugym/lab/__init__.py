@@ -15,8 +15,8 @@ A program written for the lab runs here after one import was changed::
 ``Lab(clock=ManualClock())`` has a time that moves by hand.
 """
 
+from fmugym.clock import Clock, ManualClock, RealClock
 from fmugym.lab.client import Client
-from fmugym.lab.clock import Clock, ManualClock, RealClock
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
 from fmugym.lab.errors import LabError
 from fmugym.lab.lab import Lab, current_lab

@@ -16,15 +16,15 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.clock import Clock, RealClock
 from fmugym.errors import unknown_name
 from fmugym.lab.bookings import Bookings, new_token
 from fmugym.lab.cell import Cell
-from fmugym.lab.clock import Clock, RealClock
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
 from fmugym.lab.errors import LabError
 from fmugym.lab.experiments import EXPERIMENTS
@@ -35,6 +35,9 @@ from fmugym.lab.recording import Recording, check_can_record, write_video
 from fmugym.lab.requests import Request, check_range, entries_of, gains_of
 from fmugym.lab.sessions import Gym, Session
 from fmugym.lab.users import Account, User
+
+if TYPE_CHECKING:
+    from fmugym.lab.client import Client
 
 __all__ = ["Lab", "current_lab"]
 
@@ -120,6 +123,16 @@ class Lab:
             Lab._current.remove(self)
         if self not in Lab._current:
             self.close()
+
+    def client(self) -> Client:
+        """Return a new client of this lab."""
+        from fmugym.lab.client import Client
+
+        return Client(self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Lab:
+        """Return the lab itself: whoever copies the arguments of an environment means this one."""
+        return self
 
     def close(self) -> None:
         """End all sessions, free the cells and remove the temporary folder; twice is fine."""

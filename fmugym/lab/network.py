@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.lab.clock import Clock
+from fmugym.clock import Clock
 from fmugym.lab.presets import Options
 
 __all__ = ["Network"]

@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.model_description import Variable
 
-__all__ = ["FloatArray", "MaskArray", "Pool", "PoolSpec", "StatusArray", "whole_number_of_steps"]
+__all__ = [
+    "DEFAULT_CALL_TIMEOUT",
+    "ISOLATIONS",
+    "FloatArray",
+    "MaskArray",
+    "Pool",
+    "PoolSpec",
+    "StatusArray",
+    "available_processors",
+    "whole_number_of_steps",
+]
 
 FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
+
+
+ISOLATIONS: Final = ("none", "process")
+"""Where FMUs run: in the caller's process, or in worker processes."""
+
+DEFAULT_CALL_TIMEOUT: Final = 60.0
+"""How long a worker process may take for a call, in seconds of real time."""
 
 
 @dataclass(frozen=True)
@@ -165,6 +183,13 @@ class Pool(Protocol):
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
         ...
+
+
+def available_processors() -> int:
+    """The number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def whole_number_of_steps(duration: float, time_step: float) -> int | None:

@@ -8,6 +8,7 @@ all the same, so that each instance needs a library of its own (``private_librar
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from fmugym.model_description import Variable
 from fmugym.pool import make_pool
 from fmugym.pool.base import FloatArray, Pool, PoolSpec
 
-__all__ = ["shares_globals"]
+__all__ = ["default_spec", "shares_globals", "start_inputs"]
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +28,9 @@ _DEFAULT_STEP_SIZE = 0.01
 _MOST_OUTPUTS = 1000
 
 
-def shares_globals(fmu: FMU, spec: PoolSpec | None = None, steps: int = 10) -> bool:
+def shares_globals(
+    fmu: FMU, spec: PoolSpec | None = None, steps: int = 10, *, private_libraries: bool = False
+) -> bool:
     """Compare an instance run alone with one run beside another, which gets other inputs.
 
     Each trial loads a copy of the FMU's library of its own. FMUs may still share what lies outside
@@ -37,6 +40,7 @@ def shares_globals(fmu: FMU, spec: PoolSpec | None = None, steps: int = 10) -> b
         fmu: The FMU; neither extracted nor closed.
         spec: What to do in a step; by default all inputs are written and all outputs read.
         steps: How many steps to do.
+        private_libraries: Whether each instance has a copy of the library of its own.
 
     Returns:
         Whether the two instances are not independent of each other.
@@ -45,17 +49,18 @@ def shares_globals(fmu: FMU, spec: PoolSpec | None = None, steps: int = 10) -> b
         FMULoadError: If not even one instance can be made.
         SimulationError: If an instance alone fails.
     """
-    spec = _default_spec(fmu) if spec is None else spec
-    alone = _run(fmu, spec, 1, steps)
+    spec = default_spec(fmu) if spec is None else spec
+    alone = _run(fmu, spec, 1, steps, private_libraries)
     try:
-        beside = _run(fmu, spec, 2, steps)
+        beside = _run(fmu, spec, 2, steps, private_libraries)
     except (FMULoadError, SimulationError) as error:
         logger.info("%s: a second instance fails: %s", fmu.path.name, error)
         return True
     return alone.tobytes() != beside.tobytes()
 
 
-def _default_spec(fmu: FMU) -> PoolSpec:
+def default_spec(fmu: FMU) -> PoolSpec:
+    """What to do with an FMU of which nothing is known: all inputs, outputs, its own step size."""
     description = fmu.description
     numeric = [v for v in description.variables.values() if v.numeric]
     outputs = [v for v in numeric if v.causality == "output"] or [
@@ -69,10 +74,12 @@ def _default_spec(fmu: FMU) -> PoolSpec:
     )
 
 
-def _run(fmu: FMU, spec: PoolSpec, count: int, steps: int) -> FloatArray:
+def _run(fmu: FMU, spec: PoolSpec, count: int, steps: int, private_libraries: bool) -> FloatArray:
     """Step ``count`` instances of a new copy; returns what the first one did."""
     log = logging.getLogger(__name__)
-    pool = make_pool(FMU(fmu.path), spec, count, log, threads=1, private_libraries=False)
+    twin = FMU(fmu.path, limits=fmu.limits, preload=fmu.preload, probe_timeout=None)
+    options: Any = {"private_libraries": private_libraries, "isolation": "none"}
+    pool = make_pool(twin, spec, count, log, threads=1, **options)
     try:
         return _trajectory(pool, spec, steps)
     finally:
@@ -86,32 +93,33 @@ def _trajectory(pool: Pool, spec: PoolSpec, steps: int) -> FloatArray:
         if step == 0:
             outputs, statuses = pool.reset((), np.zeros((0, count)))
         else:
-            outputs, statuses = pool.step(_inputs(spec, count))
+            outputs, statuses = pool.step(start_inputs(spec, count))
         if statuses[0] > 1:
             raise SimulationError(pool.failure(0))
         rows.append(outputs[:, 0].copy())
     return np.array(rows)
 
 
-def _inputs(spec: PoolSpec, count: int) -> FloatArray:
-    """Start values for the first instance, the other end of the range for the second."""
-    values = [[_start(variable), _other(variable)] for variable in spec.inputs]
+def start_inputs(spec: PoolSpec, count: int) -> FloatArray:
+    """Start values for the first instance, the other end of the range for the second.
+
+    Args:
+        spec: What the inputs are.
+        count: 1 or 2.
+
+    Returns:
+        Shape (inputs, count).
+    """
+    values = [[variable.start_number, _other(variable)] for variable in spec.inputs]
     return np.array(values, np.float64).reshape(-1, 2)[:, :count]
-
-
-def _start(variable: Variable) -> float:
-    text = variable.start
-    if variable.kind == "boolean":
-        return float(text in {"true", "1"})
-    return float(text or 0.0)
 
 
 def _other(variable: Variable) -> float:
     if variable.kind == "boolean":
-        return 1.0 - _start(variable)
+        return 1.0 - variable.start_number
     if variable.items:
-        return float(next((v for _, v in variable.items if v != _start(variable)), 0))
+        return float(next((v for _, v in variable.items if v != variable.start_number), 0))
     for bound in (variable.maximum, variable.minimum):
-        if np.isfinite(bound) and bound != _start(variable):
+        if np.isfinite(bound) and bound != variable.start_number:
             return bound
-    return _start(variable) + 1.0
+    return variable.start_number + 1.0

@@ -30,7 +30,13 @@ from fmugym.adapters import Status
 from fmugym.archive import FMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.model_description import Variable
-from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.base import (
+    FloatArray,
+    MaskArray,
+    PoolSpec,
+    StatusArray,
+    available_processors,
+)
 
 __all__ = ["NativePool"]
 
@@ -77,6 +83,7 @@ class NativePool:
         private_libraries: Whether each instance gets a copy of the FMU's library, and so of its
             global variables, of its own; by default only where the FMU says that it can be
             instantiated only once per process. See ``fmugym.pool.isolation``.
+        first_index: What messages number the first instance.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -98,6 +105,7 @@ class NativePool:
         *,
         threads: int | None = None,
         private_libraries: bool | None = None,
+        first_index: int = 0,
     ) -> None:
         capabilities = fmu.description.capabilities
         if private_libraries is None:
@@ -110,7 +118,7 @@ class NativePool:
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations: FloatArray32 = np.zeros((num_instances, spec.num_observed), np.float32)
         self._result = self.outputs, self.statuses
-        self._fmu, self._spec = fmu, spec
+        self._fmu, self._spec, self._first_index = fmu, spec, first_index
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
         try:
             self._pool = self._open(log, private_libraries)
@@ -122,8 +130,8 @@ class NativePool:
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
+        paths = [fmu.prepare_library()]
         folder = fmu.extract()
-        paths = [folder / fmu.library]
         if private_libraries:
             paths = _copy_library(folder, Path(fmu.library), self.num_instances)
         try:
@@ -152,7 +160,7 @@ class NativePool:
                 self.outputs,
                 self.statuses,
                 self.observations,
-                _Receiver(log, description.model_identifier),
+                _Receiver(log, description.model_identifier, self._first_index),
             )
         except OSError as error:
             raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
@@ -235,7 +243,8 @@ class NativePool:
         if status < 0:  # it was refused, and is a whole sentence
             return doing
         label = Status(status).name.capitalize()
-        return f"{self._fmu.description.model_identifier}_{index}: {doing} returned {label}"
+        name = f"{self._fmu.description.model_identifier}_{self._first_index + index}"
+        return f"{name}: {doing} returned {label}"
 
     def _string_name(self, reference: int) -> str:
         return next(v.name for v, _ in self._spec.strings if v.value_reference == reference)
@@ -433,19 +442,13 @@ def _program_bytes(program: PlayProgram) -> tuple[bytes, bytes, bytes]:
 class _Receiver:
     """Passes the messages of the FMU on; it must not refer to the pool."""
 
-    def __init__(self, log: logging.Logger, model: str) -> None:
-        self._log, self._model = log, model
+    def __init__(self, log: logging.Logger, model: str, first_index: int) -> None:
+        self._log, self._model, self._first_index = log, model, first_index
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
-        self._log.log(level, "%s_%d: [%s] %s", self._model, index, category, message)
-
-
-def available_processors() -> int:
-    """The number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        number = self._first_index + index
+        self._log.log(level, "%s_%d: [%s] %s", self._model, number, category, message)
 
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:

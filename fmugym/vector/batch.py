@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from fmugym import spaces as fmu_spaces
 from fmugym.adapters import Status
-from fmugym.env import FMUEnv
+from fmugym.env import FMUEnv, pool_info
 from fmugym.episode import EpisodePlan
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
@@ -370,7 +370,10 @@ class BatchEngine(Engine):
     def _infos(self, mask: MaskArray) -> dict[str, Any]:
         if not self.env._has_info:
             return {}
-        return self._info_arrays(self.env._get_info(), mask)
+        info = self.env._get_info()
+        if self.env._is_paced:
+            info = info | pool_info(self._pool)
+        return self._info_arrays(info, mask)
 
     def _info_arrays(self, info: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
         values = {name: self._info_array(value, mask) for name, value in info.items()}

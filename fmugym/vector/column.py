@@ -82,5 +82,10 @@ class PoolColumn:
         """See ``Pool.read``."""
         return self._pool.read(variables)[:, self._index : self._index + 1]
 
+    def info(self) -> dict[str, npt.NDArray[Any]]:
+        """See ``BackendPool.info``; only for columns of one."""
+        pool: Any = self._pool
+        return {name: row[self._index : self._index + 1] for name, row in pool.info().items()}
+
     def close(self) -> None:
         """The pool is the vector environment's to close."""

@@ -25,6 +25,7 @@ from fmugym.vector.views import column
 __all__ = ["FMUVectorEnv", "vectorized"]
 
 HOOKS = ("auto", "compiled", "array", "per_env")
+POOL_OPTIONS = ("threads", "private_libraries", "isolation", "workers", "call_timeout")
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +49,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             arrays, or one environment at a time. ``"compiled"``, ``"array"`` and ``"per_env"`` ask
             for one of them; where it is not possible, that is an error.
         pool_options: Passed to ``fmugym.pool.make_pool``: ``backend``, ``threads``,
-            ``private_libraries``.
+            ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
     Raises:
         ConfigError: If an argument does not fit, or with ``hooks="array"`` if a hook does not
@@ -138,7 +139,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_open("reset")
         remaining = dict(options or {})
         mask = self._checked_mask(remaining.pop("reset_mask", None))
-        observations, infos = self._engine.reset(mask, self._seeds(seed), remaining)
+        seeds = self._seeds(seed)
+        try:
+            observations, infos = self._engine.reset(mask, seeds, remaining)
+        except BaseException:
+            self._prototype._halt()
+            raise
         self._started = True
         return observations, infos
 
@@ -187,9 +193,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if engine.any_ended and self._mode is AutoresetMode.DISABLED:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
-        result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
-        if engine.any_ended and self._mode is AutoresetMode.SAME_STEP:
-            return self._start_again(result, engine.ended.copy())
+        try:
+            result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
+            if engine.any_ended and self._mode is AutoresetMode.SAME_STEP:
+                return self._start_again(result, engine.ended.copy())
+        except BaseException:  # as in a single environment
+            self._prototype._halt()
+            raise
         return result
 
     def _refuse_step(self) -> None:
@@ -307,13 +317,14 @@ def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEn
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         hooks: str = "auto",
-        backend: str = "auto",
-        threads: int | None = None,
-        private_libraries: bool | None = None,
+        backend: Any = "auto",
         **kwargs: Any,
     ) -> FMUVectorEnv:
         """Make a vector environment; see ``FMUVectorEnv``."""
+        pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
         creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class
+        if not isinstance(backend, str):  # no name of a pool: the class knows what to do with it
+            kwargs["backend"], backend = backend, "auto"
         return FMUVectorEnv(
             lambda: creator(**kwargs),
             num_envs,
@@ -321,8 +332,7 @@ def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEn
             autoreset_mode=autoreset_mode,
             hooks=hooks,
             backend=backend,
-            threads=threads,
-            private_libraries=private_libraries,
+            **pool_options,
         )
 
     return make

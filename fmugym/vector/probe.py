@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from fmugym.adapters import Status
 from fmugym.env import FMUEnv
+from fmugym.pool import BackendPool
 from fmugym.pool.base import FloatArray
 from fmugym.values import EpisodeVariables
 from fmugym.vector.views import batched, column, copied_attributes, light_copy
@@ -124,6 +125,8 @@ _Visited = tuple[FloatArray, FloatArray, FloatArray]
 def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
     """Run short episodes with small inputs; a slow FMU should not be kept busy for long."""
     pool, plan = env._open_pool("the probe"), env._plan
+    if isinstance(pool, BackendPool):
+        return _imagine_states(pool, rng)
     mask = np.zeros(pool.num_instances, np.bool_)
     mask[0] = True
     visited: list[_Visited] = []
@@ -137,6 +140,15 @@ def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
                 pool.step(None, ~mask)
             visited.append((before, pool.outputs[:, 0].copy(), pool.inputs[:, 0].copy()))
     return visited
+
+
+def _imagine_states(pool: BackendPool, rng: np.random.Generator) -> list[_Visited]:
+    """Draw states: nothing real is to be moved to try hooks."""
+    sizes = (len(pool.outputs), len(pool.outputs), len(pool.inputs))
+    return [
+        (rng.normal(size=sizes[0]), rng.normal(size=sizes[1]), rng.normal(size=sizes[2]))
+        for _ in range(_EPISODES * _STEPS)
+    ]
 
 
 def _place_sample(

@@ -1,15 +1,16 @@
-"""The lab's time: real, faster than real, or moved by hand.
+"""The time of what is not simulated step by step: real, faster than real, or moved by hand.
 
-A lab asks its clock what time it is and sleeps on it; nothing else tells it the time. With any but
-the default clock a program takes `clock.time` and `clock.sleep` in the place of `time.time` and
-`time.sleep`, which the clock does not know of.
+A lab, and whatever is paced, asks its clock what time it is and sleeps on it; nothing else tells it
+the time. With any but the default clock a program takes `clock.time` and `clock.sleep` in the place
+of `time.time` and `time.sleep`, which the clock does not know of.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Final, Protocol
 
 from fmugym.errors import ConfigError
@@ -23,14 +24,14 @@ end of a wait."""
 
 
 class Clock(Protocol):
-    """What a lab asks of its clock; both methods may be called from any thread."""
+    """What is asked of a clock; both methods may be called from any thread."""
 
     def time(self) -> float:
-        """Return the lab's time, in s."""
+        """Return the time, in s."""
         ...
 
     def sleep(self, seconds: float) -> None:
-        """Wait for some of the lab's time, in s."""
+        """Wait for some time, in s; not at all if that is negative."""
         ...
 
 
@@ -38,8 +39,8 @@ class RealClock:
     """A clock that runs like the machine's own, or faster.
 
     Args:
-        speed: Seconds of the lab's time per second. What the machine is late by grows with it: 0.1
-            ms are 1 ms of the lab's time at ``speed=10``.
+        speed: Seconds of the clock's time per second. What the machine is late by grows with it:
+            0.1 ms are 1 ms of the clock's time at ``speed=10``.
 
     Raises:
         ConfigError: If the speed is not positive.
@@ -52,11 +53,11 @@ class RealClock:
         self._start = time.perf_counter()
 
     def time(self) -> float:
-        """Return the lab's time since this clock was made, in s."""
+        """Return the time since this clock was made, in s."""
         return (time.perf_counter() - self._start) * self.speed
 
     def sleep(self, seconds: float) -> None:
-        """Wait for some of the lab's time, in s; not at all if that is negative."""
+        """Wait for some of the clock's time, in s; not at all if that is negative."""
         end = time.perf_counter() + seconds / self.speed
         while (rest := end - time.perf_counter()) > 0.0:
             time.sleep(max(0.0, rest - _OVERSLEPT))
@@ -77,6 +78,7 @@ class ManualClock:
         self._now = start
         self._changed = threading.Condition()
         self._crew: set[threading.Thread] = set()
+        self._working_for: dict[threading.Thread, set[threading.Thread]] = {}
         self._sleepers: dict[threading.Thread, float] = {}
 
     def time(self) -> float:
@@ -124,14 +126,41 @@ class ManualClock:
         """
         return _CrewThread(self, target, args, name)
 
+    @contextmanager
+    def handed_over(self, threads: Sequence[threading.Thread]) -> Iterator[None]:
+        """Let time wait for threads that work for the caller, in the place of the caller's own.
+
+        Args:
+            threads: Each must `leave` when its work is done; with the last of them time waits for
+                the caller again, if it did before.
+        """
+        caller = threading.current_thread()
+        with self._changed:
+            if caller in self._crew:
+                self._crew.discard(caller)
+                self._working_for[caller] = set(threads)
+            self._crew.update(threads)
+            self._jump()
+        try:
+            yield
+        finally:
+            for thread in threads:
+                self.leave(thread)
+
+    def leave(self, thread: threading.Thread) -> None:
+        """Let time wait for a thread no longer."""
+        with self._changed:
+            self._crew.discard(thread)
+            for caller, threads in list(self._working_for.items()):
+                threads.discard(thread)
+                if not threads:
+                    del self._working_for[caller]
+                    self._crew.add(caller)
+            self._jump()
+
     def _join(self, thread: threading.Thread) -> None:
         with self._changed:
             self._crew.add(thread)
-
-    def _leave(self, thread: threading.Thread) -> None:
-        with self._changed:
-            self._crew.discard(thread)
-            self._jump()
 
     def _jump(self) -> None:
         """Go to the first waking if nobody is at work; those overdue are at work."""
@@ -156,11 +185,11 @@ class _CrewThread(threading.Thread):
         try:
             super().start()
         except BaseException:
-            self._clock._leave(self)
+            self._clock.leave(self)
             raise
 
     def run(self) -> None:
         try:
             super().run()
         finally:
-            self._clock._leave(self)
+            self._clock.leave(self)

@@ -1,4 +1,4 @@
-"""The lab's clocks."""
+"""Clocks: the machine's, and one that is moved by hand."""
 
 import threading
 import time
@@ -6,7 +6,7 @@ import time
 import pytest
 
 from fmugym import ConfigError
-from fmugym.lab import ManualClock, RealClock
+from fmugym.clock import ManualClock, RealClock
 
 
 class TestRealClock:
@@ -82,6 +82,40 @@ class TestManualClock:
         for thread in threads:
             thread.join(10)
         assert [moment for moment, _ in seen] == [0.3, 0.5, 0.6, 0.9, 1.0, 1.2, 1.3]
+
+    def test_time_waits_for_those_who_work_for_a_thread(self):
+        clock, seen = ManualClock(), []
+        gate, other = threading.Barrier(2), threading.Event()
+
+        def work():
+            clock.sleep(0.2)
+            clock.leave(threading.current_thread())
+            other.wait(10)
+
+        def program():
+            helper = threading.Thread(target=work)
+            gate.wait(10)
+            with clock.handed_over([helper]):
+                helper.start()
+                while clock.time() < 0.2:
+                    time.sleep(0.001)
+                seen.append(clock.time())
+            clock.sleep(0.3)
+            seen.append(clock.time())
+            other.set()
+            helper.join(10)
+
+        def sleeper():
+            gate.wait(10)
+            clock.sleep(0.4)
+            seen.append(clock.time())
+
+        threads = [clock.thread(program), clock.thread(sleeper)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(10)
+        assert seen == pytest.approx([0.2, 0.4, 0.5])
 
     @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
     def test_a_thread_that_fails_does_not_stop_the_time(self):

@@ -1,0 +1,142 @@
+"""What it costs to run FMUs in worker processes, and how soon a fault of theirs is dealt with."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from busy import BusyEnv, build
+from measure import Effort, MissingError
+from tables import Table, duration, share
+
+from fmugym.env import request_pool
+from fmugym.envs import CartPoleEnv
+
+__all__ = ["tables"]
+
+CALLS = 2000
+"""One after another, before the other configuration has its turn."""
+SIZE = 64
+MEAN = 100.0
+"""Of a step of the heavy FMU, in us."""
+TIMEOUT = 0.2
+"""In seconds, for the hang."""
+
+
+def tables(effort: Effort) -> list[Table]:
+    """Measure."""
+    with ExitStack() as stack:
+        return [_cost(stack, effort), _faults(stack, effort)]
+
+
+def _cost(stack: ExitStack, effort: Effort) -> Table:
+    header = ["a step of the pool", "in-process", "in one worker", "added", ""]
+    table = Table("Worker processes: median time of a call", header)
+    _add_cost(table, "1 cart-pole", _pools(stack, CartPoleEnv, 1), effort)
+    try:
+        path = build(Path(stack.enter_context(tempfile.TemporaryDirectory())))
+    except MissingError as reason:
+        table.rows.append([f"{SIZE} heavy FMUs", str(reason), "", "", ""])
+        return table
+    pools = _pools(stack, lambda: BusyEnv(path, MEAN, 0.0), SIZE)
+    name = f"{SIZE} FMUs of {duration(1e-6 * MEAN)} each"
+    _add_cost(table, name, pools, effort._replace(rounds=min(effort.rounds, 5)), CALLS // 100)
+    return table
+
+
+def _pools(stack: ExitStack, make_env: Callable[[], Any], count: int) -> list[Any]:
+    """One on a single thread here, and one in a single worker."""
+    pools = []
+    for options in ({"isolation": "none"}, {"isolation": "process", "workers": 1}):
+        with request_pool(count, threads=1, **options):
+            env = make_env()
+        stack.callback(env.close)
+        plan = env._plan
+        pools.append(env._pool)
+        env._pool.reset(plan.model_variables, np.repeat(plan.constants[:, None], count, axis=1))
+    return pools
+
+
+def _add_cost(
+    table: Table, name: str, pools: list[Any], effort: Effort, calls: int = CALLS
+) -> None:
+    calls = 10 if effort.quick else calls
+    rounds = [[_median_time(pool.step_own, calls) for pool in pools] for _ in range(effort.rounds)]
+    here, there = (statistics.median(times) for times in zip(*rounds, strict=True))
+    added = statistics.median(b - a for a, b in rounds)
+    cells = [duration(here), duration(there), duration(added), share(added / here)]
+    table.rows.append([name, *cells])
+    table.data.append({"configuration": name, "in_process_s": here, "in_worker_s": there})
+
+
+def _median_time(call: Callable[[], object], count: int) -> float:
+    times = []
+    for _ in range(count):
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def _faults(stack: ExitStack, effort: Effort) -> Table:
+    table = Table("Worker processes: faults of one cart-pole", ["what", "median", "longest"])
+    count = 3 if effort.quick else 30
+    with request_pool(1, isolation="process"):
+        env = CartPoleEnv(log_level=logging.CRITICAL)
+    stack.callback(env.close)
+    cases: dict[str, Callable[[], float]] = {
+        "a worker is killed: until the step is truncated": lambda: _death(env),
+        "then until the reset has given an observation": lambda: _restart(env),
+    }
+    for name, measure in cases.items():
+        _add_times(table, name, [_after_death(env, measure) for _ in range(count)])
+    hangs = [_hang(stack) for _ in range(1 if effort.quick else 10)]
+    _add_times(table, f"a step hangs: after its time-out of {duration(TIMEOUT)}", hangs)
+    return table
+
+
+def _after_death(env: Any, measure: Callable[[], float]) -> float:
+    env.reset()
+    return measure()
+
+
+def _death(env: Any) -> float:
+    begin = time.perf_counter()
+    os.kill(env._pool.processes()[0], signal.SIGKILL)
+    while not env.step(0)[3]:
+        continue
+    return time.perf_counter() - begin
+
+
+def _restart(env: Any) -> float:
+    _death(env)
+    begin = time.perf_counter()
+    env.reset()
+    return time.perf_counter() - begin
+
+
+def _hang(stack: ExitStack) -> float:
+    """A worker that is stopped does not answer."""
+    with request_pool(1, isolation="process", call_timeout=TIMEOUT):
+        env = CartPoleEnv(log_level=logging.CRITICAL)
+    stack.callback(env.close)
+    env.reset()
+    os.kill(env._pool.processes()[0], signal.SIGSTOP)
+    begin = time.perf_counter()
+    while not env.step(0)[3]:
+        continue
+    return time.perf_counter() - begin - TIMEOUT
+
+
+def _add_times(table: Table, name: str, times: list[float]) -> None:
+    table.rows.append([name, duration(statistics.median(times)), duration(max(times))])
+    table.data.append({"what": name, "median_s": statistics.median(times), "max_s": max(times)})

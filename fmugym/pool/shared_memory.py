@@ -1,0 +1,121 @@
+"""Arrays that several processes share, in memory without a name.
+
+Memory that has no name in the file system goes with the last process that uses it, however that
+one ends: there is nothing to be unlinked and nothing that could be left behind.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import secrets
+import sys
+import tempfile
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+
+__all__ = ["Arrays", "Memory", "make_arrays", "size_of_arrays"]
+
+_ALIGNMENT: Final = 64
+"""Of each array, in bytes: a cache line."""
+
+
+class Arrays(NamedTuple):
+    """The arrays of a pool; see ``Pool``.
+
+    Attributes:
+        mask: Which instances not to step, shape (N,).
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    observations: npt.NDArray[np.float32]
+    statuses: StatusArray
+    mask: MaskArray
+
+    def block(self, columns: slice) -> Arrays:
+        """The parts of some of the instances."""
+        return Arrays(
+            self.inputs[:, columns],
+            self.outputs[:, columns],
+            self.observations[columns],
+            self.statuses[columns],
+            self.mask[columns],
+        )
+
+
+def _layout(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
+    return [
+        ((len(spec.inputs), count), np.float64),
+        ((len(spec.outputs), count), np.float64),
+        ((count, spec.num_observed), np.float32),
+        ((count,), np.int8),
+        ((count,), np.bool_),
+    ]
+
+
+def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    return int(-(-size // _ALIGNMENT) * _ALIGNMENT)
+
+
+def size_of_arrays(spec: PoolSpec, count: int) -> int:
+    """Bytes that the arrays of a pool take."""
+    return sum(_padded_size(*row) for row in _layout(spec, count))
+
+
+def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
+    """Lay the arrays of a pool of ``count`` instances out in memory, which they keep alive."""
+    arrays: list[Any] = []
+    offset = 0
+    for shape, dtype in _layout(spec, count):
+        arrays.append(np.ndarray(shape, dtype, memory.map, offset))
+        offset += _padded_size(shape, dtype)
+    return Arrays(*arrays)
+
+
+class Memory:
+    """Zeros, to be shared.
+
+    Args:
+        size: In bytes, not 0.
+        descriptor: The file descriptor of memory that was made elsewhere.
+        tag: Its name instead, on Windows, which forgets a name together with its memory.
+
+    Attributes:
+        size: In bytes.
+        descriptor: The file descriptor; -1 on Windows.
+        tag: The name on Windows.
+        map: The memory itself.
+    """
+
+    def __init__(self, size: int, descriptor: int = -1, tag: str = "") -> None:
+        self.size = size
+        self.descriptor, self.tag = descriptor, tag
+        if sys.platform == "win32":
+            self.tag = tag or f"fmugym-{os.getpid()}-{secrets.token_hex(8)}"
+            self.map = mmap.mmap(-1, size, self.tag)
+        else:
+            self.descriptor = _anonymous_file(size) if descriptor < 0 else descriptor
+            self.map = mmap.mmap(self.descriptor, size)
+
+    def close(self) -> None:
+        """Close the file descriptor; what is mapped stays so as long as it is in use."""
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
+
+
+def _anonymous_file(size: int) -> int:
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("fmugym", os.MFD_CLOEXEC)
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.ftruncate(descriptor, size)
+    return descriptor

@@ -1,0 +1,73 @@
+"""An FMU that harms its process (``faulty.c``), and an environment over it."""
+
+import functools
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import fmpy
+import fmu_tools
+
+import fmugym
+
+FAULTS = {"none": 0, "crash": 1, "abort": 2, "exit": 3, "hang": 4, "close": 5}
+STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
+
+VARIABLES = {
+    "u": 'causality="input"><Real start="0"/>',
+    "y": 'causality="output"><Real/>',
+    "fault": 'causality="parameter" variability="fixed"><Real start="0"/>',
+    "stage": 'causality="parameter" variability="fixed"><Real start="0"/>',
+    "at": 'causality="parameter" variability="fixed"><Real start="0"/>',
+}
+
+
+@functools.cache
+def _library():
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / f"Faulty{fmpy.sharedLibraryExtension}"
+        source = Path(__file__).parent / "faulty.c"
+        command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
+        command += ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter"]
+        subprocess.run([*command, source, "-o", library], check=True)
+        return library.read_bytes()
+
+
+def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
+    """Write the FMU; the token ``{faulty-F}`` lets it fail in its instantiation."""
+    variables = "".join(
+        f'<ScalarVariable name="{name}" valueReference="{index}" {rest}</ScalarVariable>'
+        for index, (name, rest) in enumerate(VARIABLES.items())
+    )
+    xml = (
+        f'<fmiModelDescription fmiVersion="2.0" modelName="Faulty" guid="{token}"><CoSimulation '
+        f'modelIdentifier="Faulty" canHandleVariableCommunicationStepSize="true" '
+        f'canGetAndSetFMUstate="true" {capabilities}/>'
+        f"<ModelVariables>{variables}</ModelVariables><ModelStructure/></fmiModelDescription>"
+    )
+    files = {"modelDescription.xml": xml, fmu_tools.library_name(2, "Faulty"): _library()}
+    return fmu_tools.write_fmu(Path(folder) / "Faulty.fmu", files)
+
+
+def start_values(fault="none", stage="step", at=2):
+    """The parameters that ask for a fault."""
+    return {"fault": FAULTS[fault], "stage": STAGES[stage], "at": at}
+
+
+class FaultyEnv(fmugym.FMI2CSEnv):
+    """Integrates its action until the FMU does what its parameters say."""
+
+    def __init__(self, path, fault="none", stage="step", at=2, **config):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "model_parameters": start_values(fault, stage, at),
+            "time_step": 0.5,
+            "bounds": {"u": (-1, 1)},
+            "isolation": "process",
+        } | config
+        super().__init__(path, config)
+
+    def _is_done(self):
+        return self.state[0] < -1e9

@@ -1,0 +1,611 @@
+"""FMUs that end, hang or harm their process: the caller's own goes on, and nothing is left behind.
+
+That the pool is otherwise like any other is shown by test_pool.py.
+"""
+
+import contextlib
+import logging
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from process_tools import FaultyEnv, faulty_fmu, start_values
+
+import fmugym
+from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
+from fmugym import pool as pools
+from fmugym.adapters import Status
+from fmugym.pool import PoolSpec
+from fmugym.pool.block_worker import BlockWorker
+from fmugym.pool.channel import Channel
+from fmugym.pool.launcher import _fork_server, _SpawnedProcess
+from fmugym.pool.process import ProcessPool
+from fmugym.pool.shared_memory import Memory
+from fmugym.temporary import make_folder, sweep
+
+LOG = logging.getLogger("fmugym.test")
+HERE = Path(__file__).parent
+
+posix_only = pytest.mark.skipif(os.name != "posix", reason="needs signals and forks")
+linux_only = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+each_death = pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("crash", "SIGSEGV"),
+        ("abort", "SIGABRT"),
+        ("exit", "exit status 0"),
+        ("close", "worker process"),
+        ("hang", "took longer than call_timeout"),
+    ],
+)
+
+
+@pytest.fixture(name="faulty", scope="module")
+def fixture_faulty(tmp_path_factory):
+    """The path of the FMU."""
+    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(name="opened")
+def fixture_opened():
+    """Closes what is entered into it."""
+    with contextlib.ExitStack() as stack:
+        yield lambda closable: stack.enter_context(contextlib.closing(closable))
+
+
+@pytest.fixture(name="make_env")
+def fixture_make_env(faulty, opened):
+    def make(*args, **config):
+        call_timeout = 0.7 if "hang" in args else 20.0
+        return opened(FaultyEnv(faulty, *args, call_timeout=call_timeout, **config))
+
+    return make
+
+
+@pytest.fixture(name="make_vector_env")
+def fixture_make_vector_env(faulty, opened):
+    def make(num_envs, *args, **options):
+        options = {"workers": 2, "call_timeout": 20.0} | options
+        return opened(fmugym.FMUVectorEnv(lambda: FaultyEnv(faulty, *args), num_envs, **options))
+
+    return make
+
+
+@pytest.fixture(name="make_pool")
+def fixture_make_pool(faulty, opened):
+    def make(num_instances=1, path=faulty, **options):
+        fmu = FMU(path)
+        outputs = tuple(map(fmu.variable, ["y", "fault"]))
+        spec = PoolSpec((fmu.variable("u"),), outputs, time_step=0.5, num_observed=1)
+        options = {"isolation": "process", "workers": 2, "call_timeout": 20.0} | options
+        return opened(pools.make_pool(fmu, spec, num_instances, LOG, **options))
+
+    return make
+
+
+def set_up(pool, faulty, fault, mask=None, **stage):
+    """Reset with a fault for each instance."""
+    fmu = FMU(faulty)
+    columns = [list(start_values(one, **stage).values()) for one in fault]
+    variables = tuple(fmu.variable(name) for name in start_values())
+    return pool.reset(variables, np.array(columns, float).T, mask)
+
+
+def step(pool, value=1.0, **options):
+    return pool.step(np.full((1, pool.num_instances), value), **options)
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until(condition, seconds=20.0):
+    """Wait for what is bound to happen soon."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+class TestSingle:
+    @each_death
+    def test_the_episode_is_truncated_and_the_next_one_goes_well(self, make_env, fault, cause):
+        env = make_env(fault)
+        for _ in range(2):
+            env.reset()
+            assert env.step([1.0])[0] == [0.5]
+            observation, reward, terminated, truncated, info = env.step([1.0])
+            assert (observation.tolist(), reward, terminated, truncated) == (
+                [0.5],
+                0.0,
+                False,
+                True,
+            )
+            assert "Faulty.fmu" in info["fault"]
+            assert "in a step" in info["fault"] or "for a step" in info["fault"]
+            assert cause in info["fault"]
+
+    def test_policies_are_those_of_other_faults(self, make_env):
+        env = make_env("crash", on_fault="terminate", fault_reward=-7)
+        env.reset()
+        env.step([1.0])
+        assert env.step([1.0])[1:4] == (-7.0, True, False)
+        env = make_env("crash", on_fault="raise")
+        env.reset()
+        env.step([1.0])
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            env.step([1.0])
+
+    def test_a_worker_that_is_killed_between_two_calls(self, make_env):
+        env = make_env()
+        env.reset()
+        os.kill(env._pool.processes()[0], signal.SIGKILL)
+        assert "SIGKILL" in env.step([1.0])[4]["fault"]
+        env.reset()
+        assert not env.step([1.0])[3]
+
+    def test_last_words_are_told(self, make_pool, faulty):
+        """Of the Python pool, which passes messages on at once."""
+        pool = make_pool(backend="python")
+        set_up(pool, faulty, ["crash"], at=1)
+        assert step(pool)[1].tolist() == [Status.FATAL]
+        assert pool.failure(0).endswith("; the FMU said: Faulty_1: [last words] this is fault 1")
+
+    @pytest.mark.parametrize("stage", ["terminate", "free"])
+    def test_the_end_of_an_instance(self, make_env, stage, caplog):
+        env = make_env("crash", stage)
+        env.reset()
+        (pid,) = env._pool.processes()
+        env.close()
+        assert not is_alive(pid)
+        assert "SIGSEGV in its end" in caplog.text
+
+    @pytest.mark.parametrize(("number", "cause"), [(1, "SIGSEGV"), (3, "exit status 0")])
+    def test_instantiation(self, tmp_path, temp_root, number, cause):
+        path = faulty_fmu(tmp_path, f"{{faulty-{number}}}")
+        with pytest.raises(FMULoadError, match=f"{cause} in the instantiation"):
+            FaultyEnv(path)
+        assert list(temp_root.iterdir()) == []
+
+    def test_a_reset_that_ends_the_process_is_done_by_the_next_one(self, make_env):
+        env = make_env("crash", "reset")
+        for _ in range(3):
+            env.reset()
+            assert env.step([1.0])[0] == [0.5]
+
+    def test_a_process_that_ends_in_each_reset(self, make_env):
+        env = make_env("abort", "initialize")
+        for _ in range(5):
+            with pytest.raises(SimulationError, match="SIGABRT in a reset"):
+                env.reset()
+        with pytest.raises(SimulationError, match=r"given up after 5 deaths in a row: .*SIGABRT"):
+            env.reset()
+
+    def test_pickles_with_its_isolation(self, make_env, opened):
+        env = make_env("crash")
+        twin = opened(pickle.loads(pickle.dumps(env)))
+        assert twin._pool.processes() != env._pool.processes()
+        for one in (env, twin):
+            one.reset()
+            assert one.step([1.0])[0] == [0.5]
+            assert one.step([1.0])[3]
+
+    def test_unknown_isolation(self, make_env):
+        with pytest.raises(ConfigError, match="unknown isolation 'proces'; did you mean 'process'"):
+            make_env(isolation="proces")
+
+
+class TestVector:
+    @pytest.mark.parametrize(("fault", "cause"), [("crash", "SIGSEGV"), ("hang", "call_timeout")])
+    def test_only_the_episodes_of_one_worker_are_truncated(self, make_vector_env, fault, cause):
+        env = make_vector_env(4, call_timeout=0.7 if fault == "hang" else 20.0)
+        env.set_attr("fault", [start_values(fault)["fault"], 0, 0, 0])
+        env.reset()
+        actions = np.ones((4, 1))
+        env.step(actions)
+        observations, _, terminated, truncated, infos = env.step(actions)
+        assert truncated.tolist() == [True, True, False, False]
+        assert not terminated.any()
+        assert observations.ravel().tolist() == [0.5, 0.5, 1.0, 1.0]
+        assert all(cause in reason for reason in infos["fault"][:2])
+        assert infos["fault"][2:].tolist() == [None, None]
+        observations = env.step(actions)[0]  # the autoreset
+        assert observations.ravel().tolist() == [0.0, 0.0, 1.5, 1.5]
+        observations, _, _, truncated, _ = env.step(actions)
+        assert observations.ravel().tolist() == [0.5, 0.5, 2.0, 2.0]
+        assert not truncated.any()
+
+    def test_training_goes_on(self, make_vector_env):
+        env = make_vector_env(3, workers=3)
+        env.set_attr("fault", [start_values(fault)["fault"] for fault in ("crash", "exit", "none")])
+        env.reset()
+        ends = [env.step(np.ones((3, 1)))[3].tolist() for _ in range(9)]
+        assert ends == [[False] * 3, [True, True, False], [False] * 3] * 3
+
+    def test_from_make_vec(self, opened):
+        options = {"isolation": "process", "workers": 3}
+        env = opened(gymnasium.make_vec("fmugym/CartPole-v0", num_envs=5, **options))
+        assert len(env.unwrapped._prototype._pool.processes()) == 3
+
+
+class TestPool:
+    def test_blocks_and_processes(self, make_pool):
+        assert len(set(make_pool(5, workers=3).processes())) == 3
+        assert len(make_pool(2, workers=9).processes()) == 2
+
+    def test_lost_instances_stay_so_until_their_own_reset(self, make_pool, faulty):
+        pool = make_pool(4)
+        set_up(pool, faulty, ["crash", "none", "none", "none"], at=1)
+        assert step(pool)[1].tolist() == [4, 4, 0, 0]
+        set_up(pool, faulty, ["none"] * 4, np.array([False, True, False, False]))
+        outputs, statuses = step(pool)
+        assert statuses.tolist() == [4, 0, 0, 0]
+        assert outputs[0].tolist() == [0.0, 0.5, 1.0, 1.0]
+        assert "SIGSEGV" in pool.failure(0)
+        assert pool.step_own() == 1
+        set_up(pool, faulty, ["none"] * 4)
+        assert step(pool)[1].tolist() == [0] * 4
+
+    def test_the_outputs_stay_those_before_the_death(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["none", "abort"], at=2)
+        observations = np.full((2, 1), np.nan, np.float32)
+        step(pool)
+        outputs, _ = step(pool, observations=observations)
+        assert outputs[0].tolist() == [1.0, 0.5]
+        assert observations.ravel().tolist() == [1.0, 0.5]
+
+    def test_a_skipped_instance_cannot_die(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        assert step(pool, skip=np.array([True, False]))[1].tolist() == [0, 0]
+        assert step(pool)[1].tolist() == [4, 0]
+
+    def test_snapshots_go_with_their_process(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=2)
+        step(pool)
+        snapshot = pool.save()
+        assert step(pool)[1].tolist() == [4, 0]
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            pool.restore(snapshot)
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            pool.save()
+        set_up(pool, faulty, ["none", "none"])
+        with pytest.raises(SimulationError, match=r"process has been replaced since: .*SIGSEGV"):
+            pool.restore(snapshot)
+        outputs, _ = pool.restore(snapshot, np.array([False, True]))
+        assert outputs[0].tolist() == [0.0, 0.5]
+
+    def test_reading_is_refused_while_instances_are_lost(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        step(pool)
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            pool.read((FMU(faulty).variable("y"),))
+
+    def test_an_interrupted_call(self, make_pool, faulty):
+        """A reply that comes late must not be taken for that of the next call."""
+        pool = make_pool(2, call_timeout=None)
+        set_up(pool, faulty, ["hang", "none"], at=1)
+
+        def interrupt(*_):
+            raise KeyboardInterrupt
+
+        before = signal.signal(signal.SIGALRM, interrupt)
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                step(pool)
+        finally:
+            signal.signal(signal.SIGALRM, before)
+        assert "interrupted" in pool.failure(0)
+        set_up(pool, faulty, ["none", "none"])
+        assert step(pool)[0][0].tolist() == [0.5, 0.5]
+
+    def test_after_close(self, make_pool):
+        pool = make_pool()
+        pids = pool.processes()
+        pool.close()
+        assert not any(map(is_alive, pids))
+        with pytest.raises(SimulationError, match="the pool is closed"):
+            pool.step_own()
+
+    def test_several_at_once(self, make_pool, faulty):
+        first, second = make_pool(2), make_pool(3)
+        set_up(first, faulty, ["none"] * 2)
+        set_up(second, faulty, ["none", "none", "crash"], at=1)
+        step(second)
+        assert step(first)[0][0].tolist() == [0.5, 0.5]
+        first.close()
+        set_up(second, faulty, ["none"] * 3)
+        assert step(second)[0][0].tolist() == [0.5] * 3
+
+    def test_without_its_fork_server(self, make_pool, faulty):
+        pool = make_pool()
+        set_up(pool, faulty, ["none"])
+        os.kill(_fork_server().pid, signal.SIGKILL)
+        wait_until(lambda: not any(map(is_alive, pool.processes())))
+        assert step(pool)[1].tolist() == [Status.FATAL]
+        set_up(pool, faulty, ["none"])
+        assert step(pool)[1].tolist() == [Status.OK]
+
+    def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
+        start = lambda end, memory, folder: _SpawnedProcess(end, memory)  # noqa: E731
+        monkeypatch.setattr("fmugym.pool.supervisor.launch", start)
+        pool = make_pool()
+        set_up(pool, faulty, ["crash"], at=2)
+        assert step(pool)[0][0].tolist() == [0.5]
+        assert step(pool)[1].tolist() == [Status.FATAL]
+        assert "SIGSEGV in a step" in pool.failure(0)
+        set_up(pool, faulty, ["none"])
+        assert step(pool)[1].tolist() == [Status.OK]
+
+    @linux_only
+    def test_deaths_leave_nothing(self, make_pool, faulty, temp_root):
+        pool = make_pool()
+
+        def die():
+            set_up(pool, faulty, ["crash"], at=1)
+            step(pool)
+            return len(os.listdir("/proc/self/fd")), len(list(temp_root.iterdir()))
+
+        first = [die() for _ in range(3)][-1]
+        assert [die() for _ in range(10)] == [first] * 10
+
+
+class WorkerThread:
+    """A worker in this process, which shows what it does to those who look at this process only."""
+
+    pid = 0
+
+    def __init__(self, end, memory, folder):
+        self._end, self._memory = end.dup(), Memory(memory.size, os.dup(memory.descriptor))
+        worker = BlockWorker(Channel(self._end), self._memory)
+        self._thread = threading.Thread(target=worker.serve, daemon=True)
+        self._thread.start()
+
+    def kill(self):
+        with contextlib.suppress(OSError):
+            self._end.shutdown(socket.SHUT_RDWR)
+
+    def exit_status(self):
+        self._thread.join()
+        self._end.close()
+        self._memory.close()
+        return 0
+
+
+@posix_only
+@pytest.mark.parametrize("backend", ["auto", "python"])
+def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, backend):
+    here = make_pool(3, isolation="none")
+    monkeypatch.setattr("fmugym.pool.supervisor.launch", WorkerThread)
+    pool = make_pool(3, backend=backend)
+    with pytest.raises(SimulationError):
+        pool.save()  # before the first reset
+    for one in (here, pool):
+        set_up(one, faulty, ["none"] * 3)
+        step(one, 1.0)
+        snapshot = one.save()
+        step(one, 2.0, skip=np.array([False, True, False]))
+        one.restore(snapshot, np.array([False, False, True]))
+        one.inputs[:] = 4.0
+        assert one.step_own() == 0
+        del snapshot
+        step(one, np.inf)
+    np.testing.assert_array_equal(pool.outputs, here.outputs)
+    np.testing.assert_array_equal(pool.statuses, here.statuses)
+    np.testing.assert_array_equal(pool.observations, here.observations)
+    assert all(pool.failure(index).endswith("y = inf") for index in range(3))
+    variables = (FMU(faulty).variable("u"), FMU(faulty).variable("y"))
+    np.testing.assert_array_equal(pool.read(variables), here.read(variables))
+
+
+class TestChoice:
+    """An FMU whose second instance fails, though it has a copy of the library."""
+
+    def test_one_process_for_each_instance(self, make_pool, tmp_path, caplog):
+        path = faulty_fmu(tmp_path, "{lonely}")
+        pool = make_pool(3, path, isolation=None, workers=None)
+        assert isinstance(pool, ProcessPool)
+        assert len(pool.processes()) == 3
+        assert "each gets a process of its own" in caplog.text
+
+    def test_by_its_own_word(self, make_pool, tmp_path):
+        flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
+        alone = faulty_fmu(tmp_path / "1", "{lonely}", flag)
+        assert isinstance(make_pool(2, alone, isolation=None, workers=None), ProcessPool)
+        if pools.has_native_pool():  # else copies of the library are not to be had
+            path = faulty_fmu(tmp_path / "2", capabilities=flag)
+            assert not isinstance(make_pool(2, path, isolation=None), ProcessPool)
+
+    def test_with_isolation_asked_for(self, make_pool, tmp_path):
+        path = faulty_fmu(tmp_path, "{lonely}")
+        assert len(make_pool(2, path, workers=None).processes()) == 2
+
+
+PROGRAM = """
+import os, signal, sys, time
+import process_tools
+from fmugym.pool.launcher import _fork_server
+
+env = process_tools.FaultyEnv(sys.argv[1])
+env.reset()
+env.step([1.0])
+print(*env._pool.processes(), _fork_server().pid, flush=True)
+"""
+
+
+class TestEndOfParent:
+    @pytest.fixture(name="start")
+    def fixture_start(self, faulty, temp_root):
+        """Start a program; returns it and the numbers of its worker and of its fork server."""
+        programs = []
+
+        def start(end):
+            path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+            program = subprocess.Popen(
+                [sys.executable, "-W", "error", "-c", PROGRAM + textwrap.dedent(end), faulty],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"PYTHONPATH": path},
+                start_new_session=True,
+            )
+            programs.append(program)
+            return program, [int(pid) for pid in program.stdout.readline().split()]
+
+        yield start
+        for program in programs:
+            program.kill()
+            program.communicate()
+
+    @pytest.mark.parametrize("end", ["", "env.close()", "os._exit(0)", "sys.exit(0)", "del env"])
+    def test_ordinary(self, start, temp_root, end):
+        program, pids = start(end)
+        assert program.communicate()[1] == ""
+        wait_until(lambda: not any(map(is_alive, pids)))
+        assert list(temp_root.iterdir()) == []
+
+    @posix_only
+    @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+    def test_by_a_signal(self, start, temp_root, number):
+        """A Ctrl-C goes to all processes of the terminal."""
+        program, pids = start("time.sleep(60)")
+        send = os.killpg if number == signal.SIGINT else os.kill
+        send(program.pid, number)
+        stderr = program.communicate()[1]
+        assert "KeyboardInterrupt" in stderr if number == signal.SIGINT else stderr == ""
+        wait_until(lambda: not any(map(is_alive, pids)))
+        assert list(temp_root.iterdir()) == []
+
+    @linux_only
+    def test_while_the_fmu_hangs(self, start, temp_root):
+        end = "env.reset(options={'model_parameters': process_tools.start_values('hang', at=1)})"
+        program, pids = start(f"{end}; print('hanging', flush=True); env.step([1.0])")
+        assert program.stdout.readline() == "hanging\n"
+        program.kill()
+        wait_until(lambda: not any(map(is_alive, pids)))
+        wait_until(lambda: not list(temp_root.iterdir()))
+
+    @linux_only
+    def test_together_with_its_fork_server(self, start, temp_root):
+        """Only the folder remains, until the next process that needs one."""
+        program, pids = start("time.sleep(60)")
+        os.kill(pids[-1], signal.SIGKILL)
+        program.kill()
+        program.communicate()
+        wait_until(lambda: not any(map(is_alive, pids)))
+        (left,) = temp_root.iterdir()
+        sweep.cache_clear()
+        made = make_folder()
+        assert not left.exists()
+        sweep.cache_clear()
+        sweep()
+        assert made.exists()
+
+    @posix_only
+    def test_a_fork_of_it_leaves_the_pool_alone(self, start):
+        """The fork can neither use the pool nor take the folder away."""
+        program, _ = start(
+            """
+            child = os.fork()
+            if child == 0:
+                try:
+                    env.step([1.0])
+                except Exception as error:
+                    print(error, flush=True)
+                sys.exit(0)
+            os.waitpid(child, 0)
+            print(env.step([1.0])[0])
+            os.kill(env._pool.processes()[0], signal.SIGKILL)
+            print("SIGKILL" in env.step([1.0])[4]["fault"])
+            env.reset()
+            print(env.step([1.0])[0])
+            """
+        )
+        stdout, stderr = program.communicate()
+        lines = stdout.splitlines()
+        assert lines, stderr
+        assert "the process that this one was forked from" in lines[0]
+        assert lines[1:] == ["[1.]", "True", "[0.5]"]
+        assert "Error" not in stderr
+
+
+class TestReproducibility:
+    """The same seed and actions give the same bits, wherever the FMU runs."""
+
+    WAYS = (
+        {"backend": "python"},
+        {"backend": "auto", "threads": 1},
+        {"backend": "auto", "threads": 2},
+        *({"isolation": "process", "workers": workers} for workers in (1, 2, 3)),
+        {"isolation": "process", "workers": 2, "backend": "python"},
+    )
+
+    @staticmethod
+    def rollout(env):
+        observations = [env.reset(seed=3)[0].tobytes()]
+        rng = np.random.default_rng(4)
+        for _ in range(60):  # long enough for random actions to let poles fall
+            result = env.step(rng.integers(0, 2, env.num_envs))
+            observations += [array.tobytes() for array in result[:4]]
+        return observations
+
+    @pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
+    def test_of_vector_environments(self, opened, version):
+        rollouts = []
+        for options in self.WAYS:
+            arguments = {"num_envs": 5, "fmi_version": version} | options
+            env = opened(gymnasium.make_vec("fmugym/CartPole-v0", **arguments))
+            rollouts += [self.rollout(env), self.rollout(env)]
+        assert all(rollout == rollouts[0] for rollout in rollouts)
+
+    def test_of_pools_on_both_sides_of_a_death(self, make_pool, faulty):
+        """A new process goes on as the former one would have."""
+
+        def rollout(pool):
+            set_up(pool, faulty, ["none"] * 3)
+            return [step(pool, 0.1 * index)[0].tobytes() for index in range(5)]
+
+        pool = make_pool(3)
+        before = rollout(pool)
+        set_up(pool, faulty, ["crash", "none", "abort"], at=1)
+        assert step(pool)[1].any()
+        assert rollout(pool) == before
+
+
+def test_the_bundled_fmus_run_in_processes(opened):
+    """With what a user passes to a single environment of a class of his own."""
+
+    class Pole(fmugym.FMI2CSEnv):
+        def __init__(self):
+            config = {
+                "model_input_names": "f",
+                "model_output_names": ["x", "theta"],
+                "time_step": 0.02,
+                "isolation": "process",
+            }
+            super().__init__(bundled_fmu("CartPole"), config)
+
+        def _is_done(self):
+            return abs(self.state[1]) > 1.0
+
+    env = opened(Pole())
+    env.reset()
+    assert env.step([1.0])[0].shape == (2,)
+    assert env.read_variables("x").keys() == {"x"}
