@@ -33,6 +33,53 @@ def run(script, *arguments, folder, **environment):
     return done.stdout
 
 
+FOR_THE_REAL_LAB = """
+import time
+from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from cloudpendulumclient.client import Client
+from cloudpendulumclient.data import CellType
+
+def fall(angle):
+    cell, rows = Client(), []
+    token, _ = cell.start_episode(gym, "SimplePendulum", 5, 0.0, initial_position=[angle])
+    cell.set_impedance_controller_params([0.0], [0.0], token)
+    begin = time.time()
+    while len(rows) < 250:
+        rows.append((cell.get_position(token), cell.get_velocity(token)))
+        time.sleep(max(0.0, begin + 0.02 * len(rows) - time.time()))
+    cell.stop_episode(token)
+    return np.array(rows)
+
+user = Path("~/.env").expanduser().read_text().strip()
+info = Client().get_user_info(user)
+print(info.number_of_attempts, info.max_gym_length, info.gym_bucket_size, info.gym_max_bucket_size)
+gym = Client().start_gym(user, 30, [CellType.SINGLE] * 4)
+with ThreadPoolExecutor(4) as four:
+    rows = np.array(list(four.map(fall, np.random.default_rng(0).uniform(-np.pi, np.pi, 12))))
+Client().stop_gym(gym)
+velocity, sine = rows[:, 1:-1, 1].ravel(), np.sin(rows[:, 1:-1, 0]).ravel()
+acceleration = (rows[:, 2:, 1] - rows[:, :-2, 1]).ravel() / 0.04
+p1, p2 = np.linalg.lstsq(np.column_stack([-velocity, -sine]), acceleration, rcond=None)[0]
+print("length", 9.81 / p2)
+"""
+
+
+@pytest.mark.realtime
+def test_a_program_for_the_real_lab_runs_with_another_import(tmp_path, temp_root):
+    """Twelve swings on four cells of the default lab, in real time and at 50 Hz."""
+    (tmp_path / ".env").write_text("my token\n")
+    (tmp_path / "program.py").write_text(
+        FOR_THE_REAL_LAB.replace("cloudpendulumclient", "fmugym.lab")
+    )
+    printed = run("program.py", folder=tmp_path, HOME=str(tmp_path), USERPROFILE=str(tmp_path))
+    assert printed.startswith("1000 3600.0 20 20\n")
+    length = float(printed.rpartition("length ")[2])
+    assert length == pytest.approx(LENGTH, rel=TOLERANCE["hardware"])
+    assert list(temp_root.iterdir()) == []
+
+
 @pytest.fixture(name="identification")
 def fixture_identification(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))

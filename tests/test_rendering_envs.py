@@ -7,7 +7,12 @@ from gymnasium.wrappers import RecordVideo
 
 import fmugym
 
-IDS = ["fmugym/CartPole-v0", "fmugym/ModelicaCartPole-v0", "fmugym/Pendulum-v0"]
+IDS = [
+    "fmugym/CartPole-v0",
+    "fmugym/CloudPendulum-v0",
+    "fmugym/ModelicaCartPole-v0",
+    "fmugym/Pendulum-v0",
+]
 
 
 @pytest.mark.parametrize("env_id", IDS)

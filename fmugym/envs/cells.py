@@ -1,0 +1,230 @@
+"""Cells of the CloudPendulum lab as backends, by the methods of the published client alone.
+
+The lab itself is not imported: whatever has these methods will do, the real client and that of the
+simulated lab.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from fmugym.adapters import Status
+from fmugym.clock import RealClock
+from fmugym.errors import ConfigError
+from fmugym.pool import Paced
+
+__all__ = ["Cell", "Lease", "paced_cells"]
+
+logger = logging.getLogger(__name__)
+
+EXPERIMENT: Final = "SimplePendulum"
+
+_DEFAULT_GYM_TIME: Final = 600.0  # s, of leases for several cells
+
+_ANY_USER: Final = "fmugym"  # the default simulated lab takes any user token
+
+_METHODS: Final = (
+    "start_experiment",
+    "stop_experiment",
+    "get_position",
+    "get_velocity",
+    "set_torque",
+    "set_impedance_controller_params",
+)
+"""What makes a client; those for leases are only needed there."""
+
+_LEAVING = re.compile("(Position|Velocity) ?Limit ?Violation")
+"""How the lab says that it has ended a session because of where the arm went."""
+
+
+def paced_cells(
+    client: Any,
+    user_token: str | None,
+    gym_token: str | None,
+    gym_time: float | None,
+    session_time: float,
+) -> Paced:
+    """Make cells that are stepped in the lab's time.
+
+    Args:
+        client: A client, or a lab that gives one by its method ``client``.
+        user_token: For experiments, or for a lease of one's own.
+        gym_token: Of a lease that is there already.
+        gym_time: Length of a lease of one's own, in s.
+        session_time: Longest time of an episode, in s.
+
+    Raises:
+        ConfigError: If that is no client, or the tokens do not fit.
+    """
+    if not _is_client(client) and callable(getattr(client, "client", None)):
+        client = client.client()
+    if not _is_client(client):
+        raise ConfigError(f"backend must be 'fmu', or a client of the lab, not {client!r}")
+    lab = _simulated_lab(client)
+    if user_token is None and gym_token is None:
+        if lab is None:
+            raise ConfigError("the lab wants user_token= or gym_token=")
+        user_token = _ANY_USER
+    if gym_token is not None and (user_token is not None or gym_time is not None):
+        raise ConfigError("a gym_token= stands for a lease: give no user_token and no gym_time")
+    lease = Lease(client, user_token, gym_token, gym_time, session_time)
+    return Paced(lease, RealClock() if lab is None else lab.clock)
+
+
+class Lease:
+    """Where cells get their sessions from; called with a number, it gives so many cells.
+
+    Args:
+        client: The client; each cell gets one of its own.
+        user_token: Whose experiments or lease it is.
+        gym_token: A lease that is there already, and is not stopped.
+        gym_time: Length of the lease that `open` makes and `close` stops, in s. None for a lease
+            only where there are several cells.
+        session_time: Longest time of an episode, in s.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        user_token: str | None,
+        gym_token: str | None,
+        gym_time: float | None,
+        session_time: float,
+    ) -> None:
+        self._client = client
+        self._user_token, self._gym_token = user_token, gym_token
+        self._gym_time, self._session_time = gym_time, session_time
+        self._is_own = gym_token is None
+        self._count = 0
+
+    def __call__(self, count: int) -> list[Cell]:
+        """Make backends for a number of cells."""
+        self._count = count
+        if count > 1 and self._gym_time is None:
+            self._gym_time = _DEFAULT_GYM_TIME
+        return [Cell(self, _like(self._client)) for _ in range(count)]
+
+    def open(self) -> None:
+        """Make the lease if there is to be one, and there is none."""
+        if self._gym_time is not None and self._gym_token is None:
+            cell_types = [_cell_type(self._client)] * self._count
+            self._gym_token = self._client.start_gym(self._user_token, self._gym_time, cell_types)
+
+    def close(self) -> None:
+        """Stop the lease if it is an own one."""
+        if self._is_own and self._gym_token is not None:
+            gym_token, self._gym_token = self._gym_token, None
+            self._client.stop_gym(gym_token)
+
+    def start(self, client: Any, angle: float) -> tuple[str, bool]:
+        """Start a session at an angle in rad; returns its token and whether it is on a lease."""
+        is_leased = self._gym_token is not None
+        start = client.start_episode if is_leased else client.start_experiment
+        owner = self._gym_token if is_leased else self._user_token
+        token, _ = start(owner, EXPERIMENT, self._session_time, 0.0, initial_position=[angle])
+        return token, is_leased
+
+
+class Cell:
+    """A cell as a backend: position and velocity at the tick, then the torque; see ``Backend``.
+
+    Args:
+        lease: Where it gets its sessions from.
+        client: A client for the thread that steps it.
+    """
+
+    def __init__(self, lease: Lease, client: Any) -> None:
+        self._lease, self._client = lease, client
+        self._session: tuple[str, bool] | None = None
+        self._outputs: dict[str, float] = {}
+
+    def reset(self, start_values: Mapping[str, float]) -> dict[str, float]:
+        """Start a session, in torque control and without torque."""
+        self._end_session()
+        client = self._client
+        self._session = self._lease.start(client, start_values["q_0"])
+        token = self._session[0]
+        client.set_impedance_controller_params(0.0, 0.0, token)
+        client.set_torque(0.0, token)
+        return self._read(token)
+
+    def step(self, inputs: Mapping[str, float]) -> tuple[dict[str, float], Status]:
+        """Read the arm and set the torque that acts until the next step.
+
+        Returns:
+            The outputs, and ``TERMINATED`` with the last ones where the lab has ended the session
+            because the arm went beyond a limit.
+        """
+        token = self._token()
+        try:
+            outputs = self._read(token)
+            self._client.set_torque(inputs["tau"], token)
+        except RuntimeError as error:
+            if _LEAVING.search(str(error)) is None:
+                raise
+            return self._outputs, Status.TERMINATED
+        return outputs, Status.OK
+
+    def hold(self) -> None:
+        """Take the torque away, which is a sign of life as well."""
+        self._client.set_torque(0.0, self._token())
+
+    def stop(self) -> None:
+        """End the session."""
+        self._end_session()
+
+    def _token(self) -> str:
+        if self._session is None:
+            raise RuntimeError("the cell has no session")
+        return self._session[0]
+
+    def _read(self, token: str) -> dict[str, float]:
+        q, q_dot = self._client.get_position(token), self._client.get_velocity(token)
+        self._outputs = {"q": q, "q_dot": q_dot}
+        return self._outputs
+
+    def _end_session(self) -> None:
+        if self._session is None:
+            return
+        (token, is_leased), self._session = self._session, None
+        try:
+            self._client.set_torque(0.0, token)
+        except RuntimeError as error:  # it has ended by itself
+            logger.debug("the torque was not taken away: %s", error)
+        stop = self._client.stop_episode if is_leased else self._client.stop_experiment
+        try:
+            stop(token)
+        except RuntimeError as error:
+            logger.debug("the session was not stopped: %s", error)
+
+
+def _is_client(client: Any) -> bool:
+    return all(callable(getattr(client, method, None)) for method in _METHODS)
+
+
+def _simulated_lab(client: Any) -> Any:
+    """The lab with a clock that a client of the simulated lab talks to; None for other clients."""
+    lab = getattr(client, "lab", None)
+    return lab if hasattr(lab, "clock") else None
+
+
+def _like(client: Any) -> Any:
+    """A client of the same lab: each thread wants one of its own."""
+    lab = _simulated_lab(client)
+    return type(client)() if lab is None else lab.client()
+
+
+def _cell_type(client: Any) -> Any:
+    """The kind of cell with one joint, of the package that the client is of."""
+    package = type(client).__module__.rpartition(".")[0]
+    try:
+        return importlib.import_module(f"{package}.data").CellType.SINGLE
+    except (ImportError, AttributeError, ValueError):
+        name = type(client).__name__
+        raise ConfigError(
+            f"{package or name} has no data.CellType: make the lease yourself and give gym_token="
+        ) from None

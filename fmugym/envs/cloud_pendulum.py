@@ -1,0 +1,211 @@
+"""A cell of the CloudPendulum lab as a Gymnasium environment: simulated by an FMU, or reached."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.bundled import bundled_fmu
+from fmugym.distributions import Uniform
+from fmugym.env import FMUEnv
+from fmugym.envs.cells import paced_cells
+from fmugym.errors import ConfigError
+from fmugym.rendering import PendulumFrame, PendulumScene
+
+__all__ = ["CloudPendulumEnv"]
+
+TIME_STEP: Final = 0.02
+"""Control period in s."""
+
+PLATFORM_TORQUE: Final = 0.15
+"""Largest torque of a cell's drive, in N m."""
+
+POSITION_LIMIT: Final = math.tau
+"""Angle from hanging at which the lab ends a session, in rad."""
+
+VELOCITY_LIMIT: Final = 50.0
+"""Angular velocity at which the lab ends a session, in rad/s."""
+
+_FMU_PARAMETERS: Final = {
+    "theta_dot_max": 1000.0,  # rad/s: it shall pass the limit to be stopped there
+    "max_step": 0.002,  # s: off by 1e-4 rad after 10 s with Coulomb friction, by 4e-8 without
+}
+
+_VELOCITY_WEIGHT: Final = 0.1 * 15.0 / 98.1
+_EFFORT_WEIGHT: Final = 0.001 * 2.0**2
+
+
+class CloudPendulumEnv(FMUEnv):
+    """Swing the pendulum of a CloudPendulum cell up and hold it upright.
+
+    ## Description
+    A pendulum of 0.06 kg and 0.1 m hangs at a motor, which is asked for a torque 50 times a second.
+    The same environment runs on the bundled FMU, on a cell of the simulated lab and on one of the
+    real lab: ``backend`` chooses.
+
+    **Timing.** Observation k is sampled at the tick ``t_k = t_0 + k * 0.02 s``. The action computed
+    from it takes effect at the next tick and lasts until the one after, so that it shows for the
+    first time in observation k + 2. On the FMU that is exact; in the lab position, velocity and
+    torque are one request each, in this order, from the tick on.
+
+    ## Action Space
+    ``Box(-1.0, 1.0, (1,), float32)``
+
+    | Num | Action                                                        | Min  | Max |
+    |-----|---------------------------------------------------------------|------|-----|
+    | 0   | torque in parts of ``torque_limit``, counter-clockwise positive | -1.0 | 1.0 |
+
+    ## Observation Space
+    ``Box(float32)`` of shape (3,); q is the angle from hanging, counter-clockwise positive
+
+    | Num | Observation               | Min   | Max  |
+    |-----|---------------------------|-------|------|
+    | 0   | cos q                     | -1.0  | 1.0  |
+    | 1   | sin q                     | -1.0  | 1.0  |
+    | 2   | angular velocity [rad/s]  | -50.0 | 50.0 |
+
+    ## Rewards
+    ``-(theta^2 + 0.0153 q_dot^2 + 0.004 action^2)`` with theta, the angle from upright, normalized
+    to [-pi, pi), and the velocity, both before the step. That is the reward of Gymnasium's
+    ``Pendulum-v1`` in units of each plant: 0.1 times the square of the velocity over the natural
+    frequency, which squared is 3 g / (2 l) = 15 there and g / l = 98.1 here, and 0.001 times
+    that of the torque over half its limit. The step that violates a limit of the platform gets
+    1000 less, which is a little more than hanging still for ever costs at a discount of 0.99.
+
+    ## Starting State
+    At rest, q uniform in [-0.05, 0.05) rad. The lab's cells sag towards hanging before they are
+    released.
+
+    ## Episode End
+    Terminated when q is more than 2 pi or q_dot more than 50 rad/s from zero: there the lab ends a
+    session. Truncated after 500 steps, 10 s (by ``gymnasium.make``), and by faults.
+
+    ## Information
+    In the lab ``info`` has ``sample_age`` (how old the observation was when ``step`` returned it,
+    in s), ``deadline_misses`` (of this episode) and ``worst_lateness`` (in s). A step that comes
+    too late shifts those that follow; while none comes, the torque is zero and the session is kept
+    alive.
+
+    ## Arguments
+    * ``torque_limit``: torque of an action of 1, at most 0.15 N m.
+    * ``backend``: "fmu", a client (``fmugym.lab.Client()`` or the real
+      ``cloudpendulumclient.client.Client()``), or a ``fmugym.lab.Lab``.
+    * ``model_parameters``: values or distributions for the FMU's parameters, such as ``l``, ``b``
+      and ``c``. In the lab there is only ``q_0``, the start angle.
+    * ``user_token``: the lab's user token, which the simulated lab does not need. Each episode is
+      an experiment of its own, or an episode of a lease if ``gym_time`` is given.
+    * ``gym_token``: a lease of yours, used instead of a user token; it is not stopped.
+    * ``gym_time``: length in s of the lease that is made at the first reset and stopped at the
+      close. A vector environment always makes one, of 600 s by default.
+    * ``session_time``: longest time of an episode in the lab, in s, pauses included.
+    * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
+    * ``render_mode``: "human", "rgb_array" or None.
+
+    ## Version History
+    * v0: Initial version.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    render_size: ClassVar[tuple[int, int]] = (500, 500)
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        torque_limit: float = PLATFORM_TORQUE,
+        *,
+        backend: Any = "fmu",
+        model_parameters: Mapping[str, Any] | None = None,
+        user_token: str | None = None,
+        gym_token: str | None = None,
+        gym_time: float | None = None,
+        session_time: float = 30.0,
+        fmi_version: str | float = "2.0",
+        log_level: int = logging.WARNING,
+    ) -> None:
+        if not 0.0 < torque_limit <= PLATFORM_TORQUE:
+            raise ConfigError(
+                f"torque_limit must be more than 0 and at most {PLATFORM_TORQUE} N m, "
+                f"got {torque_limit!r}"
+            )
+        self.torque_limit = torque_limit
+        self.limit_penalty = 1000.0
+        self._in_lab = not isinstance(backend, str)
+        given = dict(model_parameters or {})
+        self._require_settable(given)
+        if self._in_lab:
+            backend = paced_cells(backend, user_token, gym_token, gym_time, session_time)
+        plant = {} if self._in_lab else _FMU_PARAMETERS
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"q_0": Uniform(-0.05, 0.05), **plant, **given},
+            "time_step": TIME_STEP,
+        }
+        super().__init__(
+            bundled_fmu("Pendulum", fmi_version),
+            config,
+            log_level,
+            render_mode=render_mode,
+            backend=None if backend == "fmu" else backend,
+        )
+
+    def _require_settable(self, names: Mapping[str, Any]) -> None:
+        """Refuse to set what no request to the lab can."""
+        for name in names:
+            if self._in_lab and name != "q_0":
+                raise ConfigError(
+                    f"{name!r} cannot be set in the lab: a cell's parameters are what they are, "
+                    "and its arm starts at rest; only 'q_0', the start angle, can"
+                )
+
+    def _get_action_space(self) -> spaces.Space[Any]:
+        return spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32)
+
+    def _get_observation_space(self) -> spaces.Space[Any]:
+        high = np.array([1.0, 1.0, VELOCITY_LIMIT], dtype=np.float32)
+        return spaces.Box(-high, high, dtype=np.float32)
+
+    def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        parameters = super()._get_episode_parameters(options)
+        self._require_settable(parameters)
+        return parameters
+
+    def _get_inputs(self) -> Any:
+        """The last action's torque on the FMU; in the lab cells wait for the tick themselves."""
+        torque = self._torque(self.action)
+        if self._in_lab:
+            return torque
+        return self._torque(self.previous_action) + 0.0 * torque  # which refuses a NaN at once
+
+    def _torque(self, action: Any) -> Any:
+        return self.torque_limit * np.float64(np.minimum(np.maximum(action[0], -1.0), 1.0))
+
+    def _is_done(self) -> Any:
+        q, q_dot = self.state
+        return (abs(q) > POSITION_LIMIT) | (abs(q_dot) > VELOCITY_LIMIT)
+
+    def _reward_policy(self) -> Any:
+        q, q_dot = self.previous_state
+        theta = q % math.tau - math.pi
+        effort = (self._torque(self.action) / self.torque_limit) ** 2
+        cost = theta**2 + _VELOCITY_WEIGHT * q_dot**2 + _EFFORT_WEIGHT * effort
+        return -cost - self.limit_penalty * self.done
+
+    def _get_observation(self) -> Any:
+        q, q_dot = self.state
+        limited = np.minimum(np.maximum(q_dot, -VELOCITY_LIMIT), VELOCITY_LIMIT)
+        return np.array([np.cos(q), np.sin(q), limited], dtype=np.float32)
+
+    def _get_scene(self) -> PendulumScene:
+        return PendulumScene(torque_limit=self.torque_limit)
+
+    def _get_frame(self) -> PendulumFrame:
+        return PendulumFrame(self.state[0] - math.pi, self._torque(self.previous_action))
+
+    def _describe_action(self) -> str:
+        return f"{self._torque(self.previous_action):+.3f} N m"

@@ -1,0 +1,700 @@
+"""The CloudPendulum environment: on the FMU, on simulated cells, on whatever else is a client."""
+
+import gc
+import itertools
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import types
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.integrate import solve_ivp
+
+from fmugym import ConfigError, SimulationError, Uniform
+from fmugym.envs import CloudPendulumEnv
+from fmugym.lab import CellType, Client, Lab, ManualClock, User
+from fmugym.testing import check_fmu_env, check_hooks
+
+ID = "fmugym/CloudPendulum-v0"
+M, L, B, G = 0.06, 0.1, 4e-4, 9.81  # kg, m, N m s/rad, m/s^2: the published nominal values
+
+
+@pytest.fixture(name="make_lab")
+def fixture_make_lab():
+    """Make labs on a clock that stands still, closed after the test."""
+    labs = []
+
+    def make(preset="ideal", **options):
+        labs.append(Lab(preset, clock=ManualClock(), seed=0, **options))
+        return labs[-1]
+
+    yield make
+    for lab in labs:
+        lab.close()
+
+
+def sessions(lab):
+    """What runs in a lab: leases, experiments and episodes."""
+    lab._bookings.settle(lab.clock.time())
+    return sorted(owner.kind for owner in lab._bookings._live.values())
+
+
+def swings(count, amplitude=0.1, seed=0):
+    """Random actions, each kept for a fifth of a second, that pass no limit of the platform."""
+    values = np.random.default_rng(seed).uniform(-amplitude, amplitude, -(-count // 10))
+    return np.repeat(values, 10)[:count, None].astype(np.float32)
+
+
+def run(env, actions, seed=0, **options):
+    """The states and rewards of an episode, from the reset on."""
+    env.reset(seed=seed, **options)
+    states, rewards = [env.unwrapped.state], []
+    for action in actions:
+        _, reward, *ends, info = env.step(action)
+        assert not ends[0], info
+        states.append(env.unwrapped.state)
+        rewards.append(reward)
+    return np.array(states), np.array(rewards)
+
+
+def last(env, actions):
+    """The info of the step that ends the episode."""
+    for action in actions:
+        *_, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            return info
+    raise AssertionError("the episode did not end")
+
+
+class TestTask:
+    def test_spaces(self):
+        env = gym.make(ID)
+        assert env.action_space == gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        high = np.array([1.0, 1.0, 50.0], np.float32)
+        assert env.observation_space == gym.spaces.Box(-high, high, dtype=np.float32)
+        assert env.spec.max_episode_steps == 500
+        assert env.metadata["render_fps"] == 50
+        env.close()
+
+    @pytest.mark.parametrize("fmi_version", ["1.0", "2.0", "3.0"])
+    def test_keeps_the_contracts(self, fmi_version):
+        env = CloudPendulumEnv(fmi_version=fmi_version, model_parameters={"c": Uniform(0, 3e-3)})
+        check_env(env, skip_render_check=True)
+        check_fmu_env(env, num_steps=60)
+        env.close()
+
+    def test_hooks_work_on_arrays(self):
+        check_hooks(CloudPendulumEnv)
+        env = gym.make_vec(ID, num_envs=2, hooks="array")
+        env.close()
+
+    def test_an_action_takes_effect_one_period_later(self):
+        env = CloudPendulumEnv(model_parameters={"q_0": 0.0})
+        states, _ = run(env, np.array([[1.0], [0.0], [0.0]], np.float32))
+        np.testing.assert_allclose(states[:2], 0.0, atol=1e-12)
+        assert states[2, 1] > 0.1
+        env.close()
+
+    def test_against_an_integration_by_scipy(self):
+        """The equation of the plant, with each action from the tick after its own."""
+        env = CloudPendulumEnv(torque_limit=0.1, model_parameters={"q_0": 0.4, "c": 2e-3})
+        actions = swings(100)
+        states, _ = run(env, actions)
+        state, applied = np.array([0.4, 0.0]), [0.0, *(0.1 * actions[:-1, 0].astype(float))]
+        for k, torque in enumerate(applied):
+
+            def derivative(_, x, torque=torque):
+                friction = B * x[1] + 2e-3 * np.tanh(x[1] / 0.05)
+                return x[1], (torque - friction) / (M * L**2) - G / L * np.sin(x[0])
+
+            solution = solve_ivp(derivative, (0, 0.02), state, rtol=1e-9, atol=1e-10)
+            state = solution.y[:, -1]
+            np.testing.assert_allclose(states[k + 1], state, atol=2e-3)
+        env.close()
+
+    def test_without_friction_the_energy_stays(self):
+        env = CloudPendulumEnv(model_parameters={"q_0": 2.5, "b": 0.0})
+        q, q_dot = run(env, np.zeros((300, 1), np.float32))[0].T
+        energy = 0.5 * M * L**2 * q_dot**2 + M * G * L * (1 - np.cos(q))
+        np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
+        env.close()
+
+    def test_small_swings_have_the_frequency_of_the_closed_form(self):
+        env = CloudPendulumEnv(model_parameters={"q_0": 0.01})
+        q = run(env, np.zeros((200, 1), np.float32))[0][:, 0]
+        decay, time_ = B / (2 * M * L**2), 0.02 * np.arange(201)
+        omega = np.sqrt(G / L - decay**2)
+        expected = np.cos(omega * time_) + decay / omega * np.sin(omega * time_)
+        np.testing.assert_allclose(q, 0.01 * np.exp(-decay * time_) * expected, atol=1e-6)
+        env.close()
+
+    def test_the_start(self):
+        env = gym.make_vec(ID, num_envs=500)
+        observations, infos = env.reset(seed=0)
+        q = infos["drawn"]["q_0"]
+        assert -0.05 <= q.min() < -0.045 < 0.045 < q.max() < 0.05
+        np.testing.assert_allclose(observations, np.c_[np.cos(q), np.sin(q), 0 * q], atol=1e-7)
+        env.close()
+
+    def test_rewards_by_hand(self):
+        """Hanging costs pi^2, half the torque 0.004 / 4, 10 rad/s 0.1 * 15 / 98.1 * 100."""
+        env = CloudPendulumEnv(model_parameters={"q_0": 0.0, "q_dot_0": 10.0})
+        env.reset()
+        reward = env.step(np.array([0.5], np.float32))[1]
+        assert reward == pytest.approx(-(np.pi**2 + 1.52905199 + 0.001), abs=1e-6)
+        env.reset(options={"model_parameters": {"q_0": np.pi + 0.3, "q_dot_0": 0.0}})
+        assert env.step(np.array([0.0], np.float32))[1] == pytest.approx(-(0.3**2))
+        env.reset(options={"model_parameters": {"q_0": -np.pi - 0.2, "q_dot_0": 0.0}})
+        assert env.step(np.array([-3.0], np.float32))[1] == pytest.approx(-(0.2**2) - 0.004)
+        env.close()
+
+    @pytest.mark.parametrize("start", [{"q_0": 6.2, "q_dot_0": 9.0}, {"q_0": 0.0, "q_dot_0": -52}])
+    def test_beyond_the_limits_of_the_platform_it_ends(self, start):
+        env = CloudPendulumEnv(model_parameters={**start, "b": 0.0})
+        env.reset()
+        observation, reward, terminated, truncated, _ = env.step(np.array([0.0], np.float32))
+        assert (terminated, truncated) == (True, False)
+        assert reward < -1000.0
+        assert env.observation_space.contains(observation)
+        env.close()
+
+    def test_ten_seconds(self):
+        env = gym.make(ID)
+        env.reset(seed=0)
+        steps = next(k for k in itertools.count(1) if env.step(np.zeros(1, np.float32))[3])
+        assert steps == 500
+        assert env.unwrapped.time == pytest.approx(10.0)
+        env.close()
+
+    def test_a_nan_is_refused_at_once(self):
+        env = CloudPendulumEnv()
+        env.reset()
+        with pytest.raises(ConfigError, match="every input must be finite"):
+            env.step(np.array([np.nan], np.float32))
+        env.close()
+
+    def test_parameters_are_drawn_for_each_episode(self):
+        env = gym.make_vec(ID, num_envs=3, model_parameters={"l": Uniform(0.09, 0.11)})
+        _, infos = env.reset(seed=0)
+        assert len(set(infos["drawn"]["l"])) == 3
+        env.close()
+
+    @pytest.mark.parametrize("limit", [0.0, -0.1, 0.2, float("nan")])
+    def test_a_torque_limit_beyond_the_platform(self, limit):
+        with pytest.raises(ConfigError, match="torque_limit must be more than 0 and at most"):
+            CloudPendulumEnv(torque_limit=limit)
+
+    def test_the_picture_shows_the_torque_that_acts(self):
+        env = CloudPendulumEnv("rgb_array", model_parameters={"q_0": 0.0})
+        pictures = []
+        for first in (0.0, 1.0):
+            env.reset()
+            for action in (first, 0.0):
+                env.step(np.array([action], np.float32))
+            pictures.append(env.render())
+        assert pictures[0].shape == (500, 500, 3)
+        assert not np.array_equal(*pictures)
+        env.close()
+
+
+class TestOnTheLab:
+    def test_the_same_as_on_the_fmu(self, make_lab):
+        """Solver steps of 2 ms there and 0.5 ms here: 1e-6 of 10 s of swings that are not small."""
+        actions = swings(500)
+        on_fmu, on_lab = gym.make(ID), gym.make(ID, backend=make_lab())
+        states, rewards = run(on_fmu, actions, seed=3)
+        lab_states, lab_rewards = run(on_lab, actions, seed=3)
+        assert np.ptp(states[:, 0]) > 1.0
+        np.testing.assert_allclose(lab_states, states, atol=1e-5)
+        np.testing.assert_allclose(lab_rewards, rewards, atol=1e-4)
+        assert on_lab.observation_space == on_fmu.observation_space
+        assert on_lab.action_space == on_fmu.action_space
+        on_lab.close()
+        on_fmu.close()
+
+    def test_a_client_will_do_and_needs_no_token(self, make_lab):
+        lab = make_lab()
+        env = gym.make(ID, backend=Client(lab))
+        _, info = env.reset(seed=1)
+        assert sessions(lab) == ["experiment"]
+        assert (info["sample_age"], info["deadline_misses"]) == (0.0, 0)
+        env.close()
+        assert sessions(lab) == []
+
+    def test_tokens_of_users(self, make_lab):
+        lab = make_lab(users={"ada": User(), "bob": User(gym=False)})
+        with pytest.raises(SimulationError, match="unknown user token"):
+            gym.make(ID, backend=lab).reset()
+        env = gym.make(ID, backend=lab, user_token="bob")
+        env.reset()
+        env.close()
+        with pytest.raises(SimulationError, match="has no gym permission"):
+            gym.make(ID, backend=lab, user_token="bob", gym_time=60).reset()
+        assert sessions(lab) == []
+
+    def test_a_lease_of_ones_own_serves_all_episodes(self, make_lab):
+        lab = make_lab()
+        env = gym.make(ID, backend=lab, user_token="ada", gym_time=100.0)
+        for _ in range(3):
+            env.reset()
+            env.step(np.zeros(1, np.float32))
+            assert sessions(lab) == ["episode", "gym"]
+        assert Client(lab).get_user_info("ada").gym_bucket_size == 19
+        assert Client(lab).get_user_info("ada").number_of_attempts == 1000
+        env.close()
+        assert sessions(lab) == []
+
+    def test_a_lease_that_is_there_is_used_and_left(self, make_lab):
+        lab = make_lab()
+        token = Client(lab).start_gym("ada", 100.0, [CellType.SINGLE])
+        env = gym.make(ID, backend=lab, gym_token=token)
+        env.reset()
+        assert sessions(lab) == ["episode", "gym"]
+        env.close()
+        assert sessions(lab) == ["gym"]
+
+    @pytest.mark.parametrize("names", [{"q_dot_0": 1.0}, {"l": 0.12}, {"q_0": 0.1, "c": 0.0}])
+    def test_what_the_lab_cannot_set_is_refused(self, make_lab, names):
+        lab = make_lab()
+        with pytest.raises(ConfigError, match="cannot be set in the lab"):
+            CloudPendulumEnv(backend=lab, model_parameters=names)
+        env = CloudPendulumEnv(backend=lab, model_parameters={"q_0": 0.2})
+        assert env.reset()[1]["drawn"] == {}
+        assert env.state == pytest.approx((0.2, 0.0))
+        with pytest.raises(ConfigError, match="cannot be set in the lab"):
+            env.reset(options={"model_parameters": names})
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("arguments", "text"),
+        [
+            ({"backend": object()}, "must be 'fmu', or a client of the lab"),
+            ({"backend": "fmuu"}, "unknown backend 'fmuu'; did you mean 'fmu'"),
+            ({"user_token": "a", "gym_token": "b"}, "give no user_token"),
+            ({"gym_token": "b", "gym_time": 5.0}, "and no gym_time"),
+        ],
+    )
+    def test_arguments_that_do_not_fit(self, make_lab, arguments, text):
+        with pytest.raises(ConfigError, match=text):
+            CloudPendulumEnv(**{"backend": make_lab(), **arguments})
+
+    def test_a_limit_ends_it_as_on_the_fmu(self, make_lab):
+        ends = []
+        for backend in ("fmu", make_lab()):
+            env = CloudPendulumEnv(backend=backend)
+            env.reset(seed=0)
+            terminated = False
+            while not terminated:
+                _, reward, terminated, truncated, info = env.step(np.ones(1, np.float32))
+                assert not truncated, info
+            assert reward < -1000.0
+            ends.append(env.step_count)
+            env.close()
+        assert abs(ends[0] - ends[1]) <= 1
+
+    def test_the_hardware_preset(self, make_lab):
+        lab = make_lab("hardware")
+        env = gym.make(ID, backend=lab)
+        env.reset(seed=0)
+        ages = []
+        for action in swings(200):
+            *_, truncated, info = env.step(action)
+            assert not truncated
+            ages.append(info["sample_age"])
+        # Two readings and a setter, from the first reading on: 0.79 ms in the median.
+        assert 0.5e-3 < np.median(ages) < 1.2e-3
+        assert lab.clock.time() == pytest.approx(1.0 + 4.0, abs=0.2)
+        env.close()
+
+    def test_a_pause_keeps_the_session_and_shifts_the_schedule(self, make_lab):
+        """A policy update of 5 s, in steps of time that the lab's heartbeat would survive."""
+        lab, torques = make_lab(), queue.Queue()
+        env = CloudPendulumEnv(backend=Client(lab))
+        env.reset()
+        client = env._pool._rigs[0]._backend._client
+        set_torque = client.set_torque
+        client.set_torque = lambda *args: (set_torque(*args), torques.put(args[0]))
+        env.step(np.full(1, 0.2, np.float32))
+        for expected in (0.03, 0.0, 0.0, 0.0, 0.0, 0.0):
+            assert torques.get(timeout=10) == pytest.approx(expected)
+            lab.clock.advance(1.0)
+        torques.get(timeout=10)
+        *_, truncated, info = env.step(np.zeros(1, np.float32))
+        assert not truncated, info
+        assert info["deadline_misses"] == 1
+        assert info["worst_lateness"] == pytest.approx(5.98)
+        env.close()
+        assert sessions(lab) == []
+
+    def test_without_a_keeper_the_session_is_lost(self, make_lab):
+        lab = make_lab()
+        env = gym.make(ID, backend=lab)
+        env.reset()
+        lab.clock.advance(2.5)
+        lab._bookings.settle(lab.clock.time())
+        observation, _, terminated, truncated, info = env.step(np.zeros(1, np.float32))
+        assert (terminated, truncated) == (False, True)
+        assert "no request for 2 s" in info["fault"]
+        assert np.isfinite(observation).all()
+        env.reset()
+        assert "fault" not in env.step(np.zeros(1, np.float32))[4]
+        env.close()
+        assert sessions(lab) == []
+
+    def test_an_expired_lease(self, make_lab):
+        lab = make_lab()
+        env = gym.make(ID, backend=lab, gym_time=3.0)
+        env.reset()
+        assert "the lease of its gym is over" in last(env, swings(160))["fault"]
+        with pytest.raises(SimulationError, match="the gym has ended"):
+            env.reset()
+        assert sessions(lab) == []
+        env.reset()  # takes a new lease
+        env.close()
+        assert sessions(lab) == []
+
+    def test_the_session_time(self, make_lab):
+        lab = make_lab()
+        env = gym.make(ID, backend=lab, session_time=1.0)
+        env.reset()
+        assert "its time of 1 s is over" in last(env, swings(56))["fault"]
+        env.close()
+
+
+class TestCells:
+    @pytest.mark.parametrize("mode", ["next_step", "same_step"])
+    def test_one_lease_for_all_and_new_episodes(self, make_lab, mode):
+        lab = make_lab()
+        env = gym.make_vec(
+            ID, num_envs=4, backend=Client(lab), autoreset_mode=mode, max_episode_steps=20
+        )
+        alone = gym.make_vec(ID, num_envs=4, autoreset_mode=mode, max_episode_steps=20)
+        for each in (env, alone):
+            each.reset(seed=5)
+        assert sessions(lab) == ["episode"] * 4 + ["gym"]
+        for action in swings(50):
+            actions = np.tile(action, (4, 1))
+            got, expected = env.step(actions), alone.step(actions)
+            for left, right in zip(got[:4], expected[:4], strict=True):
+                np.testing.assert_allclose(left, right, atol=1e-5)
+        assert got[4]["_sample_age"].all()
+        assert Client(lab).get_user_info("fmugym").gym_bucket_size == 19
+        env.close()
+        alone.close()
+        assert sessions(lab) == []
+
+    def test_cells_keep_the_same_time(self, make_lab):
+        lab = make_lab()
+        env = gym.make_vec(ID, num_envs=4, backend=lab)
+        env.reset()
+        for _ in range(10):
+            env.step(np.zeros((4, 1), np.float32))
+        assert lab.clock.time() == pytest.approx(0.2)
+        env.close()
+
+    def test_cells_of_the_hardware_preset_start_together(self, make_lab):
+        """Homing takes a second: for all of them at once, also where a clock is moved by hand."""
+        lab = make_lab("hardware", stall_share=0.0)
+        env = gym.make_vec(ID, num_envs=4, backend=lab)
+        env.reset(seed=0)
+        assert lab.clock.time() == pytest.approx(1.0, abs=0.05)
+        for _ in range(50):
+            *_, infos = env.step(np.zeros((4, 1), np.float32))
+        assert lab.clock.time() == pytest.approx(2.0, abs=0.05)
+        assert infos["deadline_misses"].tolist() == [0] * 4
+        env.close()
+        assert sessions(lab) == []
+
+    def test_programs_of_several_threads(self, make_lab):
+        """Two programs, each with a lease of its own; time waits for both."""
+        lab, ends = make_lab("hardware", stall_share=0.0), []
+
+        def program():
+            env, begin = gym.make(ID, backend=Client(lab), gym_time=60.0), lab.clock.time()
+            env.reset(seed=0)
+            for _ in range(50):
+                *_, info = env.step(np.zeros(1, np.float32))
+            ends.append((lab.clock.time() - begin, info["deadline_misses"]))
+            env.close()
+
+        threads = [lab.clock.thread(program) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(30)
+        for duration, misses in ends:
+            assert duration == pytest.approx(2.0, abs=0.05)
+            assert misses == 0
+        assert len(ends) == 2
+        assert sessions(lab) == []
+
+    def test_more_cells_than_there_are(self, make_lab):
+        env = gym.make_vec(ID, num_envs=5, backend=make_lab())
+        with pytest.raises(SimulationError, match="the lab has 4 cells of type SINGLE, not 5"):
+            env.reset()
+        env.close()
+
+    def test_a_fault_of_one_cell(self, make_lab):
+        lab = make_lab()
+        env = gym.make_vec(ID, num_envs=3, backend=lab, autoreset_mode="same_step")
+        env.reset()
+        zeros = np.zeros((3, 1), np.float32)
+        token = env._prototype._pool._rigs[1]._backend._session[0]
+        Client(lab).stop_episode(token)
+        *_, truncated, infos = env.step(zeros)
+        assert truncated.tolist() == [False, True, False]
+        assert "was stopped" in infos["final_info"]["fault"][1]
+        assert not env.step(zeros)[3].any()
+        env.close()
+        assert sessions(lab) == []
+
+    @pytest.mark.parametrize("vectorization_mode", ["sync", "vector_entry_point"])
+    def test_ways_to_vectorize(self, make_lab, vectorization_mode):
+        lab = make_lab()
+        env = gym.make_vec(
+            ID, num_envs=2, vectorization_mode=vectorization_mode, backend=Client(lab)
+        )
+        env.reset(seed=0)
+        assert env.step(np.zeros((2, 1), np.float32))[0].shape == (2, 3)
+        env.close()
+        assert sessions(lab) == []
+
+
+class Published:
+    """A client with the published methods only, and an arm that does as it is told."""
+
+    calls: list = []  # noqa: RUF012
+    answers: dict = {}  # noqa: RUF012
+
+    def __init__(self):
+        """The real one takes no arguments."""
+
+    def _call(self, name, *args):
+        self.calls.append((name, *args))
+        answer = self.answers.get(name)
+        return answer() if answer is not None else None
+
+    def start_experiment(self, user_token, experiment_type, experiment_time,
+                         preparation_time=0.0, record=False, initial_state=None,
+                         initial_position=None):  # fmt: skip
+        self._call("start_experiment", user_token, experiment_type, initial_position)
+        return "1234567890123456789", "https://example.org"
+
+    def start_gym(self, user_token, gym_time, cell_types):
+        self._call("start_gym", user_token, gym_time, cell_types)
+        return "99"
+
+    def start_episode(self, gym_token, experiment_type, time, preparation_time=0.0,
+                      initial_position=None):  # fmt: skip
+        self._call("start_episode", gym_token, experiment_type, initial_position)
+        return "100", "https://example.org"
+
+    def stop_experiment(self, session_token):
+        self._call("stop_experiment", session_token)
+        return ""
+
+    def stop_episode(self, episode_token):
+        self._call("stop_episode", episode_token)
+        return ""
+
+    def stop_gym(self, gym_token):
+        self._call("stop_gym", gym_token)
+
+    def get_position(self, token):
+        value = self._call("get_position", token)
+        return 0.1 if value is None else value
+
+    def get_velocity(self, token):
+        self._call("get_velocity", token)
+        return 0.0
+
+    def set_torque(self, torque, token):
+        self._call("set_torque", torque, token)
+
+    def set_impedance_controller_params(self, kp, kd, token):
+        self._call("set_impedance_controller_params", kp, kd, token)
+
+
+@pytest.fixture(name="published")
+def fixture_published(monkeypatch):
+    """A client of a package of the real one's form."""
+    package = types.ModuleType("standin")
+    data = types.ModuleType("standin.data")
+    data.CellType = types.SimpleNamespace(SINGLE="single")
+    monkeypatch.setitem(sys.modules, "standin", package)
+    monkeypatch.setitem(sys.modules, "standin.data", data)
+    return type(
+        "Client", (Published,), {"calls": [], "answers": {}, "__module__": "standin.client"}
+    )
+
+
+def names(client):
+    """The requests in their order, without what merely keeps the session alive."""
+    return [name for name, *_ in client.calls]
+
+
+class TestRealClient:
+    def test_an_experiment_of_the_published_methods(self, published):
+        env = gym.make(ID, backend=published(), user_token="ada", torque_limit=0.1)
+        env.reset(options={"model_parameters": {"q_0": 0.02}})
+        assert published.calls[:5] == [
+            ("start_experiment", "ada", "SimplePendulum", [0.02]),
+            ("set_impedance_controller_params", 0.0, 0.0, "1234567890123456789"),
+            ("set_torque", 0.0, "1234567890123456789"),
+            ("get_position", "1234567890123456789"),
+            ("get_velocity", "1234567890123456789"),
+        ]
+        published.calls.clear()
+        observation, *_ = env.step(np.array([0.5], np.float32))
+        np.testing.assert_allclose(observation, [np.cos(0.1), np.sin(0.1), 0.0], atol=1e-7)
+        env.close()
+        steps = [call[:2] for call in published.calls if call[0] in ("set_torque", "get_position")]
+        assert ("set_torque", 0.05) in steps
+        assert names(published)[-2:] == ["set_torque", "stop_experiment"]
+
+    def test_a_lease(self, published):
+        env = gym.make_vec(ID, num_envs=2, backend=published(), user_token="ada", gym_time=60.0)
+        env.reset()
+        env.step(np.zeros((2, 1), np.float32))
+        env.close()
+        assert published.calls[0] == ("start_gym", "ada", 60.0, ["single"] * 2)
+        assert names(published).count("start_episode") == 2
+        assert names(published).count("stop_episode") == 2
+        assert published.calls[-1] == ("stop_gym", "99")
+
+    def test_it_wants_a_token(self, published):
+        with pytest.raises(ConfigError, match="user_token= or gym_token="):
+            gym.make(ID, backend=published())
+
+    def test_a_package_without_cell_types(self):
+        client = type("Client", (Published,), {"calls": [], "__module__": "nowhere.client"})
+        env = gym.make(ID, backend=client(), user_token="ada", gym_time=60.0)
+        with pytest.raises(SimulationError, match=r"nowhere has no data.CellType.*gym_token="):
+            env.reset()
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("request_name", "answer", "text"),
+        [
+            ("get_position", lambda: float("nan"), "the outputs are not finite: q = nan"),
+            ("get_position", lambda: [0.1, 0.2], "ValueError"),
+            ("get_velocity", lambda: 1 / 0, "ZeroDivisionError"),
+        ],
+    )
+    def test_nonsense_from_a_client(self, published, request_name, answer, text):
+        env = gym.make(ID, backend=published(), user_token="ada")
+        env.reset()
+        published.calls.clear()
+        published.answers[request_name] = answer
+        observation, _, _, truncated, info = env.step(np.ones(1, np.float32))
+        assert truncated
+        assert text in info["fault"]
+        assert np.isfinite(observation).all()
+        assert published.calls[-1][:2] == ("set_torque", 0.0)
+        env.close()
+        assert names(published)[-1] == "stop_experiment"
+
+    def test_torque_refused(self, published):
+        def refuse():
+            raise RuntimeError("torque 0.2 is outside the limits")
+
+        env = gym.make(ID, backend=published(), user_token="ada")
+        env.reset()
+        published.answers["set_torque"] = refuse
+        *_, truncated, info = env.step(np.ones(1, np.float32))
+        assert truncated
+        assert info["fault"] == "Cell.step: RuntimeError: torque 0.2 is outside the limits"
+        env.close()
+        assert names(published)[-1] == "stop_experiment"
+
+    def test_an_interrupt_while_waiting_for_cells(self, published):
+        def interrupt():
+            raise KeyboardInterrupt
+
+        published.answers["start_gym"] = interrupt
+        env = gym.make(ID, backend=published(), user_token="ada", gym_time=60.0)
+        with pytest.raises(KeyboardInterrupt):
+            env.reset()
+        env.close()
+        assert names(published) == ["start_gym"]
+
+    def test_an_interrupt_in_the_middle(self, published):
+        def interrupt():
+            raise KeyboardInterrupt
+
+        env = gym.make(ID, backend=published(), user_token="ada")
+        env.reset()
+        published.answers["get_velocity"] = interrupt
+        with pytest.raises(KeyboardInterrupt):
+            env.step(np.ones(1, np.float32))
+        assert names(published)[-2:] == ["set_torque", "stop_experiment"]
+        env.close()
+        assert names(published).count("stop_experiment") == 1
+
+    def test_a_lost_session_is_stopped_without_complaint(self, published, caplog):
+        def lose():
+            raise RuntimeError("the session has ended")
+
+        env = gym.make(ID, backend=published(), user_token="ada")
+        env.reset()
+        published.answers.update(set_torque=lose, stop_experiment=lose)
+        env.close()
+        assert caplog.text == ""
+
+    def test_forgotten(self, published):
+        before = threading.enumerate()
+        env = gym.make(ID, backend=published(), user_token="ada")
+        env.reset()
+        assert len(threading.enumerate()) == len(before) + 1
+        del env
+        gc.collect()
+        assert names(published)[-1] == "stop_experiment"
+        assert threading.enumerate() == before
+
+
+PROGRAM = """
+import sys
+import gymnasium as gym, numpy as np
+import fmugym
+from fmugym.lab import Lab
+
+stop_session = Lab.stop_session
+def told(self, *args):
+    result = stop_session(self, *args)
+    print("stopped", flush=True)
+    return result
+Lab.stop_session = told
+
+lab = Lab("ideal")
+env = gym.make("fmugym/CloudPendulum-v0", backend=lab)
+env.reset()
+print("running", flush=True)
+for _ in range(int(sys.argv[1])):
+    env.step(np.zeros(1, np.float32))
+"""
+
+
+class TestExits:
+    def start(self, steps):
+        command = [sys.executable, "-W", "error", "-c", PROGRAM, str(steps)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(command, **pipes)
+
+    def test_a_program_that_forgets_to_close(self):
+        process = self.start(2)
+        out, error = process.communicate(timeout=60)
+        assert (process.returncode, out, error) == (0, "running\nstopped\n", "")
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="there is no such signal")
+    def test_control_c(self):
+        process = self.start(1000)
+        assert process.stdout.readline() == "running\n"
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=60)
+        assert out == "stopped\n"
+        assert error.strip().endswith("KeyboardInterrupt")
