@@ -11,6 +11,13 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 
+def echo_to(memory: Array, /) -> None:
+    """Write what FMUs say to memory as well, before they go on.
+
+    Args:
+        memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
+    """
+
 @final
 class Access:
     """A list of variables of one FMI version.

@@ -16,6 +16,12 @@ static Mutex lock = MUTEX_INITIALIZER;
 static Log *logs;
 static uint32_t next_id = 1;
 
+static struct {
+    char *text;
+    size_t size; /* 0 without an echo */
+    size_t length;
+} echo;
+
 bool log_open(Log *log, size_t count) {
     memset(log, 0, sizeof *log);
     log->recent = calloc(count, sizeof *log->recent);
@@ -144,6 +150,38 @@ static Log *find_log(uint32_t id) {
     return log;
 }
 
+void log_echo_to(char *memory, size_t size) {
+    mutex_lock(&lock);
+    echo.text = memory;
+    echo.size = size;
+    echo.length = 0;
+    mutex_unlock(&lock);
+}
+
+/* The oldest makes room for the newest, of which the end is kept. */
+static void append_to_echo(const char *category, const char *text) {
+    char room[TEXT_SIZE + 64];
+    const char *line = room;
+
+    if (echo.size < 2) {
+        return;
+    }
+    snprintf(room, sizeof room, "[%.32s] %s", category, text);
+    size_t length = strlen(line);
+    if (length > echo.size - 2) {
+        line += length - (echo.size - 2);
+        length = echo.size - 2;
+    }
+    const size_t free_bytes = echo.size - 1 - echo.length;
+    const size_t dropped = length + 1 > free_bytes ? length + 1 - free_bytes : 0;
+    memmove(echo.text, echo.text + dropped, echo.length - dropped);
+    echo.length -= dropped;
+    memcpy(echo.text + echo.length, line, length);
+    echo.length += length;
+    echo.text[echo.length++] = '\n';
+    echo.text[echo.length] = '\0';
+}
+
 static void trim_end(char *text) {
     size_t length = strlen(text);
     while (length > 0 && strchr(" \t\r\n", text[length - 1]) != NULL) {
@@ -154,12 +192,14 @@ static void trim_end(char *text) {
 static void deliver(uint64_t environment, int status, const char *category, char *text) {
     const size_t index = (size_t)(environment & UINT32_MAX);
 
+    category = category == NULL ? "" : category;
     trim_end(text);
     mutex_lock(&lock);
+    append_to_echo(category, text);
     Log *log = find_log((uint32_t)(environment >> INDEX_BITS));
     if (log != NULL && index < log->count) {
         remember(log, index, text);
-        queue_message(log, index, status, category == NULL ? "" : category, text);
+        queue_message(log, index, status, category, text);
     }
     mutex_unlock(&lock);
 }

@@ -879,6 +879,22 @@ static PyObject *uses_states(PyObject *object, PyObject *unused) {
                            !atomic_get(&self->pool.trial.refuted));
 }
 
+/* The memory of the echo, which is the process's. */
+static Py_buffer echo;
+
+static PyObject *echo_to(PyObject *module, PyObject *memory) {
+    Py_buffer view;
+
+    (void)module;
+    if (PyObject_GetBuffer(memory, &view, PyBUF_SIMPLE | PyBUF_WRITABLE) < 0) {
+        return NULL;
+    }
+    log_echo_to(view.buf, (size_t)view.len);
+    release(&echo);
+    echo = view;
+    Py_RETURN_NONE;
+}
+
 /* The module */
 
 #define FAST(name, function) {name, (PyCFunction)(void (*)(void))function, METH_FASTCALL, NULL}
@@ -929,11 +945,17 @@ static bool add_type(PyObject *module, PyTypeObject **type, PyType_Spec *spec) {
     return *type != NULL && PyModule_AddType(module, *type) == 0;
 }
 
+static PyMethodDef module_functions[] = {
+    {"echo_to", echo_to, METH_O, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
 static struct PyModuleDef definition = {
     .m_base = PyModuleDef_HEAD_INIT,
     .m_name = "fmugym._native",
     .m_doc = "Pools of FMU instances in C.",
     .m_size = -1,
+    .m_methods = module_functions,
 };
 
 PyMODINIT_FUNC PyInit__native(void) {

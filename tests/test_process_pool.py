@@ -157,12 +157,18 @@ class TestSingle:
         env.reset()
         assert not env.step([1.0])[3]
 
-    def test_last_words_are_told(self, make_pool, faulty):
-        """Of the Python pool, which passes messages on at once."""
-        pool = make_pool(backend="python")
+    @pytest.mark.parametrize(
+        ("backend", "said"),
+        [
+            ("python", "Faulty_1: [last words] this is fault 1"),
+            ("native", "[last words] this is fault 1"),
+        ],
+    )
+    def test_last_words_are_told(self, make_pool, faulty, backend, said):
+        pool = make_pool(backend=backend)
         set_up(pool, faulty, ["crash"], at=1)
         assert step(pool)[1].tolist() == [Status.FATAL]
-        assert pool.failure(0).endswith("; the FMU said: Faulty_1: [last words] this is fault 1")
+        assert pool.failure(0).endswith(f"; the FMU said: {said}")
 
     @pytest.mark.parametrize("stage", ["terminate", "free"])
     def test_the_end_of_an_instance(self, make_env, stage, caplog):

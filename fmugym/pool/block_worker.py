@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.archive import FMU
 from fmugym.errors import FMUGymError, SimulationError
@@ -27,7 +28,7 @@ from fmugym.model_description import ModelDescription, Variable
 from fmugym.pool.base import FloatArray, MaskArray, Pool, PoolSpec
 from fmugym.pool.channel import Channel, Code
 from fmugym.pool.python import PythonPool
-from fmugym.pool.shared_memory import Memory, make_arrays
+from fmugym.pool.shared_memory import Memory, make_arrays, make_echo
 from fmugym.safe_zip import ArchiveLimits
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
@@ -52,6 +53,7 @@ class Setup:
         directory: The working directory.
         environment: The environment variables.
         block: The indices of the worker's instances.
+        number: Which of the pool's workers it is.
         native: Whether the worker's own pool is a ``NativePool``.
         threads: See ``NativePool``.
     """
@@ -67,6 +69,7 @@ class Setup:
     directory: str
     environment: Mapping[str, str]
     block: slice
+    number: int = 0
     native: bool = False
     threads: int = 1
 
@@ -188,6 +191,8 @@ class BlockWorker:
         log.setLevel(setup.log_level)
         arrays = make_arrays(self._memory, setup.spec, setup.num_instances)
         self._block = arrays.block(setup.block)
+        if setup.native:
+            _native_echo_to(make_echo(self._memory, setup.spec, setup.num_instances, setup.number))
         self._pool = _make_pool(setup, log)
         np.copyto(self._pool.outputs, self._block.outputs)  # of a predecessor that died
 
@@ -239,6 +244,13 @@ class BlockWorker:
         self._serving = False
         self._snapshots.clear()
         self._pool.close()
+
+
+def _native_echo_to(memory: npt.NDArray[np.uint8]) -> None:
+    """The native pool hands messages over after a call only, which the process may not survive."""
+    from fmugym import _native
+
+    _native.echo_to(memory)
 
 
 def _make_pool(setup: Setup, log: logging.Logger) -> Pool:

@@ -36,7 +36,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.block_worker import Setup
 from fmugym.pool.channel import Code
-from fmugym.pool.shared_memory import Arrays, Memory, make_arrays, size_of_arrays
+from fmugym.pool.shared_memory import Arrays, Memory, make_arrays, size_for
 from fmugym.pool.supervisor import LostError, Supervisor
 
 __all__ = ["ProcessPool"]
@@ -92,7 +92,7 @@ class ProcessPool:
         self._numbers: dict[tuple[Variable, ...], int] = {}
         try:
             fmu.extract()
-            memory = Memory(max(1, size_of_arrays(spec, num_instances)))
+            memory = Memory(size_for(spec, num_instances, self.workers))
         except BaseException:
             fmu.close()
             raise
@@ -100,7 +100,8 @@ class ProcessPool:
         setup = Setup.of(fmu, spec, num_instances, log)
         setup = replace(setup, native=native, threads=threads or max(1, processors // self.workers))
         blocks = _blocks(num_instances, self.workers)
-        self._supervisors = [Supervisor(replace(setup, block=b), memory, log) for b in blocks]
+        setups = [replace(setup, block=b, number=i) for i, b in enumerate(blocks)]
+        self._supervisors = [Supervisor(one, memory, log) for one in setups]
         self._note_lost()
         patience = min(_CLOSING_TIME, self._call_timeout)
         self._close = weakref.finalize(self, _close, self._supervisors, memory, fmu, patience)
@@ -366,7 +367,7 @@ def disturb_each_other(fmu: FMU, spec: PoolSpec, *, private_libraries: bool = Fa
         What ``fmugym.pool.isolation.shares_globals`` says; True also if the worker dies of it.
     """
     log = logging.getLogger(__name__)
-    setup, memory = Setup.of(fmu, spec, 2, log), Memory(1)
+    setup, memory = Setup.of(fmu, spec, 2, log), Memory(size_for(spec, 2, 1))
     supervisor = Supervisor(setup, memory, log)
     try:
         supervisor.start("compare", setup, private_libraries)

@@ -19,10 +19,14 @@ import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 
-__all__ = ["Arrays", "Memory", "make_arrays", "size_of_arrays"]
+__all__ = ["Arrays", "Memory", "make_arrays", "make_echo", "size_for"]
 
 _ALIGNMENT: Final = 64
 """Of each array, in bytes: a cache line."""
+
+
+_ECHO_SIZE: Final = 4096
+"""Bytes for what the FMUs of a worker said last."""
 
 
 class Arrays(NamedTuple):
@@ -64,9 +68,13 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
     return int(-(-size // _ALIGNMENT) * _ALIGNMENT)
 
 
-def size_of_arrays(spec: PoolSpec, count: int) -> int:
-    """Bytes that the arrays of a pool take."""
+def _size_of_arrays(spec: PoolSpec, count: int) -> int:
     return sum(_padded_size(*row) for row in _layout(spec, count))
+
+
+def size_for(spec: PoolSpec, count: int, workers: int) -> int:
+    """Bytes that a pool of ``count`` instances needs."""
+    return _size_of_arrays(spec, count) + workers * _ECHO_SIZE
 
 
 def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
@@ -77,6 +85,12 @@ def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
         arrays.append(np.ndarray(shape, dtype, memory.map, offset))
         offset += _padded_size(shape, dtype)
     return Arrays(*arrays)
+
+
+def make_echo(memory: Memory, spec: PoolSpec, count: int, worker: int) -> npt.NDArray[np.uint8]:
+    """Where a worker's FMUs leave their last words, a text that ends with 0."""
+    offset = _size_of_arrays(spec, count) + worker * _ECHO_SIZE
+    return np.ndarray(_ECHO_SIZE, np.uint8, memory.map, offset)
 
 
 class Memory:

@@ -16,7 +16,7 @@ from fmugym.last_words import describe_exit
 from fmugym.pool.block_worker import Setup
 from fmugym.pool.channel import Channel, Code
 from fmugym.pool.launcher import Process, launch
-from fmugym.pool.shared_memory import Memory
+from fmugym.pool.shared_memory import Memory, make_echo
 
 __all__ = ["LostError", "Supervisor"]
 
@@ -59,6 +59,7 @@ class Supervisor:
         self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
         self._setup, self._memory, self._log = setup, memory, log
+        self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
         self._deaths = 0
         self._process: Process | None = None
         self._opening = self._busy = False
@@ -90,6 +91,7 @@ class Supervisor:
             raise LostError(self.reason) from None
         self._channel = Channel(end)
         self._tail: deque[str] = deque(maxlen=_TAIL)
+        self._echo[0] = 0
         self.is_new = True
         self.known.clear()
         self._channel.send_object(Code.REQUEST, (greeting, arguments or (self._setup,)))
@@ -268,7 +270,9 @@ class Supervisor:
         raise LostError(self.reason)
 
     def _cause(self, text: str) -> str:
-        said = f"; the FMU said: {' | '.join(self._tail)}" if self._tail else ""
+        echo = self._echo.tobytes().partition(b"\0")[0].decode(errors="replace")
+        lines = echo.splitlines()[-_TAIL:] or list(self._tail)
+        said = f"; the FMU said: {' | '.join(lines)}" if lines else ""
         return f"{self._setup.path.name}: {text}{said}"
 
 
