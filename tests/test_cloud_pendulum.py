@@ -202,6 +202,17 @@ class TestTask:
         env.close()
 
 
+    def test_no_time_passes_between_sample_and_step_on_the_fmu(self):
+        env = gym.make(ID)
+        assert env.reset(seed=0)[1]["sample_age"] == 0.0
+        assert env.step(env.action_space.sample())[4]["sample_age"] == 0.0
+        envs = gym.make_vec(ID, num_envs=3)
+        envs.reset(seed=0)
+        assert envs.step(envs.action_space.sample())[4]["sample_age"].tolist() == [0.0] * 3
+        envs.close()
+        env.close()
+
+
 class TestOnTheLab:
     def test_the_same_as_on_the_fmu(self, make_lab):
         """Solver steps of 2 ms there and 0.5 ms here: 1e-6 of 10 s of swings that are not small."""

@@ -86,10 +86,10 @@ class CloudPendulumEnv(FMUEnv):
     session. Truncated after 500 steps, 10 s (by ``gymnasium.make``), and by faults.
 
     ## Information
-    In the lab ``info`` has ``sample_age`` (how old the observation was when ``step`` returned it,
-    in s), ``deadline_misses`` (of this episode) and ``worst_lateness`` (in s). A step that comes
-    too late shifts those that follow; while none comes, the torque is zero and the session is kept
-    alive.
+    ``info`` has ``sample_age``: how old the observation was when ``step`` returned it, in s; on the
+    FMU, where no time passes meanwhile, 0. In the lab it also has ``deadline_misses`` (of this
+    episode) and ``worst_lateness`` (in s). A step that comes too late shifts those that follow;
+    while none comes, the torque is zero and the session is kept alive.
 
     ## Arguments
     * ``torque_limit``: torque of an action of 1, at most 0.15 N m.
@@ -200,6 +200,9 @@ class CloudPendulumEnv(FMUEnv):
         q, q_dot = self.state
         limited = np.minimum(np.maximum(q_dot, -VELOCITY_LIMIT), VELOCITY_LIMIT)
         return np.array([np.cos(q), np.sin(q), limited], dtype=np.float32)
+
+    def _get_info(self) -> dict[str, Any]:
+        return {} if self._in_lab else {"sample_age": np.zeros(np.shape(self.state[0]))[()]}
 
     def _get_scene(self) -> PendulumScene:
         return PendulumScene(torque_limit=self.torque_limit)
