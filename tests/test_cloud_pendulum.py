@@ -201,7 +201,6 @@ class TestTask:
         assert not np.array_equal(*pictures)
         env.close()
 
-
     def test_no_time_passes_between_sample_and_step_on_the_fmu(self):
         env = gym.make(ID)
         assert env.reset(seed=0)[1]["sample_age"] == 0.0
