@@ -197,7 +197,7 @@ except fmugym.FMULoadError as error:
 
 
 def test_paths_of_preload_are_relative_to_the_class(probe, tmp_path, monkeypatch):
-    (tmp_path / "tank_env.py").write_text(
+    (tmp_path / "preloading_tank.py").write_text(
         "import fmugym\n"
         "class Tank(fmugym.FMI2CSEnv):\n"
         "    def __init__(self, path, config):\n"
@@ -206,7 +206,7 @@ def test_paths_of_preload_are_relative_to_the_class(probe, tmp_path, monkeypatch
         "        return False\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    from tank_env import Tank
+    from preloading_tank import Tank
 
     loaded = []
     monkeypatch.setattr(archive, "load_globally", loaded.append)
