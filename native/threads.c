@@ -1,8 +1,12 @@
 /* Helper threads that take chunks of jobs.
  *
+ * The items of a job are divided into as many ranges as threads may work on it. Each thread begins with
+ * a range that is its own from job to job, as what it touches is in its processor's cache then, and
+ * goes on with what is left of the others'.
+ *
  * A job sits in a slot, and slots are never freed, so a helper that was put to sleep by the operating
  * system between finding a job and taking a chunk of it does no harm when it wakes up much later: a
- * chunk is taken by replacing the slot's ticket, (epoch, next item), and the epoch has gone on. So
+ * chunk is taken by replacing a range's ticket, (epoch, next item), and the epoch has gone on. So
  * the caller waits for chunks that were taken, never for threads. */
 
 #include "threads.h"
@@ -18,6 +22,7 @@
 
 enum {
     SLOTS = 64, /* jobs at the same time; with more, a caller works alone */
+    MOST_RANGES = 16,
     MOST_HELPERS = 255,
     STACK_SIZE = 8 << 20, /* of the main thread on most systems: FMUs may count on it */
     HELPER_SPIN = 20000, /* ns to look for more work before going to sleep */
@@ -25,7 +30,8 @@ enum {
 };
 
 typedef struct {
-    Atomic ticket; /* epoch << 32 | next item */
+    Atomic tickets[MOST_RANGES]; /* epoch << 32 | next item of a range */
+    Atomic ranges;
     Atomic count;
     Atomic done;
     Atomic helpers; /* at work in this slot */
@@ -33,7 +39,7 @@ typedef struct {
     Atomic smallest;
     Atomic largest;
     Atomic waiting; /* whether the caller sleeps */
-    /* constant from the opening of the ticket until all is done */
+    /* constant from the opening of the tickets until all is done */
     Job job;
     fenv_t environment;
     Mutex lock;
@@ -55,12 +61,16 @@ static size_t next_item(uint64_t ticket) {
     return (size_t)(ticket & UINT32_MAX);
 }
 
+static size_t end_of_range(const Slot *slot, size_t range) {
+    return (size_t)(atomic_get(&slot->count) * (range + 1) / atomic_get(&slot->ranges));
+}
+
 /* Large chunks first, smaller ones towards the end, so that all finish together. Whole cache lines
  * where chunks are large: neighbours write next to each other. */
 static size_t chunk_size(const Slot *slot, size_t left) {
     const size_t smallest = (size_t)atomic_get(&slot->smallest);
     const size_t largest = (size_t)atomic_get(&slot->largest);
-    size_t size = left / (2 * ((size_t)atomic_get(&slot->limit) + 1));
+    size_t size = left / 2;
 
     size = size > largest ? largest : size;
     size = size < smallest ? smallest : size;
@@ -78,36 +88,54 @@ static void finish(Slot *slot, size_t size, size_t count) {
     }
 }
 
-/* Takes chunks until there are none. A helper works in the caller's floating-point environment: the
- * rounding mode and the treatment of denormals must not depend on the thread. */
-static void take_chunks(Slot *slot, bool helper) {
-    uint64_t ticket = atomic_get(&slot->ticket), epoch = UINT64_MAX;
+/* Takes chunks of a range until there are none. A helper works in the caller's floating-point
+ * environment: the rounding mode and the treatment of denormals must not depend on the thread. epoch is
+ * that of the job for which it has been set. */
+static void take_range(Slot *slot, size_t range, bool helper, uint64_t *epoch) {
+    Atomic *place = &slot->tickets[range];
+    uint64_t ticket = atomic_get(place);
 
     for (;;) {
-        const size_t begin = next_item(ticket);
-        const size_t count = (size_t)atomic_get(&slot->count);
-        if (begin >= count) {
+        const size_t begin = next_item(ticket), end = end_of_range(slot, range);
+        if (begin >= end) {
             return;
         }
-        const size_t size = chunk_size(slot, count - begin);
-        if (!atomic_replace(&slot->ticket, &ticket, ticket + size)) {
+        const size_t size = chunk_size(slot, end - begin);
+        if (!atomic_replace(place, &ticket, ticket + size)) {
             continue;
         }
-        if (helper && epoch != ticket >> 32) {
-            epoch = ticket >> 32;
+        if (helper && *epoch != ticket >> 32) {
+            *epoch = ticket >> 32;
             fesetenv(&slot->environment);
         }
+        const size_t count = (size_t)atomic_get(&slot->count);
         slot->job.work(slot->job.context, begin, begin + size);
         finish(slot, size, count);
-        ticket = atomic_get(&slot->ticket);
+        ticket = atomic_get(place);
+    }
+}
+
+static void take_chunks(Slot *slot, size_t home, bool helper) {
+    const size_t ranges = (size_t)atomic_get(&slot->ranges);
+    uint64_t epoch = UINT64_MAX;
+
+    for (size_t i = 0; i < ranges; i++) {
+        take_range(slot, (home + i) % ranges, helper, &epoch);
     }
 }
 
 /* Helpers */
 
 static bool has_work(const Slot *slot) {
-    return next_item(atomic_get(&slot->ticket)) < atomic_get(&slot->count) &&
-           atomic_get(&slot->helpers) < atomic_get(&slot->limit);
+    if (atomic_get(&slot->helpers) >= atomic_get(&slot->limit)) {
+        return false;
+    }
+    for (size_t i = 0; i < atomic_get(&slot->ranges); i++) {
+        if (next_item(atomic_get(&slot->tickets[i])) < end_of_range(slot, i)) {
+            return true;
+        }
+    }
+    return false;
 }
 
 static Slot *find_work(void) {
@@ -120,9 +148,10 @@ static Slot *find_work(void) {
     return NULL;
 }
 
-static void help(Slot *slot) {
+/* The caller's range is the first one. */
+static void help(Slot *slot, size_t number) {
     if (atomic_add(&slot->helpers, 1) < atomic_get(&slot->limit)) {
-        take_chunks(slot, true);
+        take_chunks(slot, 1 + number, true);
     }
     atomic_add(&slot->helpers, (uint64_t)-1);
 }
@@ -148,11 +177,11 @@ static void sleep_until_work(void) {
     mutex_unlock(&lock);
 }
 
-static void helper_main(void) {
+static void helper_main(size_t number) {
     for (;;) {
         Slot *slot = spin_for_work();
         if (slot != NULL) {
-            help(slot);
+            help(slot, number);
         } else {
             sleep_until_work();
         }
@@ -161,14 +190,13 @@ static void helper_main(void) {
 
 #if defined _WIN32
 
-static DWORD WINAPI helper_entry(void *unused) {
-    (void)unused;
-    helper_main();
+static DWORD WINAPI helper_entry(void *number) {
+    helper_main((size_t)(uintptr_t)number);
     return 0;
 }
 
-static bool start_helper(void) {
-    HANDLE thread = CreateThread(NULL, STACK_SIZE, helper_entry, NULL,
+static bool start_helper(size_t number) {
+    HANDLE thread = CreateThread(NULL, STACK_SIZE, helper_entry, (void *)(uintptr_t)number,
                                  STACK_SIZE_PARAM_IS_A_RESERVATION, NULL);
     if (thread != NULL) {
         CloseHandle(thread);
@@ -178,14 +206,13 @@ static bool start_helper(void) {
 
 #else
 
-static void *helper_entry(void *unused) {
-    (void)unused;
-    helper_main();
+static void *helper_entry(void *number) {
+    helper_main((size_t)(uintptr_t)number);
     return NULL;
 }
 
 /* Signals are for the threads that were there before. */
-static bool start_helper(void) {
+static bool start_helper(size_t number) {
     pthread_attr_t attributes;
     pthread_t thread;
     sigset_t all, before;
@@ -195,7 +222,8 @@ static bool start_helper(void) {
     pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
     sigfillset(&all);
     pthread_sigmask(SIG_SETMASK, &all, &before);
-    const bool made = pthread_create(&thread, &attributes, helper_entry, NULL) == 0;
+    const bool made = pthread_create(&thread, &attributes, helper_entry,
+                                     (void *)(uintptr_t)number) == 0;
     pthread_sigmask(SIG_SETMASK, &before, NULL);
     pthread_attr_destroy(&attributes);
     return made;
@@ -210,7 +238,7 @@ static void start_helpers(size_t wanted) {
         return;
     }
     mutex_lock(&lock);
-    while (atomic_get(&started) < wanted && start_helper()) {
+    while (atomic_get(&started) < wanted && start_helper((size_t)atomic_get(&started))) {
         atomic_add(&started, 1);
     }
     mutex_unlock(&lock);
@@ -239,11 +267,14 @@ static Slot *take_slot(void) {
     return NULL;
 }
 
-/* The ticket is closed while the rest changes: no late helper may take a chunk meanwhile. */
+/* The tickets are closed while the rest changes: no late helper may take a chunk meanwhile. */
 static void open_slot(Slot *slot, const Job *job) {
-    const uint64_t epoch = (atomic_get(&slot->ticket) >> 32) + 1;
+    const uint64_t epoch = (atomic_get(&slot->tickets[0]) >> 32) + 1;
+    const size_t ranges = job->helpers < MOST_RANGES ? job->helpers + 1 : MOST_RANGES;
 
-    atomic_set(&slot->ticket, epoch << 32 | CLOSED);
+    for (size_t i = 0; i < MOST_RANGES; i++) {
+        atomic_set(&slot->tickets[i], epoch << 32 | CLOSED);
+    }
     slot->job = *job;
     fegetenv(&slot->environment);
     atomic_set(&slot->limit, job->helpers);
@@ -251,7 +282,10 @@ static void open_slot(Slot *slot, const Job *job) {
     atomic_set(&slot->largest, job->largest);
     atomic_set(&slot->done, 0);
     atomic_set(&slot->count, job->count);
-    atomic_set(&slot->ticket, epoch << 32);
+    atomic_set(&slot->ranges, ranges);
+    for (size_t i = 0; i < ranges; i++) {
+        atomic_set(&slot->tickets[i], epoch << 32 | (job->count * i / ranges));
+    }
     atomic_or_bits(&opened, (uint64_t)1 << (slot - slots));
 }
 
@@ -286,7 +320,7 @@ void threads_run(const Job *job) {
     start_helpers(job->helpers);
     open_slot(slot, job);
     wake_helpers(job->helpers);
-    take_chunks(slot, false);
+    take_chunks(slot, 0, false);
     atomic_and_bits(&opened, ~bit);
     wait_for_chunks(slot, job->count);
     atomic_and_bits(&taken, ~bit);
