@@ -284,6 +284,7 @@ class TestOnTheLab:
         ("arguments", "text"),
         [
             ({"backend": object()}, "must be 'fmu', or a client of the lab"),
+            ({"backend": "lab"}, r"such as fmugym\.lab\.Client\(\), not 'lab'"),
             ({"backend": "fmuu"}, "unknown backend 'fmuu'; did you mean 'fmu'"),
             ({"user_token": "a", "gym_token": "b"}, "give no user_token"),
             ({"gym_token": "b", "gym_time": 5.0}, "and no gym_time"),

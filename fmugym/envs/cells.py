@@ -63,7 +63,10 @@ def paced_cells(
     if not _is_client(client) and callable(getattr(client, "client", None)):
         client = client.client()
     if not _is_client(client):
-        raise ConfigError(f"backend must be 'fmu', or a client of the lab, not {client!r}")
+        raise ConfigError(
+            "backend must be 'fmu', or a client of the lab such as fmugym.lab.Client(), "
+            f"not {client!r}"
+        )
     lab = _simulated_lab(client)
     if user_token is None and gym_token is None:
         if lab is None:

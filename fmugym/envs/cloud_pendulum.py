@@ -105,12 +105,13 @@ class CloudPendulumEnv(FMUEnv):
     * ``session_time``: longest time of an episode in the lab, in s, pauses included.
     * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
     * ``render_mode``: "human", "rgb_array" or None.
+    * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
     ## Version History
     * v0: Initial version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
     render_size: ClassVar[tuple[int, int]] = (500, 500)
 
     def __init__(
@@ -126,6 +127,7 @@ class CloudPendulumEnv(FMUEnv):
         session_time: float = 30.0,
         fmi_version: str | float = "2.0",
         log_level: int = logging.WARNING,
+        **options: Any,
     ) -> None:
         if not 0.0 < torque_limit <= PLATFORM_TORQUE:
             raise ConfigError(
@@ -134,7 +136,7 @@ class CloudPendulumEnv(FMUEnv):
             )
         self.torque_limit = torque_limit
         self.limit_penalty = 1000.0
-        self._in_lab = not isinstance(backend, str)
+        self._in_lab = not isinstance(backend, str) or backend == "lab"  # an error will say how
         given = dict(model_parameters or {})
         self._require_settable(given)
         if self._in_lab:
@@ -152,6 +154,7 @@ class CloudPendulumEnv(FMUEnv):
             log_level,
             render_mode=render_mode,
             backend=None if backend == "fmu" else backend,
+            **options,
         )
 
     def _require_settable(self, names: Mapping[str, Any]) -> None:
