@@ -38,7 +38,8 @@ class Snapshot:
 class Pool:
     """N instances of one FMU.
 
-    ``inputs``, ``outputs``, ``status`` and ``observations`` are the pool's own arrays. A call that
+    ``inputs``, ``outputs``, ``status``, ``observations`` and ``health`` (int64, a row of counts for
+    each instance; see ``fmugym.pool.health``) are the pool's own arrays. A call that
     is given the very object ``inputs`` or ``observations`` uses it without a look at its buffer.
 
     Raises:
@@ -61,6 +62,7 @@ class Pool:
         time_step: float,
         substeps: int,
         warm_up_steps: int,
+        retries: int,
         strings: tuple[tuple[int, bytes], ...],
         input_variables: Access,
         output_variables: Access,
@@ -71,6 +73,7 @@ class Pool:
         outputs: Array,
         status: Array,
         observations: Array,
+        health: Array,
         callback: Callable[[int, int, str, str], object],
         /,
     ) -> Pool: ...
@@ -157,8 +160,14 @@ class Pool:
         Returns:
             The call (a whole sentence where the status is -1), whether in the warm-up, the status,
             the time of a step (else NaN), the String that could not be set (else 2**32 - 1), what
-            the FMU logged, and the outputs where these are the reason.
+            the FMU logged, and the inputs or outputs where these are the reason.
         """
+
+    def count_steps(self) -> None:
+        """Let ``health`` have all steps until now, which it otherwise gets at resets."""
+
+    def recycle(self) -> None:
+        """Let each instance be replaced by a new one at its next reset."""
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""

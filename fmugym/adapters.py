@@ -16,8 +16,9 @@ import os
 import threading
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar, Final, NamedTuple
 
 import fmpy
 import numpy as np
@@ -53,6 +54,8 @@ class Phase(enum.Enum):
 
     INSTANTIATED = enum.auto()
     STEPPING = enum.auto()
+    ENDED = enum.auto()
+    """After a step that was not done: reading and a reset are legal."""
     FAILED = enum.auto()
     """After Error: a reset is legal."""
     DEAD = enum.auto()
@@ -63,8 +66,27 @@ _TRUE: Final = b"\x01"
 _FALSE: Final = b"\x00"
 _load_lock = threading.Lock()
 
-Initialize = Callable[[float, float | None, float | None, Callable[[], None]], None]
-"""Takes the arguments of ``Instance.initialize``."""
+
+class Span(NamedTuple):
+    """What an FMU is told of the simulation at its start; see ``Instance.initialize``."""
+
+    start_time: float
+    stop_time: float | None
+    tolerance: float | None
+
+    @property
+    def times(self) -> tuple[float, bool, float]:
+        """Start time, whether there is a stop time, and that."""
+        return self.start_time, self.stop_time is not None, self.stop_time or 0.0
+
+    @property
+    def tolerances(self) -> tuple[bool, float]:
+        """Whether there is a tolerance, and that."""
+        return self.tolerance is not None, self.tolerance or 0.0
+
+
+Initialize = Callable[[Span, Callable[[], None]], None]
+"""Takes what the FMU is told, and the function that sets the start values."""
 
 
 class Access:
@@ -221,6 +243,8 @@ class Instance(ABC):
     slave_class: ClassVar[Any]
     dtypes: ClassVar[dict[str, Any]]
     """numpy's type for each of the C types by which this FMI version gets and sets values."""
+    enumeration_type: ClassVar = "Integer"
+    """The C type of enumerations."""
 
     def __init__(self, fmu: FMU, native: _Native, target: logging.Logger) -> None:
         self.phase = Phase.DEAD
@@ -269,11 +293,12 @@ class Instance(ABC):
     @abstractmethod
     def _prepare_initialization(self) -> Initialize: ...
 
-    @abstractmethod
-    def c_type(self, variable: Variable) -> str:
-        """The C type, in the standard's naming, by which a variable is got and set."""
-
     # What they have in common.
+
+    @property
+    def _may_return(self) -> bool:
+        """Whether states of earlier times may be restored, of which FMI tells the FMU."""
+        return self._description.capabilities.can_get_and_set_fmu_state
 
     def _function(self, name: str, *argtypes: Any, restype: Any = ctypes.c_int) -> Any:
         """Look a function up anew, so that FMPy's prototype of it stays as it is."""
@@ -282,6 +307,10 @@ class Instance(ABC):
         if argtypes:
             function.argtypes = argtypes
         return function
+
+    def c_type(self, variable: Variable) -> str:
+        """The C type, in the standard's naming, by which a variable is got and set."""
+        return self.enumeration_type if variable.kind == "enumeration" else variable.type
 
     def prepare_access(
         self, c_type: str, references: npt.NDArray[np.uint32], buffer: npt.NDArray[Any]
@@ -302,6 +331,15 @@ class Instance(ABC):
 
     def _trailing_arguments(self, count: int) -> tuple[Any, ...]:
         return ()
+
+    @contextmanager
+    def muted(self) -> Iterator[None]:
+        """Drop the messages of calls that nobody has asked for."""
+        self._log.muted = True
+        try:
+            yield
+        finally:
+            self._log.muted = False
 
     def set_string(self, variable: Variable, value: str) -> None:
         """Set a String variable before initialization."""
@@ -337,7 +375,7 @@ class Instance(ABC):
         """
         self._require(Phase.INSTANTIATED, "initialize")
         try:
-            self._initialize(start_time, stop_time, tolerance, set_start_values)
+            self._initialize(Span(start_time, stop_time, tolerance), set_start_values)
         except BaseException:  # half-way: whatever the status, only a reset is legal now
             if self.phase is Phase.INSTANTIATED:
                 self.phase = Phase.FAILED
@@ -363,8 +401,8 @@ class Instance(ABC):
             return
         for state in self._saved_states:
             state.release()
-        if self.phase is Phase.STEPPING:
-            self._function("Terminate")(self._component)
+        if self.can_read:
+            self.judge(self._function("Terminate")(self._component))
         fatal, self.phase = self.phase is Phase.DEAD, Phase.DEAD
         if not fatal:  # after Fatal the standard forbids even this: the memory is given up
             self._function("FreeInstance", restype=None)(self._component)
@@ -399,6 +437,24 @@ class Instance(ABC):
         elif status == Status.ERROR:
             self.phase = Phase.FAILED
         return status
+
+    def judge_step(self, status: int) -> int:
+        """Note that after a step that was not done FMI wants no other; otherwise as ``judge``."""
+        if status != Status.TERMINATED:
+            status = self.judge(status)
+        if status > Status.WARNING:
+            self.forbid_steps()
+        return status
+
+    def forbid_steps(self) -> None:
+        """Let there be no more steps until a reset."""
+        if self.phase is Phase.STEPPING:
+            self.phase = Phase.ENDED
+
+    @property
+    def can_read(self) -> bool:
+        """Whether variables may be read now."""
+        return self.phase in (Phase.STEPPING, Phase.ENDED)
 
     def _require(self, phase: Phase, doing: str) -> None:
         if self.phase is not phase:
@@ -487,7 +543,7 @@ class Instance(ABC):
         """Free a state; only ``SavedState`` calls this."""
         if self.phase is not Phase.DEAD:
             free_state = self._function(self._state_function("Free"))
-            free_state(self._component, ctypes.byref(pointer))
+            self.judge(free_state(self._component, ctypes.byref(pointer)))
 
     def _state_function(self, verb: str) -> str:
         return f"{verb}FMUState"
@@ -546,9 +602,6 @@ class FMI1Instance(Instance):
         name = self._SLAVE_FUNCTIONS.get(name, name)
         return f"{self._description.model_identifier}_fmi{name}"
 
-    def c_type(self, variable: Variable) -> str:
-        return "Integer" if variable.kind == "enumeration" else variable.type
-
     def _prepare_step(self) -> Callable[[float, float], int]:
         double = ctypes.c_double
         do_step = self._function("DoStep", ctypes.c_void_p, double, double, ctypes.c_char)
@@ -556,7 +609,7 @@ class FMI1Instance(Instance):
 
         def step(time: float, step_size: float) -> int:
             status: int = do_step(component, time, step_size, _TRUE)
-            return status if status == 0 else self.judge(status)
+            return status if status == 0 else self.judge_step(status)
 
         return step
 
@@ -566,15 +619,11 @@ class FMI1Instance(Instance):
             "InitializeSlave", ctypes.c_void_p, double, ctypes.c_char, double
         )
 
-        def run(
-            start_time: float,
-            stop_time: float | None,
-            tolerance: float | None,
-            set_start_values: Callable[[], None],
-        ) -> None:
+        def run(span: Span, set_start_values: Callable[[], None]) -> None:
             set_start_values()
-            defined = _FALSE if stop_time is None else _TRUE
-            status = initialize(self._component, start_time, defined, stop_time or 0.0)
+            start, has_stop, stop = span.times
+            defined = _TRUE if has_stop else _FALSE
+            status = initialize(self._component, start, defined, stop)
             self.check("initialization", status)
 
         return run
@@ -602,27 +651,28 @@ class FMI2Instance(Instance):
     def _state_function(self, verb: str) -> str:
         return f"{verb}FMUstate"
 
-    def c_type(self, variable: Variable) -> str:
-        return "Integer" if variable.kind == "enumeration" else variable.type
-
     def _prepare_step(self) -> Callable[[float, float], int]:
         double = ctypes.c_double
         do_step = self._function("DoStep", ctypes.c_void_p, double, double, ctypes.c_int)
-        component = self._component
+        component, no_return = self._component, not self._may_return
 
         def step(time: float, step_size: float) -> int:
-            status: int = do_step(component, time, step_size, 1)
-            if status == Status.DISCARD and self._asked_to_stop():
-                return Status.TERMINATED
-            return status if status == 0 else self.judge(status)
+            status: int = do_step(component, time, step_size, no_return)
+            if status == Status.DISCARD:
+                status = self._judge_discard()
+            return status if status == 0 else self.judge_step(status)
 
         return step
 
-    def _asked_to_stop(self) -> bool:
+    def _judge_discard(self) -> int:
+        """What a discarded step comes to; whoever cannot tell why has discarded it."""
         terminated = ctypes.c_int(0)
         get_status = self._function("GetBooleanStatus")
         status = get_status(self._component, self._TERMINATED, ctypes.byref(terminated))
-        return status <= Status.WARNING and terminated.value != 0
+        if status == Status.FATAL:
+            return Status.FATAL
+        asked_to_stop = status <= Status.WARNING and terminated.value != 0
+        return Status.TERMINATED if asked_to_stop else Status.DISCARD
 
     def _prepare_initialization(self) -> Initialize:
         double, integer = ctypes.c_double, ctypes.c_int
@@ -633,15 +683,8 @@ class FMI2Instance(Instance):
         leave = self._function("ExitInitializationMode")
         component, check = self._component, self.check
 
-        def run(
-            start_time: float,
-            stop_time: float | None,
-            tolerance: float | None,
-            set_start_values: Callable[[], None],
-        ) -> None:
-            tolerances = (tolerance is not None, tolerance or 0.0)
-            times = (start_time, stop_time is not None, stop_time or 0.0)
-            check("setting up the experiment", setup(component, *tolerances, *times))
+        def run(span: Span, set_start_values: Callable[[], None]) -> None:
+            check("setting up the experiment", setup(component, *span.tolerances, *span.times))
             set_start_values()
             check("entering initialization", enter(component))
             check("initialization", leave(component))
@@ -666,6 +709,7 @@ class FMI3Instance(Instance):
         "UInt64": np.uint64,
         "Boolean": np.uint8,
     }
+    enumeration_type = "Int64"
 
     def _instantiate(self, log: MessageLog) -> None:
         resources = os.path.join(self._slave.unzipDirectory, "resources", "")
@@ -690,9 +734,6 @@ class FMI3Instance(Instance):
     def _trailing_arguments(self, count: int) -> tuple[Any, ...]:
         return (ctypes.c_size_t(count),)
 
-    def c_type(self, variable: Variable) -> str:
-        return "Int64" if variable.kind == "enumeration" else variable.type
-
     def _prepare_step(self) -> Callable[[float, float], int]:
         double, pointer = ctypes.c_double, ctypes.c_void_p
         do_step = self._function(
@@ -703,15 +744,16 @@ class FMI3Instance(Instance):
         results = [ctypes.addressof(flags) + i for i in range(3)]
         results.append(ctypes.addressof(last_successful_time))
         component, self._step_results = self._component, (flags, last_successful_time)
+        no_return = not self._may_return
 
         def step(time: float, step_size: float) -> int:
             flags[1] = flags[2] = False  # an FMU that has nothing to say may not write them
-            status: int = do_step(component, time, step_size, True, *results)
+            status: int = do_step(component, time, step_size, no_return, *results)
             if status <= Status.WARNING and flags[1]:
-                return Status.TERMINATED
-            if status <= Status.WARNING and flags[2]:  # early return was not allowed
-                return Status.DISCARD
-            return status if status == 0 else self.judge(status)
+                status = Status.TERMINATED
+            elif status <= Status.WARNING and flags[2]:  # early return was not allowed
+                status = Status.DISCARD
+            return status if status == 0 else self.judge_step(status)
 
         return step
 
@@ -723,16 +765,9 @@ class FMI3Instance(Instance):
         leave = self._function("ExitInitializationMode")
         component, check = self._component, self.check
 
-        def run(
-            start_time: float,
-            stop_time: float | None,
-            tolerance: float | None,
-            set_start_values: Callable[[], None],
-        ) -> None:
+        def run(span: Span, set_start_values: Callable[[], None]) -> None:
             set_start_values()
-            tolerances = (tolerance is not None, tolerance or 0.0)
-            times = (start_time, stop_time is not None, stop_time or 0.0)
-            check("entering initialization", enter(component, *tolerances, *times))
+            check("entering initialization", enter(component, *span.tolerances, *span.times))
             check("initialization", leave(component))
 
         return run

@@ -13,8 +13,9 @@ import numpy as np
 from fmugym.distributions import is_distribution
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.model_description import ModelDescription, Variable
-from fmugym.pool.base import (
+from fmugym.pool_spec import (
     DEFAULT_CALL_TIMEOUT,
+    DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
     PoolSpec,
     whole_number_of_steps,
@@ -28,6 +29,8 @@ _LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 _LARGEST_EXACT_INTEGER = 2.0**53
 
 ON_FAULT = ("truncate", "terminate", "raise")
+MOST_RETRIES = 10
+"""The last one is 1024 steps instead of one."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,11 @@ class EnvConfig:
             distributions drawn at each reset. ``_update`` may write them.
         bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
+        fault_retries: How often a step that the FMU discards is repeated, as 2, 4, 8 ... smaller
+            ones, before ``on_fault`` holds.
         fault_reward: Reward of a step that failed.
+        leak_limit: Bytes of memory that resets may take for good before the FMU's instances are
+            freed and made anew; None for ever.
         archive_limits: What is too large to be opened; by default ``ArchiveLimits()``.
         preload: Shared libraries to be loaded before the FMU's; a relative path is relative to the
             class's file.
@@ -80,7 +87,9 @@ class EnvConfig:
     episode_variables: Mapping[str, Any] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     on_fault: str = "truncate"
+    fault_retries: int = 0
     fault_reward: float = 0.0
+    leak_limit: int | None = DEFAULT_LEAK_LIMIT
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     probe_timeout: float | None = DEFAULT_TIMEOUT
@@ -137,8 +146,14 @@ class EnvConfig:
             if value is not None:
                 _check_number(key, value, positive=key not in {"start_time", "stop_time"})
         _check_count("substeps", self.substeps)
-        if self.max_episode_steps is not None:
-            _check_count("max_episode_steps", self.max_episode_steps)
+        for key in ("max_episode_steps", "leak_limit"):
+            if getattr(self, key) is not None:
+                _check_count(key, getattr(self, key))
+        retries = self.fault_retries
+        if isinstance(retries, bool) or retries not in range(MOST_RETRIES + 1):
+            raise ConfigError(
+                f"fault_retries must be an integer from 0 to {MOST_RETRIES}, got {retries!r}"
+            )
 
     def _check_names(self) -> None:
         read = self.model_output_names + self.monitor_names
@@ -226,6 +241,7 @@ class Interface:
             ConfigError: If the warm-up is not a whole number of steps.
         """
         config, description = self.config, self.description
+        self._require_retries()
         warm_up_steps = whole_number_of_steps(config.warm_up, self.time_step)
         if warm_up_steps is None:
             raise ConfigError(
@@ -244,6 +260,19 @@ class Interface:
             tolerance=config.tolerance,
             warm_up_steps=warm_up_steps,
             strings=self.strings,
+            fault_retries=config.fault_retries,
+            leak_limit=config.leak_limit,
+        )
+
+    def _require_retries(self) -> None:
+        able = self.description.capabilities
+        if not self.config.fault_retries or (
+            able.can_handle_variable_communication_step_size and able.can_get_and_set_fmu_state
+        ):
+            return
+        raise ConfigError(
+            f"config key 'fault_retries': {self.description.model_name} must be able to get and "
+            "set its FMU state and to handle variable communication step sizes, and is not"
         )
 
 

@@ -28,6 +28,7 @@ from fmugym.config import EnvConfig, checked, output_variable, start_variable
 from fmugym.episode import Episode, EpisodePlan
 from fmugym.errors import ConfigError, SimulationError, unknown_name
 from fmugym.pool import Pool, PoolSpec, make_pool
+from fmugym.pool.health import fault_rates
 from fmugym.values import EpisodeVariables, NamedValues
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         backend: What stands in for the FMU, which then only describes the variables: an object
             with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
             it. Or the name of a way to step the FMU, see ``fmugym.pool.make_pool``.
+        isolation: Where the FMU runs, if not where the config says.
 
     Attributes:
         fmu: The FMU; ``fmu.description`` is what it says of itself.
@@ -140,6 +142,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         *,
         render_mode: str | None = None,
         backend: Any = None,
+        isolation: str | None = None,
     ) -> None:
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
         self.logger.setLevel(log_level)
@@ -152,18 +155,14 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._warn_of_peculiarities()
         self._prepare_values()
         self._prepare_spaces()
-        num_instances, requested = _pool_request.get()
-        isolation = {n: getattr(self.config, n) for n in ("isolation", "call_timeout")}
-        pool_options = isolation | requested
-        if backend is not None:
-            pool_options = {**pool_options, "backend": backend}
-        self._pool = make_pool(self.fmu, self._spec, num_instances, self.logger, **pool_options)
+        self._prepare_hooks()
+        self._pool = self._make_pool(backend, isolation)
         self._step_pool = self._pool.step_own
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
         self._observation_row = self._pool.observations[0]
         self._halt = getattr(self._pool, "halt", _nothing)
-        self._is_paced = bool(pool_info(self._pool))
-        self._has_info = self._has_info or self._is_paced
+        self._pool_tells = bool(pool_info(self._pool))
+        self._has_info = self._has_info or self._pool_tells
 
     def _checked_render_mode(self, mode: str | None) -> str | None:
         if mode is not None and mode not in self.metadata["render_modes"]:
@@ -178,6 +177,17 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             preload=[_find_file(cls, p) if os.path.dirname(p) else p for p in config.preload],
             probe_timeout=config.probe_timeout,
         )
+
+    def _make_pool(self, backend: Any, isolation: str | None) -> Pool:
+        num_instances, requested = _pool_request.get()
+        options: dict[str, Any] = {
+            "isolation": self.config.isolation if isolation is None else isolation,
+            "call_timeout": self.config.call_timeout,
+            **requested,
+        }
+        if backend is not None:
+            options["backend"] = backend
+        return make_pool(self.fmu, self._spec, num_instances, self.logger, **options)
 
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
@@ -237,6 +247,11 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
                     f"{type(self).__name__}._get_{name}_space returned {space!r}, "
                     "expected a gymnasium.spaces.Space"
                 )
+        self._no_action = _no_action(self.action_space)
+        self._elements = _elements(self.action_space) if type(self).step is FMUEnv.step else None
+
+    def _prepare_hooks(self) -> None:
+        """Settle what depends on the hooks that the class has of its own."""
         interface, cls = self._interface, type(self)
         derived = cls._get_action_space is FMUEnv._get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
@@ -249,8 +264,6 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         )
         if default:
             self._observe = fmu_spaces.default_observation(interface, self.observation_space)
-        self._no_action = _no_action(self.action_space)
-        self._elements = _elements(self.action_space) if cls.step is FMUEnv.step else None
         self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
         self._has_update = cls._update is not FMUEnv._update
         self._has_truncation = cls._is_truncated is not FMUEnv._is_truncated
@@ -453,7 +466,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
 
         Returns:
             Observation, reward, terminated, truncated, info. After a fault of the FMU the
-            observation is the last good one and the info has ``"fault"``, the reason.
+            observation is the last good one and the info has ``"fault"``, the reason, and
+            ``"fault_rate"``, the part of the episodes until now that ended so.
 
         Raises:
             ConfigError: If the action does not fit the inputs, or is not finite.
@@ -511,7 +525,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             raise
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and isinstance(values, float) and values - values == 0.0:
+        if self._takes_one_real and isinstance(values, float) and math.isfinite(values):
             self._input_row[0] = values
             self.inputs = (float(values),)
             return
@@ -575,7 +589,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     def _info(self) -> dict[str, Any]:
         """What the hook tells, and the pool."""
         info: dict[str, Any] = _given(self._get_info(), "_get_info")
-        if self._is_paced:
+        if self._pool_tells:
             info = info | {name: value.item(0) for name, value in pool_info(self._pool).items()}
         return info
 
@@ -592,9 +606,28 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             raise SimulationError(reason)
         self.logger.warning("%s", reason)
         self.done = policy == "terminate"
-        info = self._info() | {"fault": reason}
+        info = self._info() | {"fault": reason, "fault_rate": self._fault_rate()}
         reward = float(self.config.fault_reward)
         return self._get_observation(), reward, self.done, not self.done, info
+
+    def _fault_rate(self) -> float:
+        return float(fault_rates(self._open_pool("health").health())[0])
+
+    @property
+    def health(self) -> dict[str, int]:
+        """What was counted of the FMU since the environment was made, by name.
+
+        ``resets``; ``steps`` (communication steps); faults by kind: ``discards``, ``errors``,
+        ``fatals``, ``not_finite``, ``deaths`` (of its worker process); ``retries`` of discarded
+        steps; ``replacements`` of the instance, and of these ``recyclings`` because of leaks; and
+        ``memory_growth``, the bytes that resets have taken from this process (in worker processes:
+        that the worker has grown by).
+
+        Raises:
+            SimulationError: If the environment is closed.
+        """
+        counts = self._open_pool("health").health()
+        return {name: int(values[0]) for name, values in counts.items()}
 
     def render(self) -> Any:
         """Draw the present state.
@@ -695,7 +728,7 @@ def _nothing() -> None:
 
 
 def pool_info(pool: Any) -> dict[str, npt.NDArray[Any]]:
-    """What a pool tells of each step, each of shape (N,); only paced ones do."""
+    """What a pool tells of each step, each of shape (N,); paced ones do, and those that retry."""
     return pool.info() if hasattr(pool, "info") else {}
 
 

@@ -41,7 +41,10 @@ class MessageLog:
         environment: A number that is unique in the process.
         instance_name: A name that is unique in the process.
         recent: The last messages, for the text of errors.
+        muted: Whether messages are dropped.
     """
+
+    muted = False
 
     def __init__(self, model: str, target: logging.Logger) -> None:
         self.environment = next(_ids)
@@ -57,6 +60,8 @@ class MessageLog:
 
     def receive(self, status: int, category: str, message: str) -> None:
         """Pass one message on, at the level of its status."""
+        if self.muted:
+            return
         self.recent.append(message)
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         self._target.log(level, "%s: [%s] %s", self.instance_name, category, message)

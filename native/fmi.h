@@ -65,6 +65,7 @@ typedef struct {
     const uint32_t *input_references, *output_references;
     size_t number_of_inputs, number_of_outputs;
     double time, step;
+    bool no_return; /* see do_step */
     const double *inputs;
     double *outputs;
 } Exchange;
@@ -84,7 +85,9 @@ typedef struct Fmi {
     /* doing is set to the call that failed. */
     Status (*initialize)(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing);
-    Status (*do_step)(const Library *library, void *component, double time, double step);
+    /* no_return promises that no state from before this time will be restored. */
+    Status (*do_step)(const Library *library, void *component, double time, double step,
+                      bool no_return);
     /* Does a step with inputs and outputs that are all FLOAT64; what exchange_by makes of the version.
      * stage is set to the call that the status is of; outputs are got if the step succeeded or was the last. */
     Status (*exchange)(const Library *library, void *component, const Exchange *exchange,
@@ -96,13 +99,13 @@ typedef struct Fmi {
     Status (*set_string)(const Library *library, void *component, uint32_t reference,
                          const char *text);
     Status (*reset)(const Library *library, void *component);
-    void (*terminate)(const Library *library, void *component);
+    Status (*terminate)(const Library *library, void *component);
     void (*free_instance)(const Library *library, void *component);
 
     /* FMU states; NULL in FMI 1.0. */
     Status (*get_state)(const Library *library, void *component, void **state);
     Status (*set_state)(const Library *library, void *component, void *state);
-    void (*free_state)(const Library *library, void *component, void **state);
+    Status (*free_state)(const Library *library, void *component, void **state);
     /* The serialized size, 0 if the FMU does not tell. */
     size_t (*state_size)(const Library *library, void *component, void *state);
 } Fmi;
@@ -119,7 +122,7 @@ static inline Status exchange_by(const Fmi *fmi, const Library *library, void *c
         return status;
     }
     *stage = DOING_STEP;
-    status = fmi->do_step(library, component, e->time, e->step);
+    status = fmi->do_step(library, component, e->time, e->step, e->no_return);
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         return status;
     }

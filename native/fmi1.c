@@ -83,7 +83,9 @@ static Status initialize(const Library *library, void *component, const Experime
                                                   e->stop_time));
 }
 
-static Status do_step(const Library *library, void *component, double time, double step) {
+static Status do_step(const Library *library, void *component, double time, double step,
+                      bool no_return) {
+    (void)no_return;
     return sane(functions_of(library)->do_step(component, time, step, 1));
 }
 
@@ -133,11 +135,9 @@ static Status reset(const Library *library, void *component) {
     return f->reset == NULL ? STATUS_ERROR : sane(f->reset(component));
 }
 
-static void terminate(const Library *library, void *component) {
+static Status terminate(const Library *library, void *component) {
     const Functions *f = functions_of(library);
-    if (f->terminate != NULL) {
-        f->terminate(component);
-    }
+    return f->terminate == NULL ? STATUS_OK : sane(f->terminate(component));
 }
 
 static void free_instance(const Library *library, void *component) {

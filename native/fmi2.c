@@ -108,19 +108,25 @@ static Status initialize(const Library *library, void *component, const Experime
     return status;
 }
 
-static bool asked_to_stop(const Functions *f, void *component) {
+/* What a discarded step comes to. Whoever cannot tell why has discarded it. */
+static Status judge_discard(const Functions *f, void *component) {
     int terminated = 0;
+
     if (f->get_boolean_status == NULL) {
-        return false;
+        return STATUS_DISCARD;
     }
-    return sane(f->get_boolean_status(component, TERMINATED, &terminated)) <= STATUS_WARNING &&
-           terminated != 0;
+    const Status status = sane(f->get_boolean_status(component, TERMINATED, &terminated));
+    if (status == STATUS_FATAL) {
+        return status;
+    }
+    return status <= STATUS_WARNING && terminated != 0 ? STATUS_TERMINATED : STATUS_DISCARD;
 }
 
-static Status do_step(const Library *library, void *component, double time, double step) {
+static Status do_step(const Library *library, void *component, double time, double step,
+                      bool no_return) {
     const Functions *f = functions_of(library);
-    const Status status = sane(f->do_step(component, time, step, 1));
-    return status == STATUS_DISCARD && asked_to_stop(f, component) ? STATUS_TERMINATED : status;
+    const Status status = sane(f->do_step(component, time, step, no_return));
+    return status == STATUS_DISCARD ? judge_discard(f, component) : status;
 }
 
 static Status get(const Library *library, void *component, Type type, const uint32_t *references,
@@ -169,11 +175,9 @@ static Status reset(const Library *library, void *component) {
     return f->reset == NULL ? STATUS_ERROR : sane(f->reset(component));
 }
 
-static void terminate(const Library *library, void *component) {
+static Status terminate(const Library *library, void *component) {
     const Functions *f = functions_of(library);
-    if (f->terminate != NULL) {
-        f->terminate(component);
-    }
+    return f->terminate == NULL ? STATUS_OK : sane(f->terminate(component));
 }
 
 static void free_instance(const Library *library, void *component) {
@@ -190,11 +194,9 @@ static Status set_state(const Library *library, void *component, void *state) {
     return f->set_state == NULL ? STATUS_ERROR : sane(f->set_state(component, state));
 }
 
-static void free_state(const Library *library, void *component, void **state) {
+static Status free_state(const Library *library, void *component, void **state) {
     const Functions *f = functions_of(library);
-    if (f->free_state != NULL && *state != NULL) {
-        f->free_state(component, state);
-    }
+    return f->free_state == NULL ? STATUS_OK : sane(f->free_state(component, state));
 }
 
 static size_t state_size(const Library *library, void *component, void *state) {

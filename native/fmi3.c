@@ -100,11 +100,12 @@ static Status initialize(const Library *library, void *instance, const Experimen
     return status;
 }
 
-static Status do_step(const Library *library, void *instance, double time, double step) {
+static Status do_step(const Library *library, void *instance, double time, double step,
+                      bool no_return) {
     bool event_handling_needed = false, terminate = false, early_return = false;
     double last_successful_time = time;
     const Status status =
-        sane(functions_of(library)->do_step(instance, time, step, true, &event_handling_needed,
+        sane(functions_of(library)->do_step(instance, time, step, no_return, &event_handling_needed,
                                             &terminate, &early_return, &last_successful_time));
 
     if (status <= STATUS_WARNING && terminate) {
@@ -148,11 +149,9 @@ static Status reset(const Library *library, void *instance) {
     return f->reset == NULL ? STATUS_ERROR : sane(f->reset(instance));
 }
 
-static void terminate(const Library *library, void *instance) {
+static Status terminate(const Library *library, void *instance) {
     const Functions *f = functions_of(library);
-    if (f->terminate != NULL) {
-        f->terminate(instance);
-    }
+    return f->terminate == NULL ? STATUS_OK : sane(f->terminate(instance));
 }
 
 static void free_instance(const Library *library, void *instance) {
@@ -169,11 +168,9 @@ static Status set_state(const Library *library, void *instance, void *state) {
     return f->set_state == NULL ? STATUS_ERROR : sane(f->set_state(instance, state));
 }
 
-static void free_state(const Library *library, void *instance, void **state) {
+static Status free_state(const Library *library, void *instance, void **state) {
     const Functions *f = functions_of(library);
-    if (f->free_state != NULL && *state != NULL) {
-        f->free_state(instance, state);
-    }
+    return f->free_state == NULL ? STATUS_OK : sane(f->free_state(instance, state));
 }
 
 static size_t state_size(const Library *library, void *instance, void *state) {

@@ -134,7 +134,7 @@ static void snapshot_dealloc(PyObject *object) {
 
 /* Pool */
 
-enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, BUFFERS };
+enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 enum { STARTS, BLOCK, USED, LOW, WIDTH, ROWS, COUNTS, ENDED, PLAY_BUFFERS };
 
 typedef struct {
@@ -158,24 +158,25 @@ typedef struct {
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
-    long long substeps, warm_up_steps;
+    long long substeps, warm_up_steps, retries;
 } Arguments;
 
 static bool parse(PyPool *self, PyObject *args, Arguments *a) {
     Settings *s = &self->pool.settings;
     return PyArg_ParseTuple(
-        args, "iyyyO!pppdOOdLLO!O!O!nnnOOOOO", &a->version, &s->model, &s->token, &s->resources,
+        args, "iyyyO!pppdOOdLLLO!O!O!nnnOOOOOO", &a->version, &s->model, &s->token, &s->resources,
         &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging, &a->can_save,
         &s->experiment.start_time, &a->stop_time, &a->tolerance, &s->time_step, &a->substeps,
-        &a->warm_up_steps, &PyTuple_Type, &a->strings, access_type, &a->inputs, access_type,
+        &a->warm_up_steps, &a->retries, &PyTuple_Type, &a->strings, access_type, &a->inputs, access_type,
         &a->outputs, &a->num_observed, &a->count, &a->threads, &self->arrays[INPUTS],
         &self->arrays[OUTPUTS], &self->arrays[STATUS], &self->arrays[OBSERVATIONS],
-        &self->callback);
+        &self->arrays[HEALTH], &self->callback);
 }
 
 static bool check_numbers(const Arguments *a) {
     const bool sound = a->count >= 1 && a->count <= INT32_MAX && a->threads >= 1 &&
                        a->substeps >= 1 && a->warm_up_steps >= 0 && a->num_observed >= 0 &&
+                       a->retries >= 0 && a->retries < 31 && (a->retries == 0 || a->can_save) &&
                        (size_t)a->num_observed <= a->outputs->access.count;
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a number is out of range");
@@ -239,7 +240,9 @@ static bool take_arrays(PyPool *self, const Arguments *a) {
            take_buffer(self->arrays[STATUS], &self->buffers[STATUS], writable, "status", "b", -1,
                        n) &&
            take_buffer(self->arrays[OBSERVATIONS], &self->buffers[OBSERVATIONS], writable,
-                       "observations", "f", n, a->num_observed);
+                       "observations", "f", n, a->num_observed) &&
+           take_buffer(self->arrays[HEALTH], &self->buffers[HEALTH], writable, "health", "lq", n,
+                       HEALTH_COUNTS);
 }
 
 static bool settle(PyPool *self, const Arguments *a) {
@@ -251,6 +254,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->can_save = a->can_save && s->fmi != NULL && s->fmi->get_state != NULL;
     s->substeps = a->substeps;
     s->warm_up_steps = a->warm_up_steps;
+    s->retries = s->can_save ? a->retries : 0;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
     s->num_observed = (size_t)a->num_observed;
@@ -261,6 +265,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->number_of_strings = (size_t)PyTuple_Size(a->strings);
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
+    s->health = self->buffers[HEALTH].buf;
     return s->fmi != NULL &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
@@ -525,6 +530,7 @@ static PyObject *reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs
     Call call = {.observations = NULL};
 
     if (require_open(self) && has_arguments(nargs, 4) &&
+        view_inputs(self, Py_None, &views, &call) &&
         view_start(self, args[0], args[1], &views, &call) &&
         view_mask(self, args[2], &views, &call.mask) &&
         view_observations(self, args[3], &views, &call)) {
@@ -828,12 +834,12 @@ static PyObject *read_variables(PyObject *object, PyObject *const *args, Py_ssiz
     return PyLong_FromSsize_t(failed);
 }
 
-static PyObject *values_of(const PyPool *self, const Failure *f) {
-    const size_t size = self->pool.settings.outputs->count * sizeof *f->values;
+static PyObject *values_of(const Failure *f) {
     if (f->values == NULL) {
         Py_RETURN_NONE;
     }
-    return PyBytes_FromStringAndSize((const char *)f->values, (Py_ssize_t)size);
+    return PyBytes_FromStringAndSize((const char *)f->values,
+                                     (Py_ssize_t)(f->number_of_values * sizeof *f->values));
 }
 
 static PyObject *failure(PyObject *object, PyObject *argument) {
@@ -853,7 +859,7 @@ static PyObject *failure(PyObject *object, PyObject *argument) {
     }
     PyObject *result = Py_BuildValue("sOidINN", f.doing, f.in_warm_up ? Py_True : Py_False,
                                      f.status, f.time, (unsigned)f.string_reference,
-                                     decode(f.said), values_of(self, &f));
+                                     decode(f.said), values_of(&f));
     free(f.said);
     free(f.values);
     return result;
@@ -862,6 +868,32 @@ static PyObject *failure(PyObject *object, PyObject *argument) {
 static PyObject *close_method(PyObject *object, PyObject *unused) {
     (void)unused;
     close_pool((PyPool *)object);
+    Py_RETURN_NONE;
+}
+
+static PyObject *count_steps(PyObject *object, PyObject *unused) {
+    PyPool *self = (PyPool *)object;
+
+    (void)unused;
+    if (!require_open(self)) {
+        return NULL;
+    }
+    Py_BEGIN_ALLOW_THREADS
+    pool_count_steps(&self->pool);
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
+static PyObject *recycle(PyObject *object, PyObject *unused) {
+    PyPool *self = (PyPool *)object;
+
+    (void)unused;
+    if (!require_open(self)) {
+        return NULL;
+    }
+    Py_BEGIN_ALLOW_THREADS
+    pool_recycle(&self->pool);
+    Py_END_ALLOW_THREADS
     Py_RETURN_NONE;
 }
 
@@ -910,6 +942,8 @@ static PyMethodDef pool_methods[] = {
     FAST("restore", restore),
     FAST("read", read_variables),
     {"failure", failure, METH_O, NULL},
+    {"count_steps", count_steps, METH_NOARGS, NULL},
+    {"recycle", recycle, METH_NOARGS, NULL},
     {"close", close_method, METH_NOARGS, NULL},
     {"costs", costs, METH_NOARGS, NULL},
     {"uses_states", uses_states, METH_NOARGS, NULL},

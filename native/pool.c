@@ -17,11 +17,15 @@ static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states
 
 enum {
     TRIALS = 5,
+    REHEARSED = 3, /* steps */
     STACK_VALUES = 512,
     RUN = PROGRAM_WIDTH, /* instances of a run */
     MANY = 64,         /* instances from which on every call is measured */
     MEASURE_EVERY = 16 /* calls with fewer */
 };
+
+static const char *const BAD_INPUTS = "the inputs are not finite";
+static const char *const BAD_OUTPUTS = "the outputs are not finite";
 
 /* Failures */
 
@@ -77,6 +81,34 @@ static size_t index_of(const Pool *pool, const Instance *me) {
     return (size_t)(me - pool->instances);
 }
 
+/* Health */
+
+static int64_t *health_of(const Pool *pool, const Instance *me) {
+    return pool->settings.health + index_of(pool, me) * HEALTH_COUNTS;
+}
+
+static void count_fault(const Pool *pool, const Instance *me, Status status) {
+    if (status == STATUS_DISCARD) {
+        health_of(pool, me)[DISCARDS]++;
+    } else if (status == STATUS_ERROR) {
+        health_of(pool, me)[ERRORS]++;
+    } else if (status == STATUS_FATAL) {
+        health_of(pool, me)[FATALS]++;
+    } else if (status == STATUS_NOT_FINITE) {
+        health_of(pool, me)[NOT_FINITE]++;
+    }
+}
+
+/* Steps count themselves; these are taken over now and then. */
+static void count_steps(const Pool *pool, Instance *me) {
+    health_of(pool, me)[STEPS] += me->steps - me->counted;
+    me->counted = me->steps;
+}
+
+static void begin_counting_at(Instance *me, int64_t steps) {
+    me->steps = me->counted = steps;
+}
+
 /* A call returned a bad status: note which calls are still legal, and why. */
 static Status fail(Pool *pool, Instance *me, const char *doing, Status status) {
     Failure *failure = note_failure(me, doing, status);
@@ -109,11 +141,13 @@ static bool build(Pool *pool, Instance *me) {
     return me->component != NULL;
 }
 
-static void free_state(const Pool *pool, Instance *me, void **state) {
+static Status free_state(const Pool *pool, Instance *me, void **state) {
+    Status status = STATUS_OK;
     if (*state != NULL && me->phase != PHASE_DEAD) {
-        pool->settings.fmi->free_state(me->library, me->component, state);
+        status = judge(me, pool->settings.fmi->free_state(me->library, me->component, state));
     }
     *state = NULL; /* after Fatal the standard forbids to free it: the memory is given up */
+    return status;
 }
 
 /* Snapshots are linked and unlinked under the pool's lock, but instances are replaced by several
@@ -133,8 +167,8 @@ static void discard(Pool *pool, Instance *me) {
     const Fmi *fmi = pool->settings.fmi;
 
     free_states(pool, me);
-    if (me->phase == PHASE_STEPPING) {
-        fmi->terminate(me->library, me->component);
+    if (me->phase == PHASE_STEPPING || me->phase == PHASE_ENDED) {
+        judge(me, fmi->terminate(me->library, me->component));
     }
     if (me->phase != PHASE_DEAD) {
         fmi->free_instance(me->library, me->component);
@@ -163,6 +197,7 @@ static void reload_private_library(Pool *pool, Instance *me) {
 static Status replace(Pool *pool, Instance *me) {
     const bool was_dead = me->phase == PHASE_DEAD;
 
+    health_of(pool, me)[REPLACEMENTS]++;
     discard(pool, me);
     if (was_dead) {
         reload_private_library(pool, me);
@@ -175,6 +210,16 @@ static Status replace(Pool *pool, Instance *me) {
         failure->said = log_said(&pool->log, index_of(pool, me));
     }
     return STATUS_FATAL;
+}
+
+/* Memory that an instance has leaked may go with it. */
+static Status recycle(Pool *pool, Instance *me) {
+    me->due = false;
+    if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
+        return STATUS_OK;
+    }
+    health_of(pool, me)[RECYCLINGS]++;
+    return replace(pool, me);
 }
 
 /* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
@@ -204,18 +249,74 @@ static double communication_point(const Pool *pool, const Instance *me) {
            (s->substeps == 1 ? since_start : since_start / (double)s->substeps);
 }
 
+/* After a step that was not done FMI wants no other. */
+static void forbid_steps(Instance *me) {
+    if (me->phase == PHASE_STEPPING) {
+        me->phase = PHASE_ENDED;
+    }
+}
+
 static Status fail_step(Pool *pool, Instance *me, double time, Status status) {
     fail(pool, me, "the step", status);
+    forbid_steps(me);
     if (me->failure != NULL) {
         me->failure->time = time;
     }
     return status;
 }
 
+/* A communication step as several smaller ones. */
+static Status step_in_parts(Pool *pool, Instance *me, double time, int64_t parts) {
+    const Settings *s = &pool->settings;
+    const double size = pool->step_size / (double)parts;
+    Status status = STATUS_OK;
+
+    for (int64_t i = 0; i < parts && status <= STATUS_WARNING; i++) {
+        status = s->fmi->do_step(me->library, me->component, time + (double)i * size, size,
+                                 pool->no_return);
+    }
+    return status;
+}
+
+/* A discarded step leaves the instance where it may not be stepped on from: each try begins at the
+ * state before the first one. */
+static Status retry(Pool *pool, Instance *me, double time, void *before) {
+    const Settings *s = &pool->settings;
+    int64_t *health = health_of(pool, me);
+    Status status = STATUS_DISCARD;
+
+    for (int64_t i = 1; i <= s->retries && status == STATUS_DISCARD; i++) {
+        const Status restored = s->fmi->set_state(me->library, me->component, before);
+        if (restored > STATUS_WARNING) {
+            return restored;
+        }
+        health[RETRIES]++;
+        health[RETRIED]++;
+        status = step_in_parts(pool, me, time, (int64_t)1 << i);
+    }
+    return status;
+}
+
+static Status step_with_retries(Pool *pool, Instance *me, double time) {
+    void *before = NULL;
+    Status status = pool->settings.fmi->get_state(me->library, me->component, &before);
+
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    status = step_in_parts(pool, me, time, 1);
+    if (status == STATUS_DISCARD) {
+        status = retry(pool, me, time, before);
+    }
+    judge(me, status);
+    const Status freed = free_state(pool, me, &before);
+    return status > STATUS_WARNING ? status : freed;
+}
+
 static Status step_once(Pool *pool, Instance *me) {
     const double time = communication_point(pool, me);
-    const Status status =
-        pool->settings.fmi->do_step(me->library, me->component, time, pool->step_size);
+    const Status status = pool->settings.retries == 0 ? step_in_parts(pool, me, time, 1)
+                                                      : step_with_retries(pool, me, time);
 
     me->steps++;
     return status > STATUS_WARNING ? fail_step(pool, me, time, status) : status;
@@ -245,10 +346,11 @@ static bool all_finite(const double *values, size_t count) {
     return sums[0] + sums[1] + sums[2] + sums[3] == 0.0;
 }
 
-static Status note_not_finite(Instance *me, const double *values, size_t count) {
-    Failure *failure = note_failure(me, "the outputs are not finite", -1);
+static Status note_not_finite(Instance *me, const char *what, const double *values, size_t count) {
+    Failure *failure = note_failure(me, what, -1);
     if (failure != NULL) {
         failure->values = copy_values(values, count);
+        failure->number_of_values = count;
     }
     return STATUS_NOT_FINITE;
 }
@@ -259,6 +361,7 @@ typedef struct {
     void *typed;    /* and their typed form */
     double *inputs; /* of a run of instances, one after the other */
     double *outputs;
+    bool sound;     /* whether these inputs are all finite */
 } Scratch;
 
 static void copy_outputs(const Pool *pool, const Instance *me, double *values) {
@@ -280,7 +383,7 @@ static Status read_outputs(Pool *pool, Instance *me, Scratch scratch) {
         return fail(pool, me, "reading the outputs", got);
     }
     if (!all_finite(scratch.values, count)) {
-        return note_not_finite(me, scratch.values, count);
+        return note_not_finite(me, BAD_OUTPUTS, scratch.values, count);
     }
     double *place = s->output_values + index_of(pool, me);
     for (size_t i = 0; i < count; i++, place += s->count) {
@@ -296,6 +399,12 @@ static void gather(const Matrix *matrix, size_t column, size_t rows, double *val
     }
 }
 
+static Status fail_reading(Pool *pool, Instance *me, Status status) {
+    fail(pool, me, "reading the outputs", status);
+    forbid_steps(me); /* the step before may have been the last */
+    return status;
+}
+
 /* Inputs, one step and outputs as one call of the FMI version. */
 static Status exchange(Pool *pool, Instance *me, Exchange *e) {
     Stage stage;
@@ -308,12 +417,18 @@ static Status exchange(Pool *pool, Instance *me, Exchange *e) {
     if (stage == DOING_STEP) {
         return fail_step(pool, me, e->time, status);
     }
-    return fail(pool, me, stage == SETTING_INPUTS ? "setting the inputs" : "reading the outputs",
-                status);
+    if (stage == SETTING_INPUTS) {
+        return fail(pool, me, "setting the inputs", status);
+    }
+    return fail_reading(pool, me, status);
 }
 
 static Status exchange_in_parts(Pool *pool, Instance *me, const Exchange *e, void *typed) {
     const Settings *s = &pool->settings;
+
+    if (s->retries > 0) {
+        health_of(pool, me)[RETRIED] = 0;
+    }
     const Status set = access_set(s->inputs, me->library, me->component, e->inputs, typed);
 
     if (set > STATUS_WARNING) {
@@ -324,12 +439,15 @@ static Status exchange_in_parts(Pool *pool, Instance *me, const Exchange *e, voi
         return status;
     }
     const Status got = access_get(s->outputs, me->library, me->component, e->outputs, typed);
-    return got > STATUS_WARNING ? fail(pool, me, "reading the outputs", got) : status;
+    return got > STATUS_WARNING ? fail_reading(pool, me, got) : status;
 }
 
 static Status step_instance(Pool *pool, Instance *me, Exchange *e, Scratch scratch) {
     if (me->phase != PHASE_STEPPING) {
         return refuse(me, "a step was asked for before a reset has mended the instance");
+    }
+    if (!scratch.sound && !all_finite(e->inputs, e->number_of_inputs)) {
+        return note_not_finite(me, BAD_INPUTS, e->inputs, e->number_of_inputs);
     }
     e->time = communication_point(pool, me);
     return pool->direct ? exchange(pool, me, e) : exchange_in_parts(pool, me, e, scratch.typed);
@@ -373,9 +491,10 @@ static Status fail_initialization(Pool *pool, Instance *me, const StartContext *
 }
 
 static Status warm_up(Pool *pool, Instance *me) {
-    me->steps = 0;
+    begin_counting_at(me, 0);
     for (int64_t i = 0; i < pool->settings.warm_up_steps; i++) {
         const Status status = advance(pool, me);
+        begin_counting_at(me, me->steps);
         if (status > STATUS_WARNING) {
             if (me->failure != NULL) {
                 me->failure->in_warm_up = true;
@@ -404,7 +523,8 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     return warm_up(pool, me);
 }
 
-/* Initial states: kept once the same start values come a second time, restored from then on. */
+/* Initial states: kept once the same start values come a second time, after an episode with steps, and
+ * restored from then on. */
 
 static bool states_are_of_use(Pool *pool, const Instance *me) {
     return pool->settings.can_save && !me->unsavable && !atomic_get(&pool->trial.refuted);
@@ -445,19 +565,67 @@ static bool too_large(Pool *pool, Instance *me) {
     return size > STATES_LIMIT / s->count;
 }
 
-static Status keep_state(Pool *pool, Instance *me, uint64_t initialization) {
+/* Steps with inputs; returns whether that went well. */
+static bool try_steps(Pool *pool, Instance *me, const double *inputs, double *outputs,
+                      void *typed) {
+    const Access *access = pool->settings.outputs;
+    const int64_t before = me->steps;
+
+    atomic_set(&pool->log.muted, index_of(pool, me) + 1); /* nobody has asked for these steps */
+    bool well = access_set(pool->settings.inputs, me->library, me->component, inputs, typed) <=
+                STATUS_WARNING;
+
+    for (size_t i = 0; i < REHEARSED && well; i++, outputs += access->count) {
+        well = advance(pool, me) <= STATUS_WARNING &&
+               access_get(access, me->library, me->component, outputs, typed) <= STATUS_WARNING;
+    }
+    atomic_set(&pool->log.muted, 0);
+    me->steps = before;
+    return well;
+}
+
+/* Steps twice from the kept state, with the inputs that were written last: an FMU may have left a part
+ * of its state out. */
+static bool rehearse(Pool *pool, Instance *me, const Matrix *inputs, void *typed) {
+    const size_t width = pool->settings.inputs->count;
+    const size_t size = REHEARSED * pool->settings.outputs->count;
+    double *memory = malloc((width + 2 * size + 1) * sizeof *memory);
+    bool well = memory != NULL;
+
+    if (well) {
+        gather(inputs, index_of(pool, me), width, memory);
+        well = all_finite(memory, width);
+    }
+    for (size_t i = 0; i < 2 && well; i++) {
+        well = try_steps(pool, me, memory, memory + width + i * size, typed) &&
+               restore_state(pool, me, me->saved) <= STATUS_WARNING;
+    }
+    well = well && memcmp(memory + width, memory + width + size, size * sizeof *memory) == 0;
+    free(memory);
+    return well;
+}
+
+static Status keep_state(Pool *pool, Instance *me, uint64_t initialization, const Matrix *inputs,
+                         void *typed) {
     const Status status = save_state(pool, me, &me->saved);
 
     if (status > STATUS_WARNING) {
         me->unsavable = true;
         return status;
     }
-    if (owns_trial(pool, me)) {
-        pool->trial.initialization = initialization;
-        if (too_large(pool, me)) {
-            give_states_up(pool);
-        }
+    if (!owns_trial(pool, me)) {
+        return STATUS_OK;
     }
+    pool->trial.initialization = initialization;
+    if (too_large(pool, me)) {
+        give_states_up(pool);
+    } else if (!pool->trial.rehearsed && !rehearse(pool, me, inputs, typed)) {
+        give_states_up(pool);
+        drop_failure(me);
+        free_state(pool, me, &me->saved);
+        return judge(me, STATUS_ERROR); /* to be initialized anew */
+    }
+    pool->trial.rehearsed = true;
     return STATUS_OK;
 }
 
@@ -471,22 +639,23 @@ static bool starts_as_before(const Pool *pool, const Instance *me, const Access 
     return me->start_id == start->id && memcmp(start_values_of(pool, me), values, size) == 0;
 }
 
-static Status start_anew(Pool *pool, Instance *me, const Access *start, bool again,
+static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
                          Scratch scratch) {
+    const Access *start = call->start;
     const uint64_t began = again ? clock_now() : 0;
-    const Status status = initialize(pool, me, start, scratch);
 
+    free_state(pool, me, &me->saved);
+    const Status status = initialize(pool, me, start, scratch);
     if (status > STATUS_WARNING) {
         return status;
     }
-    free_state(pool, me, &me->saved);
     again = again && me->start_id == start->id; /* it may have been replaced */
     me->start_id = start->id;
     memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
     if (!again || !states_are_of_use(pool, me)) {
         return STATUS_OK;
     }
-    if (keep_state(pool, me, clock_now() - began) <= STATUS_WARNING) {
+    if (keep_state(pool, me, clock_now() - began, &call->inputs, scratch.typed) <= STATUS_WARNING) {
         return STATUS_OK;
     }
     return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
@@ -511,13 +680,13 @@ static bool passes_trial(Pool *pool, Instance *me, uint64_t restoration, Scratch
     return true;
 }
 
-static Status restart(Pool *pool, Instance *me, const Access *start, bool again, Scratch scratch) {
-    Status status = start_anew(pool, me, start, again, scratch);
+static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
+    Status status = start_anew(pool, me, call, again, scratch);
 
     if (status > STATUS_WARNING) {
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
-    me->steps = pool->settings.warm_up_steps * pool->settings.substeps;
+    begin_counting_at(me, pool->settings.warm_up_steps * pool->settings.substeps);
     status = read_outputs(pool, me, scratch);
     if (status == STATUS_OK && me->saved != NULL && owns_trial(pool, me)) {
         copy_outputs(pool, me, pool->trial.outputs);
@@ -533,18 +702,27 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
         me->unsavable = true;
         return status;
     }
-    me->steps = pool->settings.warm_up_steps * pool->settings.substeps;
+    begin_counting_at(me, pool->settings.warm_up_steps * pool->settings.substeps);
     return read_outputs(pool, me, scratch);
 }
 
 /* By the cheapest way that gives the same as a fresh instance. */
-static Status reset_instance(Pool *pool, Instance *me, const Access *start, const Matrix *values,
-                             Scratch scratch) {
+static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
+    const Access *start = call->start;
+    const Matrix *values = &call->start_values;
+    const bool stepped = me->steps > pool->settings.warm_up_steps * pool->settings.substeps;
+
+    count_steps(pool, me);
+    health_of(pool, me)[RESETS]++;
+    health_of(pool, me)[RETRIED] = 0;
+    if (me->due && recycle(pool, me) > STATUS_WARNING) {
+        return STATUS_FATAL;
+    }
     gather(values, index_of(pool, me), start->count, scratch.values);
     const bool again = starts_as_before(pool, me, start, scratch.values);
 
     if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
-        return restart(pool, me, start, again, scratch);
+        return restart(pool, me, call, again && stepped, scratch);
     }
     const bool trying = owns_trial(pool, me) && pool->trial.trials < TRIALS;
     const uint64_t began = trying ? clock_now() : 0;
@@ -555,7 +733,7 @@ static Status reset_instance(Pool *pool, Instance *me, const Access *start, cons
         return status;
     }
     gather(values, index_of(pool, me), start->count, scratch.values);
-    return restart(pool, me, start, again, scratch);
+    return restart(pool, me, call, again, scratch);
 }
 
 /* Division of the work */
@@ -589,18 +767,23 @@ static void write_observation(const Pool *pool, size_t index, float *observation
 
 static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
     const size_t index = index_of(task->pool, me);
-    const Status status = restore_state(task->pool, me, task->snapshot->states[index]);
 
+    count_steps(task->pool, me);
+    const Status status = restore_state(task->pool, me, task->snapshot->states[index]);
     if (status > STATUS_WARNING) {
         return status;
     }
-    me->steps = task->snapshot->steps[index];
+    begin_counting_at(me, task->snapshot->steps[index]);
     return read_outputs(task->pool, me, scratch);
 }
 
 static size_t note_status(Task *task, size_t index, Status status) {
     task->pool->settings.status[index] = (int8_t)status;
-    return status > STATUS_WARNING;
+    if (status <= STATUS_WARNING) {
+        return 0;
+    }
+    count_fault(task->pool, &task->pool->instances[index], status);
+    return 1;
 }
 
 /* Resets or restores instances that need not be neighbours. */
@@ -615,7 +798,7 @@ static size_t start_listed(Task *task, size_t begin, size_t end, Scratch scratch
         const Status status =
             task->operation == RESTORE
                 ? restore_instance(task, me, scratch)
-                : reset_instance(pool, me, call->start, &call->start_values, scratch);
+                : reset_instance(pool, me, call, scratch);
         troubled += note_status(task, index, status);
         if (call->observations != NULL) {
             write_observation(pool, index, call->observations);
@@ -650,7 +833,8 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
         Instance *me = &pool->instances[begin + j];
         if (!all_finite(outputs, width)) {
             const bool counted = pool->settings.status[begin + j] > STATUS_WARNING;
-            troubled += note_status(task, begin + j, note_not_finite(me, outputs, width)) && !counted;
+            note_status(task, begin + j, note_not_finite(me, BAD_OUTPUTS, outputs, width));
+            troubled += !counted;
             copy_outputs(pool, me, outputs);
         }
     }
@@ -701,6 +885,7 @@ static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
                   .number_of_inputs = in_width,
                   .number_of_outputs = out_width,
                   .step = pool->step_size,
+                  .no_return = pool->no_return,
                   .inputs = scratch.inputs,
                   .outputs = scratch.outputs};
     size_t troubled = 0;
@@ -717,7 +902,7 @@ static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
             if (call->turn != NULL) {
                 play_draw(call->turn->play, index);
             }
-            status = reset_instance(pool, me, call->start, &call->start_values, scratch);
+            status = reset_instance(pool, me, call, scratch);
             troubled += note_status(task, index, status);
         }
         if (in_mask || (status > STATUS_WARNING && status != STATUS_TERMINATED)) {
@@ -731,6 +916,7 @@ static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
 
 static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
     gather_inputs(task, begin, count, scratch.inputs);
+    scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
 
     if (!all_finite(scratch.outputs, count * task->pool->settings.outputs->count)) {
@@ -809,7 +995,8 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     if (memory == NULL) {
         return give_chunk_up(task, begin, end);
     }
-    const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in};
+    const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in,
+                             true};
     const size_t troubled = work_with(task, begin, end, scratch);
     if (memory != stack) {
         free(memory);
@@ -1009,8 +1196,8 @@ ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
     mutex_lock(&pool->lock);
     for (size_t i = 0; i < count && failed < 0; i++) {
         Instance *me = &pool->instances[i];
-        if (me->phase == PHASE_DEAD) {
-            refuse(me, "nothing can be read after a fatal error");
+        if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
+            refuse(me, "nothing can be read before a reset has mended the instance");
             failed = (ptrdiff_t)i;
             break;
         }
@@ -1035,10 +1222,26 @@ bool pool_failure(Pool *pool, size_t index, Failure *copy) {
     if (failure != NULL) {
         *copy = *failure;
         copy->said = copy_text(failure->said);
-        copy->values = copy_values(failure->values, pool->settings.outputs->count);
+        copy->values = copy_values(failure->values, failure->number_of_values);
     }
     mutex_unlock(&pool->lock);
     return failure != NULL;
+}
+
+void pool_count_steps(Pool *pool) {
+    mutex_lock(&pool->lock);
+    for (size_t i = 0; i < pool->settings.count; i++) {
+        count_steps(pool, &pool->instances[i]);
+    }
+    mutex_unlock(&pool->lock);
+}
+
+void pool_recycle(Pool *pool) {
+    mutex_lock(&pool->lock);
+    for (size_t i = 0; i < pool->settings.count; i++) {
+        pool->instances[i].due = true;
+    }
+    mutex_unlock(&pool->lock);
 }
 
 /* Snapshots */
@@ -1207,7 +1410,9 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     mutex_reset(&pool->lock);
     pool->settings = *settings;
     pool->step_size = settings->time_step / (double)settings->substeps;
-    pool->direct = settings->substeps == 1 && settings->inputs->direct && settings->outputs->direct;
+    pool->no_return = !settings->can_save;
+    pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
+                   settings->outputs->direct;
     pool->open = true;
     snprintf(error, size, "out of memory");
     if (!log_open(&pool->log, settings->count) || !allocate(pool)) {

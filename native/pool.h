@@ -27,6 +27,7 @@ typedef struct {
     bool private_libraries;   /* whether there is one for each instance */
     bool logging;
     bool can_save;
+    int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
     int64_t substeps;
@@ -39,11 +40,29 @@ typedef struct {
     size_t threads;
     double *output_values; /* one row of count per output */
     int8_t *status;
+    int64_t *health; /* one row of HEALTH_COUNTS per instance */
 } Settings;
+
+/* What is counted of each instance; fugym/pool/base.py has the names in this order. */
+enum {
+    RESETS,
+    STEPS, /* communication steps until the last reset */
+    DISCARDS,
+    ERRORS,
+    FATALS,
+    NOT_FINITE,
+    RETRIES,
+    REPLACEMENTS,
+    RECYCLINGS,
+    DEATHS,  /* of processes; not counted here */
+    RETRIED, /* in the last step */
+    HEALTH_COUNTS
+};
 
 typedef enum {
     PHASE_INSTANTIATED,
     PHASE_STEPPING,
+    PHASE_ENDED,  /* after a step that was not done: reading and a reset are legal */
     PHASE_FAILED, /* after Error: a reset is legal */
     PHASE_DEAD    /* after Fatal, or where there is no instance: no call is legal */
 } Phase;
@@ -56,7 +75,8 @@ typedef struct {
     double time;    /* of a step, NaN for other calls */
     uint32_t string_reference; /* of the String that could not be set, or UINT32_MAX */
     char *said;     /* what the FMU logged, or NULL */
-    double *values; /* the outputs if these are the reason, or NULL */
+    double *values; /* the inputs or outputs if these are the reason, or NULL */
+    size_t number_of_values;
 } Failure;
 
 typedef struct {
@@ -65,12 +85,13 @@ typedef struct {
     void *saved;       /* the FMU state after initialization with the start values, or NULL */
     uint64_t start_id; /* of the list of start variables of the last initialization, or 0 */
     int64_t steps;     /* communication steps done */
+    int64_t counted;   /* of these, those that are in its health */
     Failure *failure;
     uint32_t generation; /* goes up whenever the instance is replaced */
     uint8_t phase;
     bool unsavable; /* it refused once */
-    char padding[64 - 6 * 8 - 6];
-} Instance;
+    bool due;       /* to be replaced at its next reset */
+} Instance; /* of 64 bytes */
 
 typedef struct Snapshot {
     struct Snapshot *next;
@@ -93,6 +114,7 @@ enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
 typedef struct {
     Atomic owner; /* its index + 1 */
     Atomic refuted;
+    bool rehearsed; /* whether steps from a restored state were found to be the same */
     size_t trials;
     uint64_t initialization; /* shortest times, ns */
     uint64_t restoration;
@@ -103,6 +125,7 @@ typedef struct Pool {
     struct Pool *next; /* in the list of all pools */
     Settings settings;
     double step_size; /* of a communication step */
+    bool no_return;   /* whether no state will ever be restored */
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
     bool open;
@@ -134,7 +157,7 @@ typedef struct {
 
 /* What to do in a call; what is not needed for it may be zero. */
 typedef struct {
-    Matrix inputs;
+    Matrix inputs; /* of this step, or those of the last one */
     Mask mask;
     const Access *start; /* the variables set before initialization */
     Matrix start_values;
@@ -156,6 +179,12 @@ bool pool_is_quick(const Pool *pool, int operation);
 /* Copies the last failure of an instance. Returns whether there is one, of which the caller frees
  * said and values. */
 bool pool_failure(Pool *pool, size_t index, Failure *copy);
+
+/* Lets the health have all steps until now. */
+void pool_count_steps(Pool *pool);
+
+/* Lets each instance be replaced by a new one at its next reset. */
+void pool_recycle(Pool *pool);
 
 /* All three return how many of the instances have a status worse than a warning now. */
 

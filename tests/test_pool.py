@@ -495,8 +495,8 @@ class TestStartValues:
     def test_strings_and_integers(self, make_pool, probe, version, caplog):
         pool = make_pool(probe(version), ["a"], ["steps"], 2, strings={"label": "here"})
         for _ in range(4):
-            caplog.clear()
             set_up(pool, log_status=[-1, 1])
+            caplog.clear()
             step(pool)
             assert caplog.text.count("step 1 of here is 100%") == 1
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from fmugym.archive import FMU
 from fmugym.bundled import is_bundled
-from fmugym.errors import FMULoadError, SimulationError, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, SimulationError, unknown_name
 from fmugym.pool.backend import Backend, BackendPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
@@ -79,6 +79,9 @@ def make_pool(
         FMULoadError: If the FMU cannot be loaded or instantiated, or the backend is not there.
     """
     if not isinstance(backend, str):
+        if spec.fault_retries:
+            fmu.close()
+            raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
         return BackendPool(fmu, spec, num_instances, backend)
     native = _is_native(backend)
     if isolation not in (None, *ISOLATIONS):
@@ -94,17 +97,17 @@ def make_pool(
         workers = num_instances if apart and not workers else workers
         options: Any = {"workers": workers, "threads": threads, "call_timeout": call_timeout}
         return ProcessPool(fmu, spec, num_instances, log, native=native, **options)
-    if apart and not native:
+    if native:
+        from fmugym.pool.native import NativePool
+
+        return NativePool(fmu, spec, num_instances, log, threads=threads, private_libraries=apart)
+    if apart:
         fmu.close()
         raise FMULoadError(
             f"{fmu.path.name} needs a library of its own for each of {num_instances} "
             "instances, which only the native pool or isolation='process' can give it"
         )
-    if not native:
-        return PythonPool(fmu, spec, num_instances, log)
-    from fmugym.pool.native import NativePool
-
-    return NativePool(fmu, spec, num_instances, log, threads=threads, private_libraries=apart)
+    return PythonPool(fmu, spec, num_instances, log)
 
 
 def _is_native(backend: str) -> bool:
@@ -118,49 +121,43 @@ def _is_native(backend: str) -> bool:
 
 
 def _disturb_each_other(fmu: FMU, spec: PoolSpec, isolation: str | None) -> bool:
-    """Whether instances want globals of their own."""
+    """Whether instances want globals of their own.
+
+    Found out in a process of its own; or here, where this one must do and trials are turned off.
+    """
     if is_bundled(fmu.path):
         return False
     if fmu.description.capabilities.can_be_instantiated_only_once_per_process:
         return True
-    if isolation == "process":
-        from fmugym.pool.process import disturb_each_other
-
-        return disturb_each_other(fmu, spec)
-    return _shares_globals(fmu, spec)
-
-
-def _least_isolation(fmu: FMU, spec: PoolSpec, native: bool, log: logging.Logger) -> str:
-    """What instances that disturb each other need: private libraries, or private processes."""
-    from fmugym.pool.process import disturb_each_other
-
-    if native and not disturb_each_other(fmu, spec, private_libraries=True):
-        isolation, what = "none", "a copy of the library"
-    else:
-        isolation, what = "process", "a process"
-    log.warning(
-        "the instances of %s disturb each other: each gets %s of its own", fmu.path.name, what
-    )
-    return isolation
-
-
-def _shares_globals(fmu: FMU, spec: PoolSpec) -> bool:
-    """Found out in a process of its own, or here where trials are turned off."""
+    is_isolated = isolation == "process"
+    if is_isolated or not fmu.candidate.exempt:
+        return probe_globals(fmu.candidate, spec, must_survive=not is_isolated)
     from fmugym.pool.isolation import shares_globals
 
-    if not fmu.candidate.exempt:
-        return probe_globals(fmu.candidate, spec)
     try:
         return shares_globals(fmu, spec)
     except SimulationError:  # it fails alone too, without the values that the caller will set
         return False
 
 
+def _least_isolation(fmu: FMU, spec: PoolSpec, native: bool, log: logging.Logger) -> str:
+    """What instances that disturb each other need: private libraries, or private processes."""
+    isolation, what = "process", "a process"
+    if native and not probe_globals(
+        fmu.candidate, spec, private_libraries=True, must_survive=False
+    ):
+        isolation, what = "none", "a copy of the library"
+    log.warning(
+        "the instances of %s disturb each other: each gets %s of its own", fmu.path.name, what
+    )
+    return isolation
+
+
 @functools.cache
 def has_native_pool() -> bool:
     """Whether the C extension was built when this package was installed."""
     try:
-        import fmugym._native  # noqa: F401
+        import fmugym._native  # noqa: F401  (can it be?)
     except ImportError:
         return False
     return True

@@ -19,6 +19,7 @@ from fmugym.errors import ConfigError, SimulationError
 from fmugym.model_description import Variable
 from fmugym.pool.backend_threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.health import Column, Counted, no_counts, note
 from fmugym.pool.pacing import Paced, Schedule
 
 __all__ = ["Backend", "BackendPool", "Outputs"]
@@ -194,7 +195,7 @@ def _text(error: Exception) -> str:
     return f"{error}" if isinstance(error, SimulationError) else f"{type(error).__name__}: {error}"
 
 
-class BackendPool:
+class BackendPool(Counted):
     """N backends in the place of N FMU instances, stepped at the same time.
 
     See ``Pool`` for the contract, apart from states: a backend has none to be saved. The FMU says
@@ -221,6 +222,7 @@ class BackendPool:
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._failures = [""] * num_instances
+        self._counts = no_counts(num_instances)
         self._is_ready = np.zeros(num_instances, np.bool_)
         self._ages: FloatArray = np.zeros(num_instances)
         self._paced = backend if isinstance(backend, Paced) else None
@@ -330,6 +332,7 @@ class BackendPool:
 
     def _ask(self, method: str, arguments: Mapping[int, Any]) -> None:
         """Call a method of some rigs at the same time, and take over what it gives."""
+        self._counts[list(arguments), Column.RESETS if method == "reset" else Column.STEPS] += 1
         calls = [
             (self._threads[index], getattr(self._rigs[index], method), argument)
             for index, argument in arguments.items()
@@ -347,7 +350,7 @@ class BackendPool:
             raise
 
     def _take(self, index: int, outcome: _Outcome) -> None:
-        self.statuses[index] = outcome.status
+        self.statuses[index] = note(self._counts[index], outcome.status)
         self._failures[index] = outcome.reason
         self._is_ready[index] = outcome.values is not None
         self._ages[index] = self._now() - outcome.sample_time

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import os
-from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.model_description import Variable
+from fmugym.pool_spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -21,58 +20,11 @@ __all__ = [
     "PoolSpec",
     "StatusArray",
     "available_processors",
-    "whole_number_of_steps",
 ]
 
 FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
-
-
-ISOLATIONS: Final = ("none", "process")
-"""Where FMUs run: in the caller's process, or in worker processes."""
-
-DEFAULT_CALL_TIMEOUT: Final = 60.0
-"""How long a worker process may take for a call, in seconds of real time."""
-
-
-@dataclass(frozen=True)
-class PoolSpec:
-    """What a pool does at each reset and step.
-
-    Attributes:
-        inputs: The variables set before each step, in the order of the rows of ``step``'s argument.
-        outputs: The variables read after each step, in the order of the rows of its result.
-        time_step: Simulated time of one step, in seconds.
-        num_observed: How many of the outputs, from the first, make an observation.
-        substeps: Number of communication steps in one step.
-        start_time: First communication point, in seconds.
-        stop_time: Passed to the FMU where it is not None, in seconds.
-        tolerance: Passed to the FMU where it is not None.
-        warm_up_steps: Steps simulated at each reset, inputs at their start values, before the
-            first output is read.
-        strings: String parameters and their values.
-    """
-
-    inputs: tuple[Variable, ...]
-    outputs: tuple[Variable, ...]
-    time_step: float
-    num_observed: int = 0
-    substeps: int = 1
-    start_time: float = 0.0
-    stop_time: float | None = None
-    tolerance: float | None = None
-    warm_up_steps: int = 0
-    strings: tuple[tuple[Variable, str], ...] = ()
-
-    def communication_point(self, count: int) -> float:
-        """The time after ``count`` communication steps; never a sum, which would drift."""
-        return self.start_time + count * self.time_step / self.substeps
-
-    @property
-    def communication_step_size(self) -> float:
-        """The step size that the FMU sees, in seconds."""
-        return self.time_step / self.substeps
 
 
 class Pool(Protocol):
@@ -84,7 +36,8 @@ class Pool(Protocol):
 
     A status is a ``fmugym.adapters.Status``. What an FMU does wrong is never raised, since it
     concerns one instance only: its status tells, ``failure`` gives the reason, its outputs stay
-    those before the call, and the next reset mends or replaces it.
+    those before the call, and the next reset mends or replaces it. The same goes for an instance
+    whose inputs are not finite, which is not stepped.
     """
 
     num_instances: int
@@ -180,6 +133,14 @@ class Pool(Protocol):
         """
         ...
 
+    def health(self) -> dict[str, npt.NDArray[np.int64]]:
+        """What was counted of each instance, by name, each of shape (N,); see ``HEALTH``."""
+        ...
+
+    def forget_health(self) -> None:
+        """Begin to count anew."""
+        ...
+
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
         ...
@@ -190,9 +151,3 @@ def available_processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def whole_number_of_steps(duration: float, time_step: float) -> int | None:
-    """The number of steps in a duration, or None if it is not a whole one."""
-    count = round(duration / time_step)
-    return count if math.isclose(count * time_step, duration, abs_tol=1e-9) else None

@@ -12,7 +12,6 @@ import logging
 import os
 import signal
 import socket
-import tempfile
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,10 +22,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive import FMU
-from fmugym.errors import FMUGymError, SimulationError
+from fmugym.errors import FMUGymError
 from fmugym.model_description import ModelDescription, Variable
 from fmugym.pool.base import FloatArray, MaskArray, Pool, PoolSpec
 from fmugym.pool.channel import Channel, Code
+from fmugym.pool.health import HealthArray
+from fmugym.pool.leaks import ProcessGrowth
 from fmugym.pool.python import PythonPool
 from fmugym.pool.shared_memory import Memory, make_arrays, make_echo
 from fmugym.safe_zip import ArchiveLimits
@@ -168,6 +169,7 @@ class BlockWorker:
         self._note(int(np.count_nonzero(pool.statuses > 1)))
 
     def _note(self, troubled: int) -> None:
+        self._channel.require_open()  # else the outputs would be those of a step that is lost
         self._publish()
         self._channel.send_code(Code.TROUBLE if troubled else Code.FINE)
 
@@ -193,32 +195,27 @@ class BlockWorker:
         self._block = arrays.block(setup.block)
         if setup.native:
             _native_echo_to(make_echo(self._memory, setup.spec, setup.num_instances, setup.number))
-        self._pool = _make_pool(setup, log)
+        self._pool = _make_pool(setup, log, self._block.counts)
+        self._growth = ProcessGrowth(self._pool.num_instances)
         np.copyto(self._pool.outputs, self._block.outputs)  # of a predecessor that died
-
-    def compare(self, setup: Setup, private_libraries: bool) -> bool:
-        """See ``shares_globals``; what this leaves goes with the folder of the other process."""
-        from fmugym.pool.isolation import shares_globals
-
-        tempfile.tempdir = str(setup.folder)
-        fmu = FMU(setup.path, limits=setup.limits, preload=setup.preload, probe_timeout=None)
-        try:
-            return shares_globals(fmu, setup.spec, private_libraries=private_libraries)
-        except SimulationError:  # it fails alone too, without the values that the caller will set
-            return False
 
     def reset(
         self,
         number: int,
         variables: tuple[Variable, ...] | None,
         values: FloatArray,
-        mask: MaskArray | None,
-    ) -> None:
-        """See ``Pool.reset``; a list of variables is told once, and has a number from then on."""
+        mask: MaskArray,
+    ) -> int:
+        """See ``Pool.reset``; a list of variables is told once, and has a number from then on.
+
+        Returns:
+            By how many bytes this process has grown since its first resets.
+        """
         if variables is not None:
             self._variables[number] = variables
         self._pool.reset(self._variables[number], values, mask)
         self._publish()
+        return self._growth.after(int(np.count_nonzero(mask)))
 
     def save(self) -> int:
         """See ``Pool.save``; the snapshot stays here and has a number."""
@@ -230,6 +227,10 @@ class BlockWorker:
         """See ``Pool.restore``."""
         self._pool.restore(self._snapshots[number], mask)
         self._publish()
+
+    def count_steps(self) -> None:
+        """Let the shared counts have all steps until now."""
+        self._pool.health()
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``; the index is that in the block."""
@@ -253,13 +254,13 @@ def _native_echo_to(memory: npt.NDArray[np.uint8]) -> None:
     _native.echo_to(memory)
 
 
-def _make_pool(setup: Setup, log: logging.Logger) -> Pool:
+def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> Pool:
     fmu, count = _ExtractedFMU(setup), setup.block.stop - setup.block.start
     if not setup.native:
-        return PythonPool(fmu, setup.spec, count, log)
+        return PythonPool(fmu, setup.spec, count, log, counts=counts)
     from fmugym.pool.native import NativePool
 
-    options: Any = {"threads": setup.threads, "first_index": setup.block.start}
+    options: Any = {"threads": setup.threads, "first_index": setup.block.start, "counts": counts}
     return NativePool(fmu, setup.spec, count, log, private_libraries=False, **options)
 
 

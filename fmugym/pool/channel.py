@@ -64,6 +64,7 @@ class Channel:
     def __init__(self, end: socket.socket) -> None:
         self.end = end
         self._send, self._receive = end.send, end.recv
+        self._descriptor = end.fileno()
         self._lock = threading.Lock()
         self._poll = _poller(end)
 
@@ -113,6 +114,14 @@ class Channel:
                 raise EOFError
             view = view[received:]
         return data
+
+    def require_open(self) -> None:
+        """Make sure that nobody has closed this end behind our back, as an FMU may.
+
+        Raises:
+            OSError: If somebody has.
+        """
+        os.fstat(self._descriptor)
 
     def close(self) -> None:
         """Close this end."""

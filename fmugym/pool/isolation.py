@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from fmugym.adapters import Status
 from fmugym.archive import FMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.model_description import Variable
@@ -94,7 +95,7 @@ def _trajectory(pool: Pool, spec: PoolSpec, steps: int) -> FloatArray:
             outputs, statuses = pool.reset((), np.zeros((0, count)))
         else:
             outputs, statuses = pool.step(start_inputs(spec, count))
-        if statuses[0] > 1:
+        if statuses[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
         rows.append(outputs[:, 0].copy())
     return np.array(rows)

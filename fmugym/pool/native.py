@@ -20,7 +20,7 @@ import shutil
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,8 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.health import Counted, HealthArray, no_counts
+from fmugym.pool.leaks import watch_leaks
 
 __all__ = ["NativePool"]
 
@@ -69,8 +71,11 @@ _NO_STRING: Final = 2**32 - 1
 FloatArray32 = npt.NDArray[np.float32]
 IndexArray = npt.NDArray[np.int64]
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
-class NativePool:
+
+class NativePool(Counted):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -84,6 +89,7 @@ class NativePool:
             global variables, of its own; by default only where the FMU says that it can be
             instantiated only once per process. See ``fmugym.pool.isolation``.
         first_index: What messages number the first instance.
+        counts: Where to count what is in ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -106,6 +112,7 @@ class NativePool:
         threads: int | None = None,
         private_libraries: bool | None = None,
         first_index: int = 0,
+        counts: HealthArray | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
         if private_libraries is None:
@@ -117,6 +124,7 @@ class NativePool:
         self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations: FloatArray32 = np.zeros((num_instances, spec.num_observed), np.float32)
+        self._counts = no_counts(num_instances) if counts is None else counts
         self._result = self.outputs, self.statuses
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
@@ -127,6 +135,9 @@ class NativePool:
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self.step_own = self._pool.step_own
+        self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
+        self._reset = self.watched(self._pool.reset)
+        self._step_or_reset = self.watched(self._pool.step_or_reset)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
@@ -150,6 +161,7 @@ class NativePool:
                 spec.time_step,
                 spec.substeps,
                 spec.warm_up_steps,
+                spec.fault_retries,
                 tuple((v.value_reference, text.encode()) for v, text in spec.strings),
                 self._access(spec.inputs),
                 self._access(spec.outputs),
@@ -160,6 +172,7 @@ class NativePool:
                 self.outputs,
                 self.statuses,
                 self.observations,
+                self._counts,
                 _Receiver(log, description.model_identifier, self._first_index),
             )
         except OSError as error:
@@ -230,7 +243,8 @@ class NativePool:
             return ""
         doing, in_warm_up, status, time, string, said, values = failure
         if values is not None:
-            return f"{doing}: {self._not_finite(values)}"
+            variables = self._spec.inputs if "inputs" in doing else self._spec.outputs
+            return f"{doing}: {_not_finite(variables, values)}"
         text = self._sentence(index, doing, status, time, string)
         text += f"; the FMU said: {said}" if said else ""
         return f"the warm-up failed: {text}" if in_warm_up else text
@@ -249,10 +263,6 @@ class NativePool:
     def _string_name(self, reference: int) -> str:
         return next(v.name for v, _ in self._spec.strings if v.value_reference == reference)
 
-    def _not_finite(self, values: bytes) -> str:
-        named = zip(self._spec.outputs, np.frombuffer(values).tolist(), strict=True)
-        return ", ".join(f"{v.name} = {value}" for v, value in named if not math.isfinite(value))
-
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         values = np.empty((len(variables), self.num_instances))
@@ -260,6 +270,21 @@ class NativePool:
         if failed >= 0:
             raise SimulationError(self.failure(failed))
         return values
+
+    def _count_steps(self) -> None:
+        if self._close.alive:
+            self._pool.count_steps()
+
+    def _memory_growth(self) -> int:
+        return 0 if self._watch is None else self._watch.growth
+
+    def recycle(self) -> None:
+        """Let each instance be replaced by a new one at its next reset."""
+        self._open_pool().recycle()
+
+    def watched(self, function: Callable[P, R]) -> Callable[P, R]:
+        """Have what calls of a function take that resets instances added to the growth."""
+        return function if self._watch is None else self._watch.around(function)
 
     def close(self) -> None:
         """See ``Pool.close``."""
@@ -315,11 +340,11 @@ class NativePool:
         """
         access = self._accesses.get(variables) or self._access(variables)
         try:
-            return self._pool.reset(access, values, mask, observations)
+            return self._reset(access, values, mask, observations)
         except (TypeError, BufferError, ValueError):
-            pool = self._open_pool()
+            self._open_pool()
             values = np.asarray(values, np.float64)
-            return pool.reset(access, values, _as_mask(mask), observations)
+            return self._reset(access, values, _as_mask(mask), observations)
 
     def step_or_reset(
         self,
@@ -346,12 +371,12 @@ class NativePool:
         """
         access = self._accesses.get(variables) or self._access(variables)
         try:
-            return self._pool.step_or_reset(inputs, access, values, mask, observations)
+            return self._step_or_reset(inputs, access, values, mask, observations)
         except (TypeError, BufferError, ValueError):
-            pool = self._open_pool()
+            self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             values = np.asarray(values, np.float64)
-            return pool.step_or_reset(inputs, access, values, _as_mask(mask), observations)
+            return self._step_or_reset(inputs, access, values, _as_mask(mask), observations)
 
     @property
     def costs(self) -> dict[str, float]:
@@ -449,6 +474,11 @@ class _Receiver:
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         number = self._first_index + index
         self._log.log(level, "%s_%d: [%s] %s", self._model, number, category, message)
+
+
+def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
+    pairs = zip(variables, np.frombuffer(values).tolist(), strict=True)
+    return ", ".join(f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
 
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:

@@ -36,6 +36,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.block_worker import Setup
 from fmugym.pool.channel import Code
+from fmugym.pool.health import Column, Counted, HealthArray
 from fmugym.pool.shared_memory import Arrays, Memory, make_arrays, size_for
 from fmugym.pool.supervisor import LostError, Supervisor
 
@@ -47,7 +48,7 @@ _CLOSING_TIME: Final = 5.0
 _pools: weakref.WeakSet[ProcessPool] = weakref.WeakSet()
 
 
-class ProcessPool:
+class ProcessPool(Counted):
     """N instances in blocks of supervised processes; see ``Pool`` for the contract.
 
     Args:
@@ -87,6 +88,7 @@ class ProcessPool:
         self.workers = min(num_instances, processors if workers is None else max(1, workers))
         self._call_timeout = math.inf if call_timeout is None else call_timeout
         self._lock = RLock()
+        self._spec = spec
         self._refusal = ""
         self._lost: MaskArray = np.zeros(num_instances, np.bool_)
         self._numbers: dict[tuple[Variable, ...], int] = {}
@@ -111,7 +113,7 @@ class ProcessPool:
     def _share(self, arrays: Arrays) -> None:
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
-        self._mask = arrays.mask
+        self._mask, self._counts = arrays.mask, arrays.counts
 
     def _open(self) -> None:
         """Let all workers make their instances at the same time."""
@@ -137,6 +139,7 @@ class ProcessPool:
         mask = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask, np.bool_)
         with self._lock:
             concerned = [s for s in self._supervisors if mask[s.block].any()]
+            self._retire_grown(concerned, mask)
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
             self._note_lost()
@@ -160,11 +163,28 @@ class ProcessPool:
             supervisor.known.add(number)
             supervisor.tell("reset", number, told, values[:, block], mask[block])
 
-        for supervisor in self._run("a reset", alive, tell):
+        for supervisor, growth in self._run("a reset", alive, tell).items():
             supervisor.note_success()
+            supervisor.growth = growth
             block = supervisor.block
             self._lost[block] &= ~mask[block]
         return [s for s in used if s.is_new]
+
+    def _retire_grown(self, supervisors: Sequence[Supervisor], mask: MaskArray) -> None:
+        """Replace workers that leak, though their instances were recycled.
+
+        That is best done where all instances of a worker start anew. Otherwise the others lose
+        their episodes, so it is put off until twice as much is lost.
+        """
+        limit = math.inf if self._spec.leak_limit is None else 2 * self._spec.leak_limit
+        for supervisor in supervisors:
+            block = supervisor.block
+            if supervisor.growth > (limit if mask[block].all() else 2 * limit):
+                grown = f"by {supervisor.growth / 2**20:.0f} MB"
+                reason = f"worker process {supervisor.pid} was replaced: it had grown {grown}"
+                supervisor.retire(reason, self._deadline())
+                self._lost[block] = True
+                self._counts[block, [[Column.REPLACEMENTS], [Column.RECYCLINGS]]] += 1
 
     def _is_revived(self, supervisor: Supervisor) -> bool:
         try:
@@ -262,6 +282,18 @@ class ProcessPool:
                     return str(text)
             return supervisor.reason
 
+    def _count_steps(self) -> None:
+        """A worker that dies does not tell of its last episode's steps."""
+        with self._lock:
+            if not self._refusal:
+                self._run("a question", self._able, lambda s: s.tell("count_steps"))
+
+    def _memory_growth(self) -> HealthArray:
+        growth = np.zeros(self.num_instances, np.int64)
+        for supervisor in self._supervisors:
+            growth[supervisor.block] = supervisor.growth
+        return growth
+
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         with self._lock:
@@ -326,7 +358,10 @@ class ProcessPool:
 
     def _lose(self, supervisor: Supervisor) -> None:
         """Note the loss of a block, and start its next worker before anybody waits for it."""
-        self._lost[supervisor.block] = True
+        block = supervisor.block
+        self._counts[block, Column.DEATHS] += 1
+        self._lost[block] = True
+        np.copyto(self.observations[block], self.outputs[: self.observations.shape[1], block].T)
         self._note_lost()
         supervisor.start_ahead()
 
@@ -353,30 +388,6 @@ class ProcessPool:
         self._close.detach()
         for supervisor in self._supervisors:
             supervisor.forget()
-
-
-def disturb_each_other(fmu: FMU, spec: PoolSpec, *, private_libraries: bool = False) -> bool:
-    """Find out in a worker whether instances of an FMU disturb each other.
-
-    Args:
-        fmu: The FMU; it is extracted if need be.
-        spec: What to do in a step.
-        private_libraries: Whether each has a copy of the library.
-
-    Returns:
-        What ``fmugym.pool.isolation.shares_globals`` says; True also if the worker dies of it.
-    """
-    log = logging.getLogger(__name__)
-    setup, memory = Setup.of(fmu, spec, 2, log), Memory(size_for(spec, 2, 1))
-    supervisor = Supervisor(setup, memory, log)
-    try:
-        supervisor.start("compare", setup, private_libraries)
-        return bool(supervisor.finish_opening(time.monotonic() + DEFAULT_CALL_TIMEOUT))
-    except LostError:
-        return True
-    finally:
-        supervisor.bury("the comparison has ended")
-        memory.close()
 
 
 class _Snapshot:

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.health import HEALTH_COUNTS, HealthArray
 
 __all__ = ["Arrays", "Memory", "make_arrays", "make_echo", "size_for"]
 
@@ -34,6 +35,7 @@ class Arrays(NamedTuple):
 
     Attributes:
         mask: Which instances not to step, shape (N,).
+        counts: See ``fmugym.pool.health``, shape (N, HEALTH_COUNTS).
     """
 
     inputs: FloatArray
@@ -41,6 +43,7 @@ class Arrays(NamedTuple):
     observations: npt.NDArray[np.float32]
     statuses: StatusArray
     mask: MaskArray
+    counts: HealthArray
 
     def block(self, columns: slice) -> Arrays:
         """The parts of some of the instances."""
@@ -50,6 +53,7 @@ class Arrays(NamedTuple):
             self.observations[columns],
             self.statuses[columns],
             self.mask[columns],
+            self.counts[columns],
         )
 
 
@@ -60,6 +64,7 @@ def _layout(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
         ((count, spec.num_observed), np.float32),
         ((count,), np.int8),
         ((count,), np.bool_),
+        ((count, HEALTH_COUNTS), np.int64),
     ]
 
 

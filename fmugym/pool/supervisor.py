@@ -46,6 +46,7 @@ class Supervisor:
         block: The indices of its instances.
         generation: Differs between two processes.
         reason: Why the last process died.
+        growth: By how many bytes it has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
         known: The numbers of the lists of variables that were told to this process.
         released: The snapshots that nobody refers to any more, by generation and number.
@@ -55,6 +56,7 @@ class Supervisor:
         self.block = setup.block
         self.generation = 0
         self.reason = ""
+        self.growth = 0
         self.is_new = True
         self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
@@ -71,12 +73,8 @@ class Supervisor:
 
     # Its life.
 
-    def start(self, greeting: str = "open", *arguments: Any) -> None:
+    def start(self) -> None:
         """Start a process, without waiting until it is ready.
-
-        Args:
-            greeting: The method of the worker to be called first.
-            arguments: Its arguments; by default the setup.
 
         Raises:
             LostError: If there can be none.
@@ -92,9 +90,9 @@ class Supervisor:
         self._channel = Channel(end)
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
-        self.is_new = True
+        self.growth, self.is_new = 0, True
         self.known.clear()
-        self._channel.send_object(Code.REQUEST, (greeting, arguments or (self._setup,)))
+        self._channel.send_object(Code.REQUEST, ("open", (self._setup,)))
         self._opening = True
 
     def revive(self) -> None:
@@ -134,6 +132,13 @@ class Supervisor:
         gone = self._deaths >= _MOST_DEATHS
         prefix = f"given up after {self._deaths} deaths in a row: " if gone else ""
         self.reason = prefix + reason
+
+    def retire(self, reason: str, deadline: float) -> None:
+        """End a process that has done no wrong, in order."""
+        deaths = self._deaths
+        self.begin_closing()
+        self.close(deadline)
+        self._deaths, self.reason = deaths, f"{self._setup.path.name}: {reason}"
 
     def note_success(self) -> None:
         """Keep that a reset has succeeded."""
@@ -215,11 +220,8 @@ class Supervisor:
         self._busy = False
         return result
 
-    def finish_opening(self, deadline: float) -> Any:
+    def finish_opening(self, deadline: float) -> None:
         """Wait until a new worker has made its instances.
-
-        Returns:
-            What the greeting's method returned.
 
         Raises:
             LostError: If it could not.
@@ -229,7 +231,6 @@ class Supervisor:
         if isinstance(result, Exception):
             self.bury(str(result))
             raise LostError(self.reason) from result
-        return result
 
     def _receive(self, deadline: float, doing: str) -> Any:
         while True:

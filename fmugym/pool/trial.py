@@ -126,7 +126,9 @@ def _reset_and_step(pool: Pool, spec: PoolSpec, note: Note) -> None:
 def _try_two(request: Request, note: Note) -> bool:
     note("the comparison with a second instance")
     try:
-        return shares_globals(_open(request.candidate), request.spec)
+        return shares_globals(
+            _open(request.candidate), request.spec, private_libraries=request.private_libraries
+        )
     except SimulationError:  # it fails alone too, without the values that the caller will set
         return False
 

@@ -19,6 +19,7 @@ from fmugym.env import FMUEnv, pool_info
 from fmugym.episode import EpisodePlan
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.health import fault_rates
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, envs_first
 
@@ -172,11 +173,10 @@ class BatchEngine(Engine):
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env._plan
-        uniform = plan.num_uniform is not None and plan.num_uniform == self._streams.num_draws
-        if uniform:
+        if plan.num_uniform is not None and plan.num_uniform == self._streams.num_draws:
             drawn = plan.scaled(self._streams.fractions(indices))
             self._place(plan.drawn_names, drawn, indices)
-        if not uniform:
+        else:
             self._place_each(indices, plan)
         if not default or self._overridden:
             constants = plan.constant_parameters
@@ -287,9 +287,18 @@ class BatchEngine(Engine):
                 inputs[:, index] = fmu_spaces.to_input_types(
                     self.env._interface.inputs, inputs[:, index]
                 )
-        if self.env.action.dtype.kind == "f" and not np.isfinite(inputs).all():
-            index = int(np.flatnonzero(~np.isfinite(inputs).all(axis=0))[0])
-            raise ConfigError(f"an input of environment {index} is not finite: {inputs[:, index]}")
+        self._require_finite_inputs(None)
+
+    def _require_finite_inputs(self, ignored: MaskArray | None) -> None:
+        inputs = self._pool.inputs
+        finite = np.isfinite(inputs)
+        if finite.all():
+            return
+        for index in np.flatnonzero(~finite.all(axis=0)).tolist():
+            if ignored is None or not ignored[index]:
+                raise ConfigError(
+                    f"an input of environment {index} is not finite: {inputs[:, index]}"
+                )
 
     def _new_observations(self) -> npt.NDArray[np.float32] | None:
         if not self.env._pool_observes:
@@ -371,7 +380,7 @@ class BatchEngine(Engine):
         if not self.env._has_info:
             return {}
         info = self.env._get_info()
-        if self.env._is_paced:
+        if self.env._pool_tells:
             info = info | pool_info(self._pool)
         return self._info_arrays(info, mask)
 
@@ -411,6 +420,8 @@ class BatchEngine(Engine):
         texts = np.full(self._n, None, dtype=object)
         texts[indices] = list(reasons.values())
         result.infos.update({"fault": texts, "_fault": failed})
+        rates = fault_rates(self._pool.health())
+        result.infos.update({"fault_rate": rates, "_fault_rate": failed.copy()})
         result.rewards[failed] = config.fault_reward
         result.terminated[failed] = config.on_fault == "terminate"
         result.truncated[failed] = config.on_fault == "truncate"

@@ -82,10 +82,22 @@ class PoolColumn:
         """See ``Pool.read``."""
         return self._pool.read(variables)[:, self._index : self._index + 1]
 
+    def health(self) -> dict[str, npt.NDArray[np.int64]]:
+        """See ``Pool.health``."""
+        return {
+            name: counts[self._index : self._index + 1]
+            for name, counts in self._pool.health().items()
+        }
+
+    def forget_health(self) -> None:
+        """See ``Pool.forget_health``; the counts are those of all."""
+        self._pool.forget_health()
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """See ``BackendPool.info``; only for columns of one."""
+        """What the pool tells of each step; see ``fmugym.env.pool_info``."""
         pool: Any = self._pool
-        return {name: row[self._index : self._index + 1] for name, row in pool.info().items()}
+        told = pool.info() if hasattr(pool, "info") else {}
+        return {name: row[self._index : self._index + 1] for name, row in told.items()}
 
     def close(self) -> None:
         """The pool is the vector environment's to close."""

@@ -109,6 +109,7 @@ class CompiledEngine(BatchEngine):
             (streams.block, streams.used, *plan.limits, np.array(rows, np.int64)),
             (env.step_count, self.ended, self._limit),
         )
+        self._play_with_resets = pool.watched(self._play)
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
@@ -119,11 +120,12 @@ class CompiledEngine(BatchEngine):
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         arrays = observations, rewards, terminated, truncated
+        play = self._play if resetting is None else self._play_with_resets
         try:
-            troubled, ended, used_up = self._play(actions, *arrays)
+            troubled, ended, used_up = play(actions, *arrays)
         except (TypeError, ValueError, BufferError):
             actions = np.ascontiguousarray(self._checked(actions), np.int64)
-            troubled, ended, used_up = self._play(actions, *arrays)
+            troubled, ended, used_up = play(actions, *arrays)
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         if resetting is not None:
@@ -152,6 +154,7 @@ class CompiledEngine(BatchEngine):
         statuses = self._pool.statuses
         if resetting is not None:
             self._require_started(np.flatnonzero(resetting), statuses)
+        self._require_finite_inputs(resetting)
         stopped = self._stopped(statuses)
         if stopped.any():
             result.terminated[stopped] = True

@@ -22,7 +22,7 @@ from fmugym.vector.per_env import PerEnvEngine
 from fmugym.vector.probe import CURE, find_difference
 from fmugym.vector.views import column
 
-__all__ = ["FMUVectorEnv", "vectorized"]
+__all__ = ["FMUVectorEnv", "attribute", "vectorized"]
 
 HOOKS = ("auto", "compiled", "array", "per_env")
 POOL_OPTIONS = ("threads", "private_libraries", "isolation", "workers", "call_timeout")
@@ -56,7 +56,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             work on arrays.
     """
 
-    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012  (as in FMUEnv)
 
     def __init__(
         self,
@@ -92,6 +92,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(env.observation_space, count)
         self._started = False
         self._engine = self._make_engine(hooks, max_episode_steps)
+        env._open_pool("a vector environment").forget_health()  # of the trials of hooks
 
     def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:
         env, count = self._prototype, self.num_envs
@@ -245,10 +246,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
         Compiled steps do not keep ``action``, ``done`` and what hooks read of the step before.
         """
-        singles = self._singles()
-        if not hasattr(singles[0], name) and name in singles[0].parameters:
-            return tuple(env.parameters[name] for env in singles)
-        return tuple(getattr(env, name) for env in singles)
+        return tuple(attribute(env, name) for env in self._singles())
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.
@@ -259,21 +257,22 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             values: A list or array of one value for each environment, or one value for all.
 
         Raises:
-            ConfigError: If the number of values is wrong, or they do not fit.
+            ConfigError: If there is nothing of this name, the number of values is wrong, or they do
+                not fit.
         """
-        each = isinstance(values, list | tuple) or np.ndim(values) > 0
-        if each and len(values) != self.num_envs:
+        if _is_one_each(values) and len(values) != self.num_envs:
             raise ConfigError(
                 f"there are {len(values)} values of {name!r}, expected {self.num_envs}"
             )
-        prototype = self._prototype
-        if not hasattr(prototype, name) and name in prototype.fmu.description.variables:
+        if self._is_parameter(name):
             self._engine.set_parameter(name, self._parameter_values(name, values))
-        elif isinstance(self._engine, PerEnvEngine):
-            for index, env in enumerate(self._engine.envs):
-                setattr(env, name, values[index] if each else values)
         else:
-            self._set_attributes(name, _row_of(name, values) if each else values, each)
+            self._require_attribute(name)
+            self._set_attribute(name, values)
+
+    def _is_parameter(self, name: str) -> bool:
+        env = self._prototype
+        return not hasattr(env, name) and name in env.fmu.description.variables
 
     def _parameter_values(self, name: str, values: Any) -> FloatArray:
         start_values = np.broadcast_to(np.asarray(values, object), self.num_envs).tolist()
@@ -281,12 +280,33 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         variable = self._prototype.fmu.variable(name)
         return np.array([checked_value(variable, value) for value in start_values])
 
-    def _set_attributes(self, name: str, values: Any, each: bool) -> None:
+    def _require_attribute(self, name: str) -> None:
+        """Refuse to make an attribute that no hook can know of: its name is misspelt."""
+        engine = self._engine
+        env = engine.envs[0] if isinstance(engine, PerEnvEngine) else self._prototype
+        if not hasattr(env, name):
+            public = [known for known in dir(env) if not known.startswith("_")]
+            names = public + list(env.fmu.description.variables)
+            raise unknown_name("attribute or parameter", name, names)
+
+    def _set_attribute(self, name: str, values: Any) -> None:
+        """Set or make an attribute, of one value for each environment or one for all."""
+        each = _is_one_each(values)
+        if isinstance(self._engine, PerEnvEngine):
+            for index, env in enumerate(self._engine.envs):
+                setattr(env, name, values[index] if each else values)
+            return
+        values = _row_of(name, values) if each else values
         prototype = self._prototype
         attributes = {n: v for n, v in prototype._per_env_attributes.items() if n != name}
         setattr(prototype, name, values)
         prototype._per_env_attributes = {**attributes, name: values} if each else attributes
         self._engine.note_attributes()
+
+    @property
+    def health(self) -> dict[str, npt.NDArray[np.int64]]:
+        """What was counted of each environment's FMU, arrays of shape (N,); see ``FMUEnv``."""
+        return self._prototype._open_pool("health").health()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each environment, or get an attribute."""
@@ -354,6 +374,21 @@ def _checked_prototype(env: Any) -> FMUEnv:
             f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
         )
     return env
+
+
+def _is_one_each(values: Any) -> bool:
+    return isinstance(values, list | tuple) or np.ndim(values) > 0
+
+
+def attribute(env: FMUEnv, name: str) -> Any:
+    """An attribute of an environment, or else a parameter of its episode.
+
+    Raises:
+        AttributeError: If there is none of this name.
+    """
+    if not hasattr(env, name) and name in env.parameters:
+        return env.parameters[name]
+    return getattr(env, name)
 
 
 def _row_of(name: str, values: Any) -> npt.NDArray[Any]:

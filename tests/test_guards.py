@@ -1,0 +1,350 @@
+"""Guards in the process, in all pools: finite values, retries, health, recycling."""
+
+import itertools
+import logging
+import sys
+
+import gymnasium as gym
+import lawful_tools
+import numpy as np
+import pytest
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config
+from gymnasium import spaces
+
+import fmugym
+from fmugym import FMU, ConfigError, SimulationError
+from fmugym.adapters import Status
+from fmugym.pool import PoolSpec, has_native_pool, make_pool
+from fmugym.pool.leaks import LeakWatch, resident_bytes
+from fmugym.vector import FMUVectorEnv
+
+LOG = logging.getLogger("fmugym.test")
+MB = 2**20
+every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
+with_state = pytest.mark.parametrize("version", [2, 3])
+WAYS = {
+    "python": {"backend": "python"},
+    "native": {"backend": "native"},
+    "process": {"isolation": "process", "workers": 2},
+}
+
+
+@pytest.fixture(name="way", params=WAYS)
+def fixture_way(request):
+    """The options of ``make_pool`` for each pool."""
+    if request.param == "native" and not has_native_pool():
+        pytest.skip("the C extension was not built")
+    return WAYS[request.param]
+
+
+@pytest.fixture(name="opened")
+def fixture_opened():
+    """Have things closed after the test."""
+    things = []
+
+    def opened(thing):
+        things.append(thing)
+        return thing
+
+    yield opened
+    for thing in things:
+        thing.close()
+
+
+@pytest.fixture(name="lawful", scope="module")
+def fixture_lawful(tmp_path_factory):
+    """The paths of the lawful FMU by version."""
+    folders = {version: tmp_path_factory.mktemp(f"lawful{version}") for version in MAJOR_VERSIONS}
+    return {v: lawful_tools.lawful_fmu(folder, v) for v, folder in folders.items()}
+
+
+@pytest.fixture(name="make")
+def fixture_make(lawful, opened):
+    """Make pools over the lawful FMU."""
+
+    def make(version, num_instances, time_step=0.8, way=WAYS["python"], **spec):
+        fmu = FMU(lawful[version])
+        spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), time_step, **spec)
+        pool = opened(make_pool(fmu, spec, num_instances, LOG, private_libraries=False, **way))
+        pool.variable = fmu.variable
+        return pool
+
+    return make
+
+
+@pytest.fixture(name="pool")
+def fixture_pool(make, way):
+    """Make pools of two instances of each kind."""
+    return lambda version, **spec: make(version, 2, way=way, **spec)
+
+
+def set_up(pool, mask=None, **values):
+    """Reset with start values, one number for all instances or one for each."""
+    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
+    array = np.array(rows, float).reshape(len(rows), pool.num_instances)
+    return pool.reset(tuple(map(pool.variable, values)), array, mask)
+
+
+def step(pool, *inputs):
+    return pool.step(np.array([inputs]))
+
+
+class LawfulEnv(PlainEnv):
+    """y' = k u."""
+
+    def __init__(self, path, backend="auto", **changes):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "time_step": 0.8,
+            "bounds": {"u": (-1, 1)},
+        }
+        super().__init__(path, config | changes, logging.CRITICAL, backend=backend)
+
+
+class TestFiniteInputs:
+    @every_version
+    def test_only_the_instance_with_a_bad_one_is_not_stepped(self, pool, version):
+        pool = pool(version)
+        set_up(pool)
+        outputs, status = step(pool, np.nan, 1.0)
+        assert status.tolist() == [Status.NOT_FINITE, Status.OK]
+        assert pool.failure(0) == "the inputs are not finite: u = nan"
+        assert outputs.tolist() == [[0.0, 0.8]]
+        outputs, status = step(pool, 1.0, -np.inf)
+        assert status.tolist() == [Status.OK, Status.NOT_FINITE]
+        assert outputs.tolist() == [[0.8, 0.8]]
+
+    @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+    def test_made_by_a_hook_from_integer_actions(self, lawful, opened, hooks):
+        if hooks == "compiled" and not has_native_pool():
+            pytest.skip("the C extension was not built")
+
+        class Dividing(LawfulEnv):
+            def _get_action_space(self):
+                return spaces.Discrete(2)
+
+            def _get_inputs(self):
+                return 1.0 / self.action
+
+        envs = opened(FMUVectorEnv(lambda: Dividing(lawful[2]), 2, hooks=hooks))
+        envs.reset(seed=0)
+        with np.errstate(divide="ignore"), pytest.raises(ConfigError, match=r"finite"):
+            envs.step(np.array([1, 0]))
+        envs.reset(seed=0)
+        assert envs.step(np.array([1, 1]))[0].tolist() == [[pytest.approx(0.8)]] * 2
+
+
+class TestRetries:
+    @with_state
+    def test_smaller_and_smaller_steps(self, pool, version):
+        """0.8 s is discarded, and 0.4; 0.2 is not."""
+        pool = pool(version, fault_retries=3)
+        set_up(pool, longest=[0.25, 0.0], k=2.0)
+        for count in (1, 2):
+            outputs, status = step(pool, 0.5, 0.5)
+            assert status.tolist() == [Status.OK, Status.OK]
+            np.testing.assert_allclose(outputs, [[0.8 * count] * 2], rtol=1e-15)
+            assert pool.info()["retries"].tolist() == [2, 0]
+        health = pool.health()
+        assert health["retries"].tolist() == [4, 0]
+        assert health["discards"].tolist() == [0, 0]
+        assert health["steps"].tolist() == [2, 2]
+
+    @with_state
+    def test_what_no_retry_mends_is_a_fault(self, pool, version):
+        pool = pool(version, fault_retries=2)
+        set_up(pool, longest=[0.1, 0.0])
+        outputs, status = step(pool, 1.0, 1.0)
+        assert status.tolist() == [Status.DISCARD, Status.OK]
+        assert outputs.tolist() == [[0.0, 0.8]]
+        assert "the step at t = 0 s returned Discard" in pool.failure(0)
+        assert pool.health()["discards"].tolist() == [1, 0]
+
+    @with_state
+    def test_pools_agree_bit_for_bit(self, make, way, version):
+        def rollout(way):
+            spec = {"substeps": 3, "fault_retries": 4, "start_time": 0.1}
+            pool = make(version, 2, 0.7, way, **spec)
+            set_up(pool, longest=[0.03, 0.1], k=[0.3, 0.7])
+            rows = [step(pool, 0.1 * i, -0.2)[0].copy() for i in range(5)]
+            return np.array(rows), pool.health()["retries"]
+
+        (rows, retries), (expected, expected_retries) = rollout(way), rollout(WAYS["python"])
+        np.testing.assert_array_equal(rows, expected)
+        np.testing.assert_array_equal(retries, expected_retries)
+        assert (retries > 0).all()
+
+    def test_are_told_in_the_info(self, lawful, opened):
+        config = {"fault_retries": 2, "model_parameters": {"longest": 0.5}}
+        env = opened(LawfulEnv(lawful[2], **config))
+        assert env.reset()[1]["retries"] == 0
+        assert env.step([1.0])[4]["retries"] == 1
+        envs = opened(FMUVectorEnv(lambda: LawfulEnv(lawful[2], **config), 3))
+        envs.reset(options={"model_parameters": {"longest": 0.0}})
+        mask = np.array([False, True, False])
+        envs.reset(options={"reset_mask": mask})
+        assert envs.step(np.ones((3, 1)))[4]["retries"].tolist() == [0, 1, 0]
+
+    def test_of_an_fmu_that_cannot(self, lawful):
+        with pytest.raises(
+            ConfigError, match="'fault_retries': Lawful must be able to get and set"
+        ):
+            LawfulEnv(lawful[1], fault_retries=1)
+
+    @pytest.mark.parametrize("count", [-1, 11, 1.5, True])
+    def test_number(self, lawful, count):
+        with pytest.raises(ConfigError, match="fault_retries must be an integer from 0 to 10, got"):
+            LawfulEnv(lawful[2], fault_retries=count)
+
+    def test_not_of_what_is_real(self, lawful):
+        class Rig:
+            def reset(self, start_values):
+                return {"y": 0.0}
+
+            def step(self, inputs):
+                return {"y": 0.0}, Status.OK
+
+            def stop(self):
+                pass
+
+        with pytest.raises(ConfigError, match="a backend's steps cannot be repeated"):
+            LawfulEnv(lawful[2], fault_retries=1, backend=Rig())
+
+
+class TestHealth:
+    @every_version
+    def test_counts(self, pool, version):
+        pool = pool(version)
+        set_up(pool, longest=[0.0, 0.5])
+        for _ in range(3):
+            step(pool, 1.0, np.nan)
+        step(pool, 1.0, 1.0)
+        set_up(pool, np.array([False, True]))
+        step(pool, 1.0, 1.0)
+        health = pool.health()
+        assert health["resets"].tolist() == [1, 2]
+        assert health["steps"].tolist() == [5, 2]
+        assert health["not_finite"].tolist() == [0, 3]
+        assert health["discards"].tolist() == [0, 1]
+        pool.forget_health()
+        assert not any(counts.any() for counts in pool.health().values())
+
+    @every_version
+    @pytest.mark.parametrize(("code", "kind"), [(3, "errors"), (4, "fatals")])
+    def test_recovery(self, make_env, version, code, kind):
+        """After Error by a reset, after Fatal by a new instance."""
+        env = make_env(version, model_parameters={"fault": code, "fault_step": 2})
+        for episode in (1, 2):
+            env.reset()
+            assert not env.step([1.0])[3]
+            truncated, info = env.step([1.0])[3:]
+            assert truncated
+            assert info["fault_rate"] == 1.0
+            assert env.health[kind] == episode
+        env.reset(options={"model_parameters": {"fault": 0}})
+        assert not any(env.step([1.0])[3] for _ in range(3))
+        assert env.health["replacements"] == (2 if code == 4 else 0)
+        env.reset()
+        env.step([1.0])
+        assert env.step([1.0])[4]["fault_rate"] == 0.75
+
+    @pytest.mark.parametrize("hooks", ["array", "per_env"])
+    def test_of_vector_environments(self, probe, opened, hooks):
+        parameters = {"fault": 3, "fault_step": 2}
+        envs = opened(
+            FMUVectorEnv(
+                lambda: PlainEnv(probe(2), probe_config(model_parameters=parameters)),
+                3,
+                hooks=hooks,
+            )
+        )
+        envs.set_attr("fault_step", [2, 9, 9])
+        envs.reset(seed=0)
+        envs.step(np.ones((3, 1)))
+        infos = envs.step(np.ones((3, 1)))[4]
+        assert infos["_fault_rate"].tolist() == [True, False, False]
+        assert infos["fault_rate"][0] == 1.0
+        assert envs.health["errors"].tolist() == [1, 0, 0]
+        assert envs.health["resets"].tolist() == [1, 1, 1]
+        assert envs.health["steps"].tolist() == [2, 2, 2]
+
+    def test_of_a_closed_environment(self, make_env):
+        env = make_env()
+        env.close()
+        with pytest.raises(SimulationError, match="health was called on a closed"):
+            env.health  # noqa: B018
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows is not asked for its memory")
+class TestLeaks:
+    RESETS, LEAK, LIMIT = 1200, 64 * 1024, 4 * MB
+
+    def reset_often(self, pool, leak):
+        """Returns by how much this process has grown."""
+        for _ in range(6):
+            set_up(pool, leak=leak)
+        before = resident_bytes()
+        for _, gain in zip(range(self.RESETS), itertools.cycle([1.0, 2.0]), strict=False):
+            _, status = set_up(pool, leak=leak, k=gain)
+            assert not status.any()
+        return resident_bytes() - before
+
+    @pytest.mark.parametrize("backend", ["python", "native"])
+    @pytest.mark.parametrize("version", [1, 2])
+    def test_instances_are_recycled(self, make, version, backend, caplog):
+        if backend == "native" and not has_native_pool():
+            pytest.skip("the C extension was not built")
+        pool = make(version, 1, way=WAYS[backend], leak_limit=self.LIMIT)
+        growth = self.reset_often(pool, self.LEAK)
+        assert growth < 4 * self.LIMIT < self.RESETS * self.LEAK / 4
+        assert 0 < pool.health()["recyclings"][0] < 60  # few where there is much free memory
+        assert caplog.text == ""
+
+    def test_that_it_does_not_help_is_said_once(self, make, caplog):
+        pool = make(2, 1, leak_limit=self.LIMIT)
+        self.reset_often(pool, -self.LEAK)
+        assert caplog.text.count("isolation='process' does") == 1
+        assert pool.health()["recyclings"][0] < 10
+
+    def test_a_worker_that_leaks_is_replaced(self, make):
+        pool = make(2, 1, way={"isolation": "process"}, leak_limit=self.LIMIT)
+        (first,) = pool.processes()
+        self.reset_often(pool, -self.LEAK)
+        assert pool.processes() != [first]
+        health = pool.health()
+        assert health["deaths"].tolist() == [0]
+        assert health["memory_growth"][0] < 3 * self.LIMIT
+
+    @pytest.mark.parametrize("backend", ["python", "native"])
+    def test_recycled_instances_are_as_before(self, make, backend):
+        if backend == "native" and not has_native_pool():
+            pytest.skip("the C extension was not built")
+        pool = make(2, 2, way=WAYS[backend])
+        set_up(pool, k=[1.0, 3.0])
+        expected = step(pool, 1.0, 1.0)[0].copy()
+        pool.recycle()
+        step(pool, 1.0, 1.0)
+        set_up(pool, k=[1.0, 3.0])
+        np.testing.assert_array_equal(step(pool, 1.0, 1.0)[0], expected)
+        assert pool.health()["replacements"].tolist() == [1, 1]
+
+    def test_one_that_gives_memory_back_to_the_system_is_no_leak(self):
+        counts, recycled = np.zeros((1, 11), np.int64), []
+        watch = LeakWatch(10 * MB, counts, lambda: recycled.append(1), LOG, "Boiler")
+        for growth in [0, 0, 0, 0, *[9 * MB, -9 * MB] * 50]:
+            counts[0, 0] += 1
+            watch.note(growth)
+        assert recycled == []
+
+
+def test_bundled_fmus_are_not_watched():
+    env = gym.make("fmugym/Pendulum-v0")
+    assert env.unwrapped.health["memory_growth"] == 0
+    assert (
+        fmugym.EnvConfig.from_dict(
+            {"model_input_names": "u", "model_output_names": "y", "leak_limit": None}
+        ).leak_limit
+        is None
+    )
+    env.close()
