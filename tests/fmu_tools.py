@@ -1,6 +1,7 @@
 """FMUs for tests: the bundled ones with edits, and ``probe.c``, which obeys its parameters."""
 
 import functools
+import re
 import subprocess
 import sys
 import tempfile
@@ -157,6 +158,18 @@ def probe_library(version):
         command += [f"-DFMI_VERSION={version}", str(HERE / "probe.c"), "-o", str(library), "-lm"]
         subprocess.run(command, check=True)
         return library.read_bytes()
+
+
+def stubs(version, prefix, source):
+    """A line ``STUB(name)`` for each function of the standard that a C source does not have.
+
+    The functions are those that FMPy looks up, as its headers have them.
+    """
+    headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{version}*.h")
+    text = "".join(path.read_text() for path in headers)
+    names = set(re.findall(rf"\bfmi{version}(\w+?)TYPE\b", text))
+    own = set(re.findall(rf"\b{prefix}(\w+)\(", source.read_text()))
+    return "".join(f"STUB({prefix}{name})\n" for name in sorted(names - own))
 
 
 def platform_folder(version):

@@ -1,0 +1,66 @@
+/* The animals of the zoo as FMUs of FMI 3.0. */
+
+#include "zoo.h"
+
+void *fmi3InstantiateCoSimulation(const char *name, const char *token, const char *resources,
+                                  bool visible, bool logging, bool event_mode, bool early_return,
+                                  const unsigned *intermediate, size_t intermediate_count,
+                                  void *environment, Logger logger, void *intermediate_update) {
+    return zoo_instantiate(name, token, logger, environment);
+}
+
+void fmi3FreeInstance(Animal *me) {
+    zoo_free(me);
+}
+
+int fmi3EnterInitializationMode(Animal *me, bool tolerance_defined, double tolerance, double start,
+                                bool stop_defined, double stop) {
+    return zoo_enter(me);
+}
+
+int fmi3ExitInitializationMode(Animal *me) {
+    return zoo_exit(me);
+}
+
+int fmi3Terminate(Animal *me) {
+    return zoo_call(me, TERMINATE);
+}
+
+int fmi3Reset(Animal *me) {
+    return zoo_reset(me);
+}
+
+int fmi3DoStep(Animal *me, double time, double step_size, bool no_set_state, bool *events,
+               bool *stop, bool *early, double *last) {
+    *events = *stop = *early = false;
+    *last = time + step_size;
+    return zoo_step(me, step_size);
+}
+
+int fmi3GetFloat64(Animal *me, const unsigned *references, size_t count, double *values,
+                   size_t values_count) {
+    return zoo_get(me, references, count, values);
+}
+
+int fmi3SetFloat64(Animal *me, const unsigned *references, size_t count, const double *values,
+                   size_t values_count) {
+    return zoo_set(me, references, count, values);
+}
+
+int fmi3GetFMUState(Animal *me, void **state) {
+    return zoo_get_state(me, state);
+}
+
+int fmi3SetFMUState(Animal *me, void *state) {
+    return zoo_set_state(me, state);
+}
+
+int fmi3FreeFMUState(Animal *me, void **state) {
+    return zoo_free_state(state);
+}
+
+const char *fmi3GetVersion(void) {
+    return "3.0";
+}
+
+#include STUBS
