@@ -80,6 +80,18 @@ class FMU:
                 "; ".join(self.description.findings),
             )
 
+    @classmethod
+    def of(cls, source: FMU | str | os.PathLike[str]) -> FMU:
+        """Open an FMU of one's own: by its path, or with the arguments of one that is open."""
+        if not isinstance(source, FMU):
+            return cls(source)
+        return cls(
+            source.path,
+            limits=source.limits,
+            preload=source.preload,
+            probe_timeout=source.probe_timeout,
+        )
+
     def __repr__(self) -> str:
         return f"FMU({str(self.path)!r})"
 

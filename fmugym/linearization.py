@@ -54,7 +54,7 @@ class LinearModel:
 
 
 def linearize(
-    fmu_path: str | os.PathLike[str],
+    fmu: FMU | str | os.PathLike[str],
     *,
     states: str | Sequence[str] | None = None,
     inputs: str | Sequence[str] | None = None,
@@ -66,7 +66,7 @@ def linearize(
     ``fmi3GetDirectionalDerivative``: there is no step size and no error of truncation.
 
     Args:
-        fmu_path: The FMU.
+        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` hold.
         states: Names of continuous states, or one name; by default all that the FMU declares. What
             is left out is held constant.
         inputs: Names of continuous inputs, or one name; by default all of them.
@@ -81,7 +81,7 @@ def linearize(
         FMULoadError: If the FMU cannot be loaded.
         SimulationError: If the FMU fails.
     """
-    fmu = FMU(fmu_path)
+    fmu = FMU.of(fmu)
     description = fmu.description
     _require_derivatives(description)
     x = _chosen(description, "continuous state", states, list(description.state_derivatives))

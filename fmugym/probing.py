@@ -86,10 +86,12 @@ class Request:
     Attributes:
         candidate: The FMU.
         spec: The ``PoolSpec`` with which a second instance is compared with one alone, or None.
+        private_libraries: Whether each of the two has a copy of the library of its own.
     """
 
     candidate: Candidate
-    spec: Any
+    spec: Any = None
+    private_libraries: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,47 +127,56 @@ def probe(candidate: Candidate) -> None:
         return
     key = _content_key(candidate.path)
     if recall(key) is None:
-        _try(Request(candidate, None), key)
+        _try(Request(candidate), key)
 
 
-def probe_globals(candidate: Candidate, spec: Any) -> bool:
+def probe_globals(
+    candidate: Candidate,
+    spec: Any,
+    *,
+    private_libraries: bool = False,
+    must_survive: bool = True,
+) -> bool:
     """Find out in a worker whether instances of an FMU disturb each other; ``probe`` included.
 
     Args:
-        candidate: The FMU; not exempt.
+        candidate: The FMU, exempt or not.
         spec: The ``PoolSpec`` to compare with.
+        private_libraries: Whether each instance has a copy of the library of its own.
+        must_survive: Whether it is an error if an instance alone ends the process; otherwise that
+            counts as disturbing.
 
     Returns:
         What ``fmugym.pool.isolation.shares_globals`` says; True also if a second instance ends the
         process.
 
     Raises:
-        FMULoadError: As ``probe``.
+        FMULoadError: As ``probe``, with ``must_survive``.
     """
     key = _content_key(candidate.path)
-    spec_key = f"{key}-{_digest(repr(spec).encode())}"
+    spec_key = f"{key}-{_digest(repr((spec, private_libraries)).encode())}"
     known = recall(spec_key)
     if known is None:
-        answer = _try(Request(candidate, spec), key)
+        answer = _try(Request(candidate, spec, private_libraries), key, must_survive)
         known = json.dumps(bool(answer.get("shares_globals", True)))
         if answer.get("complete"):
             remember(spec_key, known)
     return known == "true"
 
 
-def _try(request: Request, key: str) -> dict[str, bool]:
-    """Let a worker try an FMU, and remember that it survived."""
+def _try(request: Request, key: str, must_survive: bool = True) -> dict[str, bool]:
+    """Let a worker try an FMU, and remember that it survived; returns what the worker answered."""
     name = request.candidate.path.name
     outcome = _run(request)
     if outcome.stage is None:
         logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
         return {"shares_globals": False}
-    if "complete" not in outcome.answer:
+    if "complete" not in outcome.answer and must_survive:
         raise FMULoadError(
             f"{name} cannot be used: in {outcome.stage} it {outcome.end}{outcome.said}. That was a "
             "trial in a process of its own; probe_timeout=None turns it off"
         )
-    if outcome.answer["complete"]:
+    if outcome.answer.get("complete"):
         remember(key, "")
     return outcome.answer
 

@@ -22,6 +22,7 @@ from fmugym.errors import ConfigError
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
 from fmugym.vector.batch import BatchEngine
+from fmugym.vector.env import attribute
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -203,7 +204,7 @@ class FMUVecEnv(VecEnv):
             AttributeError: If there is none of this name.
         """
         singles = self.vector_env._singles()
-        return [_attribute(singles[index], attr_name) for index in self._get_indices(indices)]
+        return [attribute(singles[index], attr_name) for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute or, from the next episode on, a parameter of the FMU.
@@ -214,26 +215,23 @@ class FMUVecEnv(VecEnv):
             indices: The environments, by default all.
 
         Raises:
-            ConfigError: If it is a parameter that the others draw anew in each episode.
+            ConfigError: If there is nothing of this name, or it is a parameter that the others draw
+                anew in each episode.
         """
-        self._set(attr_name, dict.fromkeys(self._numbers(indices), value))
+        complete = self._completed(attr_name, dict.fromkeys(self._numbers(indices), value))
+        self.vector_env.set_attr(attr_name, _common(complete))
+        if self.vector_env._is_parameter(attr_name):
+            self._set_parameters[attr_name] = complete
 
-    def _set(self, name: str, values: Mapping[int, Any]) -> None:
+    def _completed(self, name: str, values: Mapping[int, Any]) -> list[Any]:
+        """These values by the number of the environment, and what the other ones have now."""
         if len(values) < self.num_envs:
             values = {**dict(enumerate(self._present(name))), **values}
-        complete = [values[index] for index in range(self.num_envs)]
-        same = all(value is complete[0] for value in complete) and np.ndim(complete[0]) == 0
-        self.vector_env.set_attr(name, complete[0] if same else complete)
-        if self._is_parameter(name):
-            self._set_parameters[name] = complete
-
-    def _is_parameter(self, name: str) -> bool:
-        env = self.vector_env._prototype
-        return not hasattr(env, name) and name in env.fmu.description.variables
+        return [values[index] for index in range(self.num_envs)]
 
     def _present(self, name: str) -> list[Any]:
         """What all environments have now, for those that are not to be changed."""
-        if not self._is_parameter(name):
+        if not self.vector_env._is_parameter(name):
             return self.get_attr(name)
         if name in self._set_parameters:
             return self._set_parameters[name]
@@ -277,7 +275,7 @@ class FMUVecEnv(VecEnv):
                 row[call.index] = value
                 engine.env.variables[name] = row
         for name, values in written.items():
-            self._set(name, values)
+            self.vector_env._set_attribute(name, _common(self._completed(name, values)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
         """Tell that no single environment has a wrapper."""
@@ -318,16 +316,15 @@ class _Called:
         return _changes(self._variables, self._env.variables)
 
 
+def _common(values: list[Any]) -> Any:
+    """One value for all environments where it is the same number, or else the list."""
+    is_same = all(value is values[0] for value in values) and np.ndim(values[0]) == 0
+    return values[0] if is_same else values
+
+
 def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     missing = object()
     return {name: v for name, v in after.items() if before.get(name, missing) is not v}
-
-
-def _attribute(env: FMUEnv, name: str) -> Any:
-    """An attribute of an environment, or else a parameter of its episode."""
-    if not hasattr(env, name) and name in env.parameters:
-        return env.parameters[name]
-    return getattr(env, name)
 
 
 def _hand_out(infos: Mapping[str, Any], into: Any) -> None:

@@ -9,6 +9,8 @@ import pytest
 
 # Nearly every test makes an FMU that nobody has met; test_probing.py turns their trials on.
 os.environ["FMUGYM_PROBE"] = "off"
+_cache = tempfile.TemporaryDirectory(prefix="fmugym-cache-")
+os.environ["FMUGYM_CACHE_DIR"] = _cache.name
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,8 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "fmi2_stubs.h"
+
 enum { U, Y, FAULT, STAGE, AT, COUNT };
 enum fault { NONE, CRASH, ABORT, EXIT, HANG, CLOSE };
 enum stage { NOWHERE, STEP, RESET, TERMINATE, FREE, INITIALIZE };
@@ -143,36 +145,3 @@ int fmi2FreeFMUstate(Faulty *me, void **state) {
     *state = NULL;
     return OK;
 }
-
-const char *fmi2GetVersion(void) {
-    return "2.0";
-}
-
-const char *fmi2GetTypesPlatform(void) {
-    return "default";
-}
-
-#define STUB(name)                                                                                 \
-    int fmi2##name(void) {                                                                         \
-        return ERROR;                                                                              \
-    }
-
-STUB(SetDebugLogging)
-STUB(GetInteger)
-STUB(GetBoolean)
-STUB(GetString)
-STUB(SetInteger)
-STUB(SetBoolean)
-STUB(SetString)
-STUB(SerializedFMUstateSize)
-STUB(SerializeFMUstate)
-STUB(DeSerializeFMUstate)
-STUB(GetDirectionalDerivative)
-STUB(SetRealInputDerivatives)
-STUB(GetRealOutputDerivatives)
-STUB(CancelStep)
-STUB(GetStatus)
-STUB(GetRealStatus)
-STUB(GetIntegerStatus)
-STUB(GetBooleanStatus)
-STUB(GetStringStatus)

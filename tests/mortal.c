@@ -9,6 +9,8 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "fmi2_stubs.h"
+
 typedef void (*Logger)(void *, const char *, int, const char *, const char *, ...);
 
 typedef struct {
@@ -116,40 +118,14 @@ int fmi2SetReal(Mortal *me, const unsigned *vr, size_t count, const double *valu
     return 0;
 }
 
-#define STUB(name)                                                                                 \
-    int fmi2##name(void) {                                                                         \
-        return 0;                                                                                  \
-    }
+int fmi2Terminate(Mortal *me) {
+    return 0;
+}
 
-STUB(Terminate)
-STUB(Reset)
-STUB(SetDebugLogging)
-STUB(GetInteger)
-STUB(GetBoolean)
-STUB(GetString)
-STUB(SetInteger)
-STUB(SetBoolean)
-STUB(SetString)
+int fmi2Reset(Mortal *me) {
+    return 0;
+}
+
 STUB(GetFMUstate)
 STUB(SetFMUstate)
 STUB(FreeFMUstate)
-STUB(SerializedFMUstateSize)
-STUB(SerializeFMUstate)
-STUB(DeSerializeFMUstate)
-STUB(GetDirectionalDerivative)
-STUB(SetRealInputDerivatives)
-STUB(GetRealOutputDerivatives)
-STUB(CancelStep)
-STUB(GetStatus)
-STUB(GetRealStatus)
-STUB(GetIntegerStatus)
-STUB(GetBooleanStatus)
-STUB(GetStringStatus)
-
-const char *fmi2GetVersion(void) {
-    return "2.0";
-}
-
-const char *fmi2GetTypesPlatform(void) {
-    return "default";
-}

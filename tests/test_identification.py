@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +206,16 @@ class TestOutputError:
         fit = fit_parameters(PENDULUM, {"tau": (-0.1, 0.1)}, blind, **options)
         assert fit.values["tau"] == pytest.approx(0.015, abs=2e-4)
         assert fit.predict(blind).rms("q") == pytest.approx(fit.rms("q"), rel=1e-3)
+
+    def test_an_fmu_with_arguments_of_its_own(self):
+        with closing(fmugym.FMU(PENDULUM)) as fmu:
+            folder = fmu.extract()
+            fit = fit_parameters(fmu, {"b": 1e-3}, noisy(0, 1.0), fixed={"c": 2e-3})
+            assert folder.exists()  # it is still the caller's
+        assert fit.predict(noisy(0, 1.0)).rms("q") == pytest.approx(fit.rms("q"))
+        preloading = fmugym.FMU(PENDULUM, preload=["/nowhere/libgave.so"])
+        with pytest.raises(fmugym.FMULoadError, match="libgave"):
+            fit_parameters(preloading, {"b": 1e-3}, noisy(0, 1.0))
 
     def test_both_pools_give_the_same(self, fit):
         again = fit_parameters(

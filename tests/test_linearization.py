@@ -1,6 +1,7 @@
 """Linear models: against closed forms, central differences, and what FMUs do in a step."""
 
 import logging
+from contextlib import closing
 
 import foreign_tank
 import numpy as np
@@ -29,6 +30,17 @@ POINTS = {
 
 def linearize(model, version, **arguments):
     return fmugym.linearize(fmugym.bundled_fmu(model, version), **arguments)
+
+
+def test_an_fmu_with_arguments_of_its_own():
+    path = fmugym.bundled_fmu("Pendulum")
+    with closing(fmugym.FMU(path)) as fmu:
+        folder = fmu.extract()
+        assert fmugym.linearize(fmu).A.tolist() == fmugym.linearize(path).A.tolist()
+        assert folder.exists()  # it is still the caller's
+    preloading = fmugym.FMU(path, preload=["/nowhere/libgave.so"])
+    with pytest.raises(fmugym.FMULoadError, match="libgave"):
+        fmugym.linearize(preloading)
 
 
 @each_version

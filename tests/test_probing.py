@@ -142,6 +142,21 @@ class TestDeath:
             envs.close()
 
 
+class TestIsolated:
+    """Where the FMU runs in worker processes anyway, only a second instance is asked for."""
+
+    @pytest.mark.parametrize(("token", "tried"), [("lonely", 1), ("segfault in step", 2)])
+    def test_instances_that_want_a_process_each(self, make_fmu, started, token, tried):
+        path = make_fmu(token)
+        for _ in range(2):  # what one instance survives is remembered
+            fmu = FMU(path)
+            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
+            pool = make_pool(fmu, spec, 3, logging.getLogger("test"), isolation="process")
+            assert len(set(pool.processes())) == 3
+            pool.close()
+        assert sum("fmugym.pool.trial" in process.args for process in started) == tried
+
+
 class TestSurvival:
     def test_is_remembered_by_content(self, make_fmu, started, tmp_path):
         path = make_fmu()

@@ -209,6 +209,17 @@ class TestSingle:
             assert one.step([1.0])[0] == [0.5]
             assert one.step([1.0])[3]
 
+    @pytest.mark.parametrize("name", ["CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum"])
+    def test_bundled_environments_take_it_as_an_argument(self, name, opened):
+        here, apart = (
+            opened(gymnasium.make(f"fmugym/{name}-v0", isolation=isolation))
+            for isolation in (None, "process")
+        )
+        assert isinstance(apart.unwrapped._pool, ProcessPool)
+        assert not isinstance(here.unwrapped._pool, ProcessPool)
+        both = [env.reset(seed=1)[0].tolist() for env in (here, apart)]
+        assert both[0] == both[1]
+
     def test_unknown_isolation(self, make_env):
         with pytest.raises(ConfigError, match="unknown isolation 'proces'; did you mean 'process'"):
             make_env(isolation="proces")
@@ -416,7 +427,7 @@ def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, b
     np.testing.assert_array_equal(pool.outputs, here.outputs)
     np.testing.assert_array_equal(pool.statuses, here.statuses)
     np.testing.assert_array_equal(pool.observations, here.observations)
-    assert all(pool.failure(index).endswith("y = inf") for index in range(3))
+    assert all(pool.failure(index).endswith("u = inf") for index in range(3))
     variables = (FMU(faulty).variable("u"), FMU(faulty).variable("y"))
     np.testing.assert_array_equal(pool.read(variables), here.read(variables))
 

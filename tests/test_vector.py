@@ -1202,6 +1202,19 @@ def test_values_that_do_not_fit(backend, hooks):
 
 
 @each_way
+def test_misspelt_attributes_and_parameters(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    for misspelt, meant in (("force_magg", "force_mag"), ("m_poles", "m_pole")):
+        with pytest.raises(ConfigError, match=f"{misspelt!r}; did you mean {meant!r}"):
+            vector.set_attr(misspelt, [1.0, 2.0, 3.0])
+        with pytest.raises(ConfigError, match="unknown attribute or parameter"):
+            vector.set_attr(misspelt, 1.0)
+        with pytest.raises(AttributeError):
+            vector.get_attr(misspelt)
+    vector.close()
+
+
+@each_way
 def test_methods_are_called_for_each_environment(backend, hooks):
     vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
     observations, _ = vector.reset(seed=0)

@@ -77,12 +77,13 @@ class CartPoleEnv(FMUEnv):
     * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
     * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
     * ``render_mode``: "human", "rgb_array" or None.
+    * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
     ## Version History
     * v0: Initial version, equal to Gymnasium's v1.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
     steps_after_end: ClassVar[bool] = True
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "low", "high")
 
@@ -94,6 +95,7 @@ class CartPoleEnv(FMUEnv):
         fmi_version: str | float = "2.0",
         model_parameters: Mapping[str, Any] | None = None,
         log_level: int = logging.WARNING,
+        **options: Any,
     ) -> None:
         self.sutton_barto_reward = sutton_barto_reward
         self.force_mag = 10.0
@@ -107,7 +109,7 @@ class CartPoleEnv(FMUEnv):
             "time_step": 0.02,
         }
         fmu_path = bundled_fmu("CartPole", fmi_version)
-        super().__init__(fmu_path, config, log_level, render_mode=render_mode)
+        super().__init__(fmu_path, config, log_level, render_mode=render_mode, **options)
 
     def _get_action_space(self) -> spaces.Space[Any]:
         return spaces.Discrete(2)

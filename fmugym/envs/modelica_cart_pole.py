@@ -66,12 +66,13 @@ class ModelicaCartPoleEnv(FMUEnv):
     * ``fmu_path``: an FMU with the same variables; by default the bundled one.
     * ``fmi_version``: "1.0", "2.0" (default) or "3.0", which of the bundled FMUs.
     * ``render_mode``: "human", "rgb_array" or None.
+    * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
     ## Version History
     * v0: Initial version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
 
     def __init__(
         self,
@@ -88,6 +89,7 @@ class ModelicaCartPoleEnv(FMUEnv):
         *,
         fmi_version: str | float = "2.0",
         render_mode: str | None = None,
+        **options: Any,
     ) -> None:
         names = self._variable_names(own_fmu=fmu_path is not None)
         self.force = force
@@ -103,7 +105,7 @@ class ModelicaCartPoleEnv(FMUEnv):
             "negative_reward": negative_reward,
         }
         path = bundled_fmu("CartPole", fmi_version) if fmu_path is None else fmu_path
-        super().__init__(path, config, log_level, render_mode=render_mode)
+        super().__init__(path, config, log_level, render_mode=render_mode, **options)
 
     def _variable_names(self, own_fmu: bool) -> dict[str, Any]:
         """The FMU's names for the input, the outputs and the parameters of the constructor."""
@@ -165,6 +167,7 @@ class DymolaCSCartPoleEnv(ModelicaCartPoleEnv, FMI1CSEnv):
         fmu_path: str | os.PathLike[str] | None = None,
         *,
         render_mode: str | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(
             m_trolley,
@@ -179,6 +182,7 @@ class DymolaCSCartPoleEnv(ModelicaCartPoleEnv, FMI1CSEnv):
             fmu_path,
             fmi_version="1.0",
             render_mode=render_mode,
+            **options,
         )
 
     def _variable_names(self, own_fmu: bool) -> dict[str, Any]:

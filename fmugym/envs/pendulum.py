@@ -70,12 +70,13 @@ class PendulumEnv(FMUEnv):
     * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
     * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
     * ``render_mode``: "human", "rgb_array" or None.
+    * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
     ## Version History
     * v0: Initial version, equal to Gymnasium's v1.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
     steps_after_end: ClassVar[bool] = True
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "x_init", "y_init")
     render_size: ClassVar[tuple[int, int]] = (500, 500)
@@ -88,6 +89,7 @@ class PendulumEnv(FMUEnv):
         fmi_version: str | float = "2.0",
         model_parameters: Mapping[str, Any] | None = None,
         log_level: int = logging.WARNING,
+        **options: Any,
     ) -> None:
         self.max_speed = 8.0
         self.max_torque = 2.0
@@ -99,7 +101,7 @@ class PendulumEnv(FMUEnv):
             "time_step": 0.05,
         }
         fmu_path = bundled_fmu("Pendulum", fmi_version)
-        super().__init__(fmu_path, config, log_level, render_mode=render_mode)
+        super().__init__(fmu_path, config, log_level, render_mode=render_mode, **options)
 
     def _get_action_space(self) -> spaces.Space[Any]:
         limit = self.max_torque

@@ -104,7 +104,7 @@ class FitResult:
         self, trajectories: Sequence[Trajectory]
     ) -> tuple[Experiment, list[Trajectory]]:
         """Fix the fitted values, and add those of inputs to what was logged."""
-        description = FMU(self.experiment.fmu_path).description
+        description = self.experiment.fmu.description
         offsets = {n for n in self.values if description.variable(n).causality == "input"}
         fixed = {n: v for n, v in self.values.items() if n not in offsets}
         experiment = replace(self.experiment, fixed={**self.experiment.fixed, **fixed})
@@ -123,7 +123,7 @@ def _simulate(
 
 
 def fit_parameters(
-    fmu_path: str | os.PathLike[str],
+    fmu: FMU | str | os.PathLike[str],
     parameters: Mapping[str, Limits],
     trajectories: Sequence[Trajectory],
     *,
@@ -144,7 +144,7 @@ def fit_parameters(
     Jacobian run at once, an instance of one pool each.
 
     Args:
-        fmu_path: The FMU.
+        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` hold.
         parameters: What to fit, by the name of the FMU's variable: a number to start from; or
             bounds ``(low, high)``; or ``(start, low, high)``. Missing bounds are the variable's
             min and max, a missing start is its own start value or the middle. The name of an
@@ -178,7 +178,7 @@ def fit_parameters(
     if not parameters:
         raise ConfigError("there is no parameter to be fitted")
     experiment = Experiment(
-        fmu_path,
+        FMU.of(fmu),
         initial_states or {},
         fixed or {},
         scales or {},

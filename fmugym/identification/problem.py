@@ -9,13 +9,13 @@ enter the size of the optimization.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from fmugym.archive import FMU
 from fmugym.errors import ConfigError, SimulationError, unknown_name
 from fmugym.identification._scipy import scipy_module
 from fmugym.identification.results import Comparison
@@ -43,7 +43,7 @@ MAX_ITERATIONS = 50
 class Experiment:
     """What a fit and its predictions have in common; see ``fit_parameters``."""
 
-    fmu_path: str | os.PathLike[str]
+    fmu: FMU
     initial_states: Mapping[str, str | float]
     fixed: Mapping[str, float | str]
     scales: Mapping[str, float]
@@ -123,7 +123,7 @@ class Problem:
         names = [*parameters, *self._state_names]
         self._rows = range(len(names) if fit_states else len(parameters))
         self._simulator = Simulator(
-            experiment.fmu_path,
+            experiment.fmu,
             self.trajectories,
             names,
             experiment.fixed,

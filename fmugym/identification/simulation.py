@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -32,7 +31,7 @@ class Simulator:
     interpolate where the samples lie on the steps.
 
     Args:
-        path: The FMU.
+        fmu: The FMU; what runs is another one with the same arguments.
         trajectories: With the same outputs and inputs all of them.
         names: The variables of which each set has a value: parameters, start values or inputs.
             The value of an input is added to what was logged of it.
@@ -49,7 +48,7 @@ class Simulator:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        fmu: FMU,
         trajectories: Sequence[Trajectory],
         names: Sequence[str],
         fixed: Mapping[str, float | str],
@@ -59,7 +58,7 @@ class Simulator:
     ) -> None:
         if time_step is not None and not 0 < time_step < np.inf:
             raise ConfigError(f"time_step must be positive and finite, got {time_step!r}")
-        fmu = FMU(path)
+        fmu = FMU.of(fmu)
         self.failure = ""
         self.description = fmu.description
         self.outputs, logged = common_names(trajectories)
@@ -90,9 +89,9 @@ class Simulator:
             For each trajectory the outputs at its sampling instants, shape (sets, n, outputs);
             NaN where a simulation failed.
         """
-        num_sets = values.shape[1]
-        record = self._run(values.reshape(len(values), -1))
-        record = record.reshape(*record.shape[:2], num_sets, len(self._grids))
+        names, num_sets, num_trajectories = values.shape
+        record = self._run(values.reshape(names, num_sets * num_trajectories))
+        record = record.reshape(*record.shape[:2], num_sets, num_trajectories)
         return [grid.sample(record[..., w]) for w, grid in enumerate(self._grids)]
 
     def _note(self, failed: MaskArray) -> MaskArray:

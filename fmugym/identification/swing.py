@@ -46,7 +46,7 @@ class SwingFit:
     g: float
 
     @property
-    def l(self) -> float:  # noqa: E743
+    def l(self) -> float:  # noqa: E743  (the FMU's own name)
         """The length g / p2 of a point-mass pendulum, in m."""
         return self.g / self.values["p2"]
 
