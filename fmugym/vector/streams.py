@@ -46,18 +46,21 @@ class EpisodeStreams:
         row = 8 * num_envs * max(self._draws, 1)
         self._length = max(1, min(_LONGEST_BLOCK, _BLOCK_BYTES // row))
         self.block = np.empty((num_envs, self._length, self._draws))
+        self._rows = list(self.block)
         self.used = np.full(num_envs, self._length)
 
     def generator(self, index: int) -> np.random.Generator:
         """The generator of one environment, at the place that the episodes have reached."""
-        generator = self._generators[index]
-        if generator is None:
-            generator, _ = seeding.np_random()
-            self._generators[index] = generator
+        generator = self._generators[index] or self._unseeded(index)
         ahead = int(self._length - self.used[index]) * self._draws
         if ahead:
             _take_back(generator.bit_generator, ahead)
             self.used[index] = self._length
+        return generator
+
+    def _unseeded(self, index: int) -> np.random.Generator:
+        generator, _ = seeding.np_random()
+        self._generators[index] = generator
         return generator
 
     def seed(self, seeds: Sequence[int | None], indices: npt.NDArray[np.intp]) -> None:
@@ -85,9 +88,10 @@ class EpisodeStreams:
 
     def refill(self, indices: npt.NDArray[np.intp]) -> None:
         """Draw ahead for some environments whose blocks are used up."""
+        generators, rows = self._generators, self._rows
         for index in indices.tolist():
-            self.generator(index).random(out=self.block[index])
-            self.used[index] = 0
+            (generators[index] or self._unseeded(index)).random(out=rows[index])
+        self.used[indices] = 0
 
 
 def _take_back(bits: Any, count: int) -> None:
