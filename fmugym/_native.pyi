@@ -4,9 +4,10 @@ Arrays may be anything with a buffer: float64 for values, bool for masks, float3
 int8 for statuses. Those that are only read may have any strides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
+import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
@@ -125,6 +126,13 @@ class Pool:
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
+    def set_streams(self, generators: Sequence[np.random.BitGenerator], /) -> None:
+        """Take over the random stream of each instance's episodes, before the first ``play``.
+
+        Raises:
+            ValueError: If there is a wrong number of them.
+        """
+
     def play(
         self,
         actions: Array,
@@ -133,7 +141,7 @@ class Pool:
         terminated: Array,
         truncated: Array,
         /,
-    ) -> tuple[int, int, int]:
+    ) -> tuple[int, int]:
         """Do a step, with all that was taken over.
 
         Raises:

@@ -151,6 +151,8 @@ typedef struct {
     PyObject *start; /* the Access of what play sets before initialization */
     Play play;
     Py_buffer play_buffers[PLAY_BUFFERS];
+    PyObject *generators; /* keeps alive what the streams point to */
+    const Stream **streams;
 } PyPool;
 
 typedef struct {
@@ -370,6 +372,8 @@ static void pool_dealloc(PyObject *object) {
     }
     free(self->paths);
     free(self->strings);
+    free(self->streams);
+    Py_XDECREF(self->generators);
     Py_XDECREF(self->start);
     Py_XDECREF(self->arguments);
     free_object(object);
@@ -605,8 +609,8 @@ static void settle_play(PyPool *self, Py_ssize_t draws, Py_ssize_t episodes) {
     play->count = s->count;
     play->input_rows = self->buffers[INPUTS].buf;
     play->start_values = b[STARTS].buf;
-    play->draws = (Draws){(size_t)draws, (size_t)episodes, b[BLOCK].buf, b[USED].buf,
-                          b[LOW].buf,    b[WIDTH].buf,     b[ROWS].buf};
+    play->draws = (Draws){self->streams, (size_t)draws, (size_t)episodes, b[BLOCK].buf,
+                          b[USED].buf,   b[LOW].buf,    b[WIDTH].buf,     b[ROWS].buf};
     play->step_counts = b[COUNTS].buf;
     play->ended = b[ENDED].buf;
     play->source = (Source){
@@ -675,11 +679,46 @@ static PyObject *prepare_play(PyObject *object, PyObject *args) {
     Py_RETURN_NONE;
 }
 
-static bool require_play(const PyPool *self) {
-    if (!self->can_play) {
-        PyErr_SetString(PyExc_ValueError, "play was not prepared");
+static const Stream *stream_of(PyObject *generator) {
+    PyObject *capsule = PyObject_GetAttrString(generator, "capsule");
+    const Stream *stream = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, "BitGenerator");
+    Py_XDECREF(capsule); /* the generator has it */
+    return stream;
+}
+
+static PyObject *set_streams(PyObject *object, PyObject *generators) {
+    PyPool *self = (PyPool *)object;
+    const size_t count = self->pool.settings.count;
+    PyObject *kept = PySequence_Tuple(generators);
+    const Stream **streams = malloc(count * sizeof *streams);
+    bool good = kept != NULL && streams != NULL;
+
+    if (good && PyTuple_Size(kept) != (Py_ssize_t)count) {
+        PyErr_SetString(PyExc_ValueError, "there must be a bit generator for each instance");
+        good = false;
     }
-    return self->can_play;
+    for (size_t i = 0; i < count && good; i++) {
+        streams[i] = stream_of(PyTuple_GetItem(kept, (Py_ssize_t)i));
+        good = streams[i] != NULL;
+    }
+    if (!good) {
+        free(streams);
+        Py_XDECREF(kept);
+        return PyErr_Occurred() ? NULL : PyErr_NoMemory();
+    }
+    free(self->streams);
+    Py_XDECREF(self->generators);
+    self->generators = kept;
+    self->play.draws.streams = self->streams = streams;
+    Py_RETURN_NONE;
+}
+
+static bool require_play(const PyPool *self) {
+    const bool ready = self->can_play && (self->streams != NULL || self->play.draws.draws == 0);
+    if (!ready) {
+        PyErr_SetString(PyExc_ValueError, "play was not prepared, or has no streams");
+    }
+    return ready;
 }
 
 enum { ACTIONS, SEEN, REWARDS, TERMINATED, TRUNCATED, TURN_BUFFERS };
@@ -700,14 +739,14 @@ static bool take_turn(PyPool *self, PyObject *const *args, Py_buffer *buffers) {
     return true;
 }
 
-static size_t run_play(PyPool *self, const Call *call, Ends *ends) {
+static size_t run_play(PyPool *self, const Call *call, size_t *ended) {
     size_t troubled;
 
     if (pool_is_quick(&self->pool, PLAY)) {
-        return pool_play(&self->pool, call, ends);
+        return pool_play(&self->pool, call, ended);
     }
     Py_BEGIN_ALLOW_THREADS
-    troubled = pool_play(&self->pool, call, ends);
+    troubled = pool_play(&self->pool, call, ended);
     Py_END_ALLOW_THREADS
     return troubled;
 }
@@ -724,16 +763,15 @@ static PyObject *play_turn(PyPool *self, const Py_buffer *buffers) {
         .observations = buffers[SEEN].buf,
         .turn = &turn,
     };
-    Ends ends = {0, 0};
+    size_t ended = 0;
 
     if (play_find_bad_action(&turn) >= 0) {
         PyErr_SetString(PyExc_ValueError, "an action is out of range");
         return NULL;
     }
-    const size_t troubled = run_play(self, &call, &ends);
+    const size_t troubled = run_play(self, &call, &ended);
     drain_if_pending(self);
-    return Py_BuildValue("(nnn)", (Py_ssize_t)troubled, (Py_ssize_t)ends.ended,
-                         (Py_ssize_t)ends.used_up);
+    return Py_BuildValue("(nn)", (Py_ssize_t)troubled, (Py_ssize_t)ended);
 }
 
 static PyObject *play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
@@ -937,6 +975,7 @@ static PyMethodDef pool_methods[] = {
     FAST("reset", reset),
     FAST("step_or_reset", step_or_reset),
     {"prepare_play", prepare_play, METH_VARARGS, NULL},
+    {"set_streams", set_streams, METH_O, NULL},
     FAST("play", play),
     {"save", save, METH_NOARGS, NULL},
     FAST("restore", restore),

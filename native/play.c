@@ -19,12 +19,26 @@ ptrdiff_t play_find_bad_action(const Turn *turn) {
     return -1;
 }
 
+static void draw_ahead(const Draws *d, size_t index) {
+    const Stream *stream = d->streams[index];
+    const size_t size = d->episodes * d->draws;
+    double *fractions = d->block + index * size;
+
+    for (size_t i = 0; i < size; i++) {
+        fractions[i] = stream->next_double(stream->state);
+    }
+    d->used[index] = 0;
+}
+
 /* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
 void play_draw(const Play *play, size_t index) {
     const Draws *d = &play->draws;
 
-    if (d->draws == 0 || (size_t)d->used[index] >= d->episodes) {
-        return; /* nothing is random, or nobody has drawn ahead: the episode starts as the last one */
+    if (d->draws == 0) {
+        return;
+    }
+    if ((size_t)d->used[index] >= d->episodes) {
+        draw_ahead(d, index);
     }
     const size_t episode = index * d->episodes + (size_t)d->used[index];
     const double *fractions = d->block + episode * d->draws;
@@ -65,16 +79,16 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 }
 
 /* Without branches, which nobody could foresee. */
-WIDE static Ends judge(const Turn *turn, size_t begin, size_t count, const double *dones,
-                       const double *cuts, const double *rewards) {
+WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const double *dones,
+                         const double *cuts, const double *rewards) {
     const Play *play = turn->play;
-    const int64_t *step_counts = play->step_counts + begin, *used = play->draws.used + begin;
-    const int64_t limit = play->limit, episodes = (int64_t)play->draws.episodes;
+    const int64_t *step_counts = play->step_counts + begin;
+    const int64_t limit = play->limit;
     uint8_t *restrict ended = play->ended + begin;
     uint8_t *restrict terminated = turn->terminated + begin;
     uint8_t *restrict truncated = turn->truncated + begin;
     double *restrict given = turn->rewards + begin;
-    int64_t number = 0, used_up = 0;
+    size_t number = 0;
 
     for (size_t j = 0; j < count; j++) {
         given[j] = ended[j] ? 0.0 : rewards[j];
@@ -87,20 +101,16 @@ WIDE static Ends judge(const Turn *turn, size_t begin, size_t count, const doubl
     }
     for (size_t j = 0; j < count; j++) {
         number += ended[j];
-        used_up += ended[j] & (used[j] == episodes);
     }
-    return (Ends){(size_t)number, (size_t)used_up};
+    return number;
 }
 
-void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch, Ends *ends) {
+size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
 
     program_run(&play->judgement, &source, begin, count, scratch->judgement);
-    const Ends more = judge(turn, begin, count, scratch->judgement[results[DONE]],
-                            scratch->judgement[results[TRUNCATED]],
-                            scratch->judgement[results[REWARD]]);
-    ends->ended += more.ended;
-    ends->used_up += more.used_up;
+    return judge(turn, begin, count, scratch->judgement[results[DONE]],
+                 scratch->judgement[results[TRUNCATED]], scratch->judgement[results[REWARD]]);
 }

@@ -9,12 +9,22 @@
 
 #include "program.h"
 
+/* A random stream: the bit generator of numpy/random/bitgen.h. */
+typedef struct {
+    void *state;
+    uint64_t (*next_uint64)(void *state);
+    uint32_t (*next_uint32)(void *state);
+    double (*next_double)(void *state);
+    uint64_t (*next_raw)(void *state);
+} Stream;
+
 /* The draws of an episode: uniform numbers of [0, 1), drawn ahead for each environment. */
 typedef struct {
-    size_t draws;        /* of one episode */
-    size_t episodes;     /* drawn ahead for one environment */
-    const double *block; /* draws for each episode of each environment */
-    int64_t *used;       /* episodes of its block that an environment has used */
+    const Stream *const *streams; /* of each environment */
+    size_t draws;                 /* of one episode */
+    size_t episodes;              /* drawn ahead for one environment */
+    double *block;                /* draws for each episode of each environment */
+    int64_t *used;                /* episodes of its block that an environment has used */
     const double *low, *width;
     const int64_t *rows; /* of the start values, one for each draw */
 } Draws;
@@ -34,18 +44,13 @@ typedef struct {
     uint8_t *ended; /* which environments start an episode instead of a step */
 } Play;
 
-/* One step of all environments: where its results go, and a summary of them. */
+/* One step of all environments: where its results go. */
 typedef struct {
     const Play *play;
     const int64_t *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
 } Turn;
-
-typedef struct {
-    size_t ended;   /* environments whose episode has ended now */
-    size_t used_up; /* of these, those that have no episodes drawn ahead any more */
-} Ends;
 
 /* The first environment whose action is out of range, or -1. */
 ptrdiff_t play_find_bad_action(const Turn *turn);
@@ -58,11 +63,11 @@ typedef struct {
 void play_open(const Turn *turn, PlayScratch *scratch);
 
 /* Both for a run of at most PROGRAM_WIDTH environments: before their instances are reset or
- * stepped, and after; the second adds to ends. */
+ * stepped, and after; the second returns how many episodes have ended now. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
-void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch, Ends *ends);
+size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 
-/* Sets the start values of an episode from what was drawn ahead, before its instance is reset. */
+/* Draws the start values of an episode, before its instance is reset. */
 void play_draw(const Play *play, size_t index);
 
 #endif

@@ -746,8 +746,7 @@ typedef struct {
     bool listed;              /* whether the items are places in pool->chosen, or instances */
     bool measured;
     Atomic troubled; /* instances with a status worse than a warning */
-    Atomic ended;    /* when playing: see Ends */
-    Atomic used_up;
+    Atomic ended;    /* episodes, when playing */
     Atomic time;     /* ns, of all threads together, if measured */
 } Task;
 
@@ -944,18 +943,16 @@ static size_t step_through(Task *task, size_t begin, size_t end, Scratch scratch
 static size_t play_through(Task *task, size_t begin, size_t end, Scratch scratch) {
     const Turn *turn = task->call->turn;
     PlayScratch registers;
-    Ends ends = {0, 0};
-    size_t troubled = 0;
+    size_t troubled = 0, ended = 0;
 
     play_open(turn, &registers);
     for (size_t first = begin; first < end; first += RUN) {
         const size_t count = length_of_run(first, end);
         play_prepare(turn, first, count, &registers);
         troubled += do_run(task, first, count, scratch);
-        play_judge(turn, first, count, &registers, &ends);
+        ended += play_judge(turn, first, count, &registers);
     }
-    atomic_add(&task->ended, ends.ended);
-    atomic_add(&task->used_up, ends.used_up);
+    atomic_add(&task->ended, ended);
     return troubled;
 }
 
@@ -1165,7 +1162,7 @@ size_t pool_step_or_reset(Pool *pool, const Call *call) {
     return troubled;
 }
 
-size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
+size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
     Task task = {.pool = pool, .call = call, .operation = PLAY};
     const size_t count = pool->settings.count;
 
@@ -1173,7 +1170,7 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
                                                                     : give_chunk_up(&task, 0, count);
     mutex_unlock(&pool->lock);
-    *ends = (Ends){(size_t)atomic_get(&task.ended), (size_t)atomic_get(&task.used_up)};
+    *ended = (size_t)atomic_get(&task.ended);
     return troubled;
 }
 

@@ -196,8 +196,8 @@ size_t pool_reset(Pool *pool, const Call *call);
 size_t pool_step_or_reset(Pool *pool, const Call *call);
 
 /* Starts those anew whose episode has ended and steps the others, with the turn's programs before
- * and after; writes all observations. */
-size_t pool_play(Pool *pool, const Call *call, Ends *ends);
+ * and after; writes all observations and how many episodes have ended now. */
+size_t pool_play(Pool *pool, const Call *call, size_t *ended);
 
 /* These return the index of the first instance that fails, or -1. */
 ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);

@@ -18,7 +18,7 @@ import math
 import os
 import shutil
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, ParamSpec, Protocol, TypeVar
 
@@ -391,7 +391,7 @@ class NativePool(Counted):
         start_values: FloatArray,
         draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-    ) -> Callable[..., tuple[int, int, int]]:
+    ) -> Callable[..., tuple[int, int]]:
         """Let whole steps of a vector environment be done here, hooks included; only once.
 
         The arrays are used as they are, from step to step.
@@ -409,9 +409,8 @@ class NativePool(Counted):
 
         Returns:
             A function of actions (int64), observations, rewards, terminated and truncated, which
-            does a step and fills the latter four. It returns how many instances have a status
-            worse than a warning, how many episodes have ended, and how many of their environments
-            have no episodes drawn ahead any more.
+            does a step and fills the latter four, once ``set_streams`` was called. It returns how
+            many instances have a status worse than a warning, and how many episodes have ended.
         """
         block, used, low, width, rows = draws
         count, ended, limit = episodes
@@ -434,6 +433,14 @@ class NativePool(Counted):
             ended,
         )
         return self._pool.play
+
+    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
+        """Tell what the episodes of ``prepare_play`` are drawn from, when these are used up.
+
+        Args:
+            generators: N of them. They are numpy's, and drawn from without their locks.
+        """
+        self._pool.set_streams(generators)
 
     @property
     def uses_states(self) -> bool:

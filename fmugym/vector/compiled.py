@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -101,6 +101,7 @@ class CompiledEngine(BatchEngine):
             self._start_values[: len(rows)].copy if together else partial(copy, rows, 0)
         )
         pool: Any = self._pool
+        self._stream_version = -1
         self._play = pool.prepare_play(
             plan.model_variables,
             programs,
@@ -110,6 +111,17 @@ class CompiledEngine(BatchEngine):
             (env.step_count, self.ended, self._limit),
         )
         self._play_with_resets = pool.watched(self._play)
+
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Engine.reset``."""
+        result = super().reset(mask, seeds, options)
+        if self._stream_version != self._streams.version:
+            pool: Any = self._pool
+            pool.set_streams(self._streams.bit_generators())
+            self._stream_version = self._streams.version
+        return result
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
@@ -122,10 +134,10 @@ class CompiledEngine(BatchEngine):
         arrays = observations, rewards, terminated, truncated
         play = self._play if resetting is None else self._play_with_resets
         try:
-            troubled, ended, used_up = play(actions, *arrays)
+            troubled, ended = play(actions, *arrays)
         except (TypeError, ValueError, BufferError):
             actions = np.ascontiguousarray(self._checked(actions), np.int64)
-            troubled, ended, used_up = play(actions, *arrays)
+            troubled, ended = play(actions, *arrays)
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         if resetting is not None:
@@ -133,8 +145,6 @@ class CompiledEngine(BatchEngine):
         result: StepResult = _make_tuple(StepResult, (*arrays, infos))
         if troubled:
             self._mend(actions, result, resetting)
-        if used_up:
-            self._streams.refill_used_up(self.ended)
         return result
 
     def _drawn(self, mask: MaskArray) -> LateDict:

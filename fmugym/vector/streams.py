@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from fmugym.episode import EpisodePlan
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray
 
 __all__ = ["EpisodeStreams"]
 
@@ -37,10 +37,12 @@ class EpisodeStreams:
         num_draws: Numbers of the stream that an episode takes, None where they are not uniform.
         block: Uniform numbers drawn ahead, shape (N, episodes, draws).
         used: How many episodes of its block an environment has used, shape (N,).
+        version: Goes up whenever an environment gets another generator.
     """
 
     def __init__(self, num_envs: int, plan: EpisodePlan) -> None:
         self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self.version = 0
         self.num_draws = plan.num_uniform
         self._draws = plan.num_uniform or 0
         row = 8 * num_envs * max(self._draws, 1)
@@ -59,9 +61,18 @@ class EpisodeStreams:
         return generator
 
     def _unseeded(self, index: int) -> np.random.Generator:
-        generator, _ = seeding.np_random()
+        return self._renew(index, None)
+
+    def _renew(self, index: int, seed: int | None) -> np.random.Generator:
+        generator, _ = seeding.np_random(seed)
         self._generators[index] = generator
+        self.version += 1
         return generator
+
+    def bit_generators(self) -> list[np.random.BitGenerator]:
+        """What the generators take their numbers from, of all environments."""
+        generators = enumerate(self._generators)
+        return [(known or self._unseeded(index)).bit_generator for index, known in generators]
 
     def seed(self, seeds: Sequence[int | None], indices: npt.NDArray[np.intp]) -> None:
         """Seed some of the environments anew; None leaves a stream as it is."""
@@ -69,24 +80,20 @@ class EpisodeStreams:
             return
         for index in indices.tolist():
             if seeds[index] is not None:
-                self._generators[index], _ = seeding.np_random(seeds[index])
+                self._renew(index, seeds[index])
                 self.used[index] = self._length
 
     def fractions(self, indices: npt.NDArray[np.intp]) -> FloatArray:
         """Draw the uniform numbers of one episode for some environments, shape (draws, M)."""
         used = self.used[indices]
         if used.max() == self._length:
-            self.refill(indices[used == self._length])
+            self._refill(indices[used == self._length])
             used = self.used[indices]
         self.used[indices] = used + 1
         fractions: FloatArray = self.block[indices, used].T
         return fractions
 
-    def refill_used_up(self, mask: MaskArray) -> None:
-        """Draw ahead for those of some environments that have nothing left."""
-        self.refill(np.flatnonzero(mask & (self.used == self._length)))
-
-    def refill(self, indices: npt.NDArray[np.intp]) -> None:
+    def _refill(self, indices: npt.NDArray[np.intp]) -> None:
         """Draw ahead for some environments whose blocks are used up."""
         generators, rows = self._generators, self._rows
         for index in indices.tolist():
