@@ -60,17 +60,27 @@ typedef struct {
     void *context;
 } StartValues;
 
-/* A step together with the setting of its inputs and the getting of its outputs. */
+typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
+
+typedef struct {
+    Status status;
+    Stage stage; /* the call that the status is of */
+} Outcome;
+
+/* A step of each of several instances, with the setting of its inputs and the getting of its
+ * outputs; a row of either for each instance. */
 typedef struct {
     const uint32_t *input_references, *output_references;
     size_t number_of_inputs, number_of_outputs;
-    double time, step;
+    double step;
     bool no_return; /* see do_step */
+    size_t count;
+    void *const *components;
+    const double *times;
     const double *inputs;
     double *outputs;
+    Outcome *outcomes;
 } Exchange;
-
-typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
 
 /* One FMI version. Every function returns one of FMI's own codes, PENDING and unknown ones turned
  * into ERROR; a function that the FMU does not export gives ERROR. */
@@ -88,10 +98,9 @@ typedef struct Fmi {
     /* no_return promises that no state from before this time will be restored. */
     Status (*do_step)(const Library *library, void *component, double time, double step,
                       bool no_return);
-    /* Does a step with inputs and outputs that are all FLOAT64; what exchange_by makes of the version.
-     * stage is set to the call that the status is of; outputs are got if the step succeeded or was the last. */
-    Status (*exchange)(const Library *library, void *component, const Exchange *exchange,
-                       Stage *stage);
+    /* Does steps with inputs and outputs that are all FLOAT64; what exchange_by makes of the version.
+     * Returns whether all of them are OK. */
+    bool (*exchange)(const Library *library, const Exchange *exchange);
     Status (*get)(const Library *library, void *component, Type type, const uint32_t *references,
                   size_t count, void *values);
     Status (*set)(const Library *library, void *component, Type type, const uint32_t *references,
@@ -112,27 +121,46 @@ typedef struct Fmi {
 
 extern const Fmi fmi1, fmi2, fmi3;
 
-/* For the versions' own files: with a table that the compiler sees, calls become direct ones. */
-static inline Status exchange_by(const Fmi *fmi, const Library *library, void *component,
-                                 const Exchange *e, Stage *stage) {
-    *stage = SETTING_INPUTS;
-    Status status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
-                             e->number_of_inputs, e->inputs);
-    if (status > STATUS_WARNING) {
-        return status;
+static inline bool has_outputs(Outcome outcome) {
+    return outcome.stage == DOING_STEP &&
+           (outcome.status <= STATUS_WARNING || outcome.status == STATUS_TERMINATED);
+}
+
+/* For the versions' own files: with a table that the compiler sees, calls become direct ones.
+ *
+ * One kind of call after the other: a step is a long chain of operations that wait for each other,
+ * and the less there is between two steps, the more of the second one a processor does meanwhile. */
+static inline bool exchange_by(const Fmi *fmi, const Library *library, const Exchange *exchange) {
+    const Exchange e = *exchange; /* which no FMU can change behind the compiler's back */
+    bool good = true;
+
+    for (size_t i = 0; i < e.count; i++) {
+        const double *row = e.inputs + i * e.number_of_inputs;
+        const Status status = fmi->set(library, e.components[i], TYPE_FLOAT64, e.input_references,
+                                       e.number_of_inputs, row);
+        e.outcomes[i] = (Outcome){status, SETTING_INPUTS};
     }
-    *stage = DOING_STEP;
-    status = fmi->do_step(library, component, e->time, e->step, e->no_return);
-    if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
-        return status;
+    for (size_t i = 0; i < e.count; i++) {
+        if (e.outcomes[i].status <= STATUS_WARNING) {
+            const Status status =
+                fmi->do_step(library, e.components[i], e.times[i], e.step, e.no_return);
+            e.outcomes[i] = (Outcome){status, DOING_STEP};
+        }
+        good = good && e.outcomes[i].status == STATUS_OK;
     }
-    const Status got = fmi->get(library, component, TYPE_FLOAT64, e->output_references,
-                                e->number_of_outputs, e->outputs);
-    if (got > STATUS_WARNING) {
-        *stage = READING_OUTPUTS;
-        return got;
+    for (size_t i = 0; i < e.count; i++) {
+        double *row = e.outputs + i * e.number_of_outputs;
+        if (!has_outputs(e.outcomes[i])) {
+            continue;
+        }
+        const Status status = fmi->get(library, e.components[i], TYPE_FLOAT64,
+                                       e.output_references, e.number_of_outputs, row);
+        if (status > STATUS_WARNING) {
+            e.outcomes[i] = (Outcome){status, READING_OUTPUTS};
+            good = false;
+        }
     }
-    return status;
+    return good;
 }
 
 static inline Status sane(int status) {

@@ -144,9 +144,8 @@ static void free_instance(const Library *library, void *component) {
     functions_of(library)->free_instance(component);
 }
 
-static Status exchange(const Library *library, void *component, const Exchange *e,
-                       Stage *stage) {
-    return exchange_by(&fmi1, library, component, e, stage);
+static bool exchange(const Library *library, const Exchange *e) {
+    return exchange_by(&fmi1, library, e);
 }
 
 const Fmi fmi1 = {

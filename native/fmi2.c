@@ -208,9 +208,8 @@ static size_t state_size(const Library *library, void *component, void *state) {
     return sane(f->state_size(component, state, &size)) <= STATUS_WARNING ? size : 0;
 }
 
-static Status exchange(const Library *library, void *component, const Exchange *e,
-                       Stage *stage) {
-    return exchange_by(&fmi2, library, component, e, stage);
+static bool exchange(const Library *library, const Exchange *e) {
+    return exchange_by(&fmi2, library, e);
 }
 
 const Fmi fmi2 = {

@@ -182,9 +182,8 @@ static size_t state_size(const Library *library, void *instance, void *state) {
     return sane(f->state_size(instance, state, &size)) <= STATUS_WARNING ? size : 0;
 }
 
-static Status exchange(const Library *library, void *instance, const Exchange *e,
-                       Stage *stage) {
-    return exchange_by(&fmi3, library, instance, e, stage);
+static bool exchange(const Library *library, const Exchange *e) {
+    return exchange_by(&fmi3, library, e);
 }
 
 const Fmi fmi3 = {

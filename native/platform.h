@@ -158,6 +158,15 @@ static inline uint64_t clock_now(void) {
 #endif
 }
 
+/* Asks for memory that will be read soon, and is nowhere near. */
+static inline void prefetch(const void *place) {
+#if defined __GNUC__
+    __builtin_prefetch(place);
+#else
+    (void)place;
+#endif
+}
+
 /* Tells the processor that this thread waits for another in a loop. */
 static inline void spin_pause(void) {
 #if defined _MSC_VER

@@ -4,14 +4,23 @@
 
 enum { DONE, TRUNCATED, REWARD };
 
+WIDE static bool has_bad_action(const int64_t *actions, size_t count, int64_t lowest,
+                                int64_t highest) {
+    int64_t bad = 0;
+
+    for (size_t i = 0; i < count; i++) {
+        bad |= (actions[i] < lowest) | (actions[i] > highest);
+    }
+    return bad != 0;
+}
+
 ptrdiff_t play_find_bad_action(const Turn *turn) {
     const Play *play = turn->play;
-    size_t bad = 0;
 
-    for (size_t i = 0; i < play->count; i++) {
-        bad += (turn->actions[i] < play->lowest_action) | (turn->actions[i] > play->highest_action);
+    if (!has_bad_action(turn->actions, play->count, play->lowest_action, play->highest_action)) {
+        return -1;
     }
-    for (size_t i = 0; bad > 0 && i < play->count; i++) {
+    for (size_t i = 0; i < play->count; i++) {
         if (turn->actions[i] < play->lowest_action || turn->actions[i] > play->highest_action) {
             return (ptrdiff_t)i;
         }
@@ -19,15 +28,18 @@ ptrdiff_t play_find_bad_action(const Turn *turn) {
     return -1;
 }
 
+static double *fractions_of(const Draws *d, size_t index) {
+    return d->block + (index * d->episodes + (size_t)d->used[index]) * d->draws;
+}
+
 static void draw_ahead(const Draws *d, size_t index) {
     const Stream *stream = d->streams[index];
-    const size_t size = d->episodes * d->draws;
-    double *fractions = d->block + index * size;
+    d->used[index] = 0;
+    double *fractions = fractions_of(d, index);
 
-    for (size_t i = 0; i < size; i++) {
+    for (size_t i = 0; i < d->episodes * d->draws; i++) {
         fractions[i] = stream->next_double(stream->state);
     }
-    d->used[index] = 0;
 }
 
 /* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
@@ -40,8 +52,7 @@ void play_draw(const Play *play, size_t index) {
     if ((size_t)d->used[index] >= d->episodes) {
         draw_ahead(d, index);
     }
-    const size_t episode = index * d->episodes + (size_t)d->used[index];
-    const double *fractions = d->block + episode * d->draws;
+    const double *fractions = fractions_of(d, index);
 
     for (size_t i = 0; i < d->draws; i++) {
         const double scaled = d->width[i] * fractions[i];
@@ -75,6 +86,9 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     }
     for (size_t index = begin; index < begin + count; index++) {
         play->step_counts[index] = play->ended[index] ? 0 : play->step_counts[index] + 1;
+        if (play->ended[index]) {
+            prefetch(fractions_of(&play->draws, index));
+        }
     }
 }
 

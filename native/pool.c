@@ -2,6 +2,7 @@
 
 #include "pool.h"
 
+#include <float.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -330,20 +331,13 @@ static Status advance(Pool *pool, Instance *me) {
     return status;
 }
 
-/* Sums of zeros, or of NaN; four of them, which no value has to wait for. */
-static bool all_finite(const double *values, size_t count) {
-    double sums[4] = {0.0, 0.0, 0.0, 0.0};
-    size_t i = 0;
+WIDE static bool all_finite(const double *values, size_t count) {
+    int64_t bad = 0; /* as wide as the values, for the compiler's sake */
 
-    for (; i + 4 <= count; i += 4) {
-        for (size_t j = 0; j < 4; j++) {
-            sums[j] += values[i + j] - values[i + j];
-        }
+    for (size_t i = 0; i < count; i++) {
+        bad |= !(fabs(values[i]) <= DBL_MAX);
     }
-    for (; i < count; i++) {
-        sums[0] += values[i] - values[i];
-    }
-    return sums[0] + sums[1] + sums[2] + sums[3] == 0.0;
+    return bad == 0;
 }
 
 static Status note_not_finite(Instance *me, const char *what, const double *values, size_t count) {
@@ -405,52 +399,34 @@ static Status fail_reading(Pool *pool, Instance *me, Status status) {
     return status;
 }
 
-/* Inputs, one step and outputs as one call of the FMI version. */
-static Status exchange(Pool *pool, Instance *me, Exchange *e) {
-    Stage stage;
-    const Status status = pool->settings.fmi->exchange(me->library, me->component, e, &stage);
-
-    me->steps += stage != SETTING_INPUTS;
-    if (status <= STATUS_WARNING) {
-        return status;
-    }
-    if (stage == DOING_STEP) {
-        return fail_step(pool, me, e->time, status);
-    }
-    if (stage == SETTING_INPUTS) {
-        return fail(pool, me, "setting the inputs", status);
-    }
-    return fail_reading(pool, me, status);
+static Status fail_setting(Pool *pool, Instance *me, Status status) {
+    return fail(pool, me, "setting the inputs", status);
 }
 
-static Status exchange_in_parts(Pool *pool, Instance *me, const Exchange *e, void *typed) {
+static Status step_instance(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
 
+    if (me->phase != PHASE_STEPPING) {
+        return refuse(me, "a step was asked for before a reset has mended the instance");
+    }
+    if (!scratch.sound && !all_finite(scratch.inputs, s->inputs->count)) {
+        return note_not_finite(me, BAD_INPUTS, scratch.inputs, s->inputs->count);
+    }
     if (s->retries > 0) {
         health_of(pool, me)[RETRIED] = 0;
     }
-    const Status set = access_set(s->inputs, me->library, me->component, e->inputs, typed);
-
+    const Status set =
+        access_set(s->inputs, me->library, me->component, scratch.inputs, scratch.typed);
     if (set > STATUS_WARNING) {
-        return fail(pool, me, "setting the inputs", set);
+        return fail_setting(pool, me, set);
     }
     const Status status = advance(pool, me);
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         return status;
     }
-    const Status got = access_get(s->outputs, me->library, me->component, e->outputs, typed);
+    const Status got =
+        access_get(s->outputs, me->library, me->component, scratch.outputs, scratch.typed);
     return got > STATUS_WARNING ? fail_reading(pool, me, got) : status;
-}
-
-static Status step_instance(Pool *pool, Instance *me, Exchange *e, Scratch scratch) {
-    if (me->phase != PHASE_STEPPING) {
-        return refuse(me, "a step was asked for before a reset has mended the instance");
-    }
-    if (!scratch.sound && !all_finite(e->inputs, e->number_of_inputs)) {
-        return note_not_finite(me, BAD_INPUTS, e->inputs, e->number_of_inputs);
-    }
-    e->time = communication_point(pool, me);
-    return pool->direct ? exchange(pool, me, e) : exchange_in_parts(pool, me, e, scratch.typed);
 }
 
 /* Initialization */
@@ -840,19 +816,31 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
     return troubled;
 }
 
+/* Takes one value of each of count rows; four at a time, as this is where the time goes. */
+static void take_column(const double *rows, size_t width, size_t count, double *column) {
+    size_t j = 0;
+
+    for (; j + 4 <= count; j += 4, rows += 4 * width) {
+        column[j] = rows[0];
+        column[j + 1] = rows[width];
+        column[j + 2] = rows[2 * width];
+        column[j + 3] = rows[3 * width];
+    }
+    for (; j < count; j++, rows += width) {
+        column[j] = *rows;
+    }
+}
+
 static void keep_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
     const Settings *s = &task->pool->settings;
     const size_t width = s->outputs->count;
 
     for (size_t i = 0; i < width; i++) {
-        double *row = s->output_values + i * s->count + begin;
-        for (size_t j = 0; j < count; j++) {
-            row[j] = outputs[j * width + i];
-        }
+        take_column(outputs + i, width, count, s->output_values + i * s->count + begin);
     }
 }
 
-static void convert(const double *values, size_t count, float *converted) {
+WIDE static void convert(const double *values, size_t count, float *converted) {
     for (size_t i = 0; i < count; i++) {
         converted[i] = (float)values[i];
     }
@@ -873,42 +861,122 @@ static void write_observations(const Task *task, size_t begin, size_t count,
     }
 }
 
-/* Resets those in the mask and steps the others; or, in a plain step, leaves those in the mask. */
-static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
+/* The same scratch memory, without the first instances of its run. */
+static Scratch scratch_from(const Pool *pool, Scratch scratch, size_t place) {
+    scratch.inputs += place * pool->settings.inputs->count;
+    scratch.outputs += place * pool->settings.outputs->count;
+    return scratch;
+}
+
+/* Where a step has given no outputs, those from before are handed out. */
+static size_t conclude_step(Task *task, size_t index, Status status, double *outputs) {
+    if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
+        copy_outputs(task->pool, &task->pool->instances[index], outputs);
+    }
+    return note_status(task, index, status);
+}
+
+/* Resets an instance in the mask, or steps another; a plain step leaves those in the mask. */
+static size_t do_one(Task *task, size_t index, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;
-    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
-    const size_t in_width = in->count, out_width = out->count;
-    Exchange e = {.input_references = in->groups[0].references,
-                  .output_references = out->groups[0].references,
-                  .number_of_inputs = in_width,
-                  .number_of_outputs = out_width,
-                  .step = pool->step_size,
-                  .no_return = pool->no_return,
-                  .inputs = scratch.inputs,
-                  .outputs = scratch.outputs};
+    Instance *me = &pool->instances[index];
     size_t troubled = 0;
 
-    for (size_t index = begin; index < begin + count; index++) {
-        Instance *me = &pool->instances[index];
-        const bool in_mask = is_in(call->mask, index);
-        Status status = STATUS_OK;
+    if (!is_in(call->mask, index)) {
+        return conclude_step(task, index, step_instance(pool, me, scratch), scratch.outputs);
+    }
+    if (task->operation != STEP) {
+        if (call->turn != NULL) {
+            play_draw(call->turn->play, index);
+        }
+        troubled = note_status(task, index, reset_instance(pool, me, call, scratch));
+    }
+    copy_outputs(pool, me, scratch.outputs);
+    return troubled;
+}
 
-        if (!in_mask) {
-            status = step_instance(pool, me, &e, scratch);
-            troubled += note_status(task, index, status);
-        } else if (task->operation != STEP) {
-            if (call->turn != NULL) {
-                play_draw(call->turn->play, index);
-            }
-            status = reset_instance(pool, me, call, scratch);
-            troubled += note_status(task, index, status);
+/* Neighbours that are stepped together, by one call of the FMI version. */
+typedef struct {
+    void *components[RUN];
+    double times[RUN];
+    Outcome outcomes[RUN];
+} Neighbours;
+
+/* Those from begin on that are to be stepped, and can be; takes their steps for done. */
+static size_t line_up(const Task *task, size_t begin, size_t end, Neighbours *neighbours) {
+    const Pool *pool = task->pool;
+    const Library *library = pool->instances[begin].library;
+    size_t count = 0;
+
+    for (; begin + count < end; count++) {
+        Instance *me = &pool->instances[begin + count];
+        if (is_in(task->call->mask, begin + count) || me->phase != PHASE_STEPPING ||
+            me->library != library) {
+            break;
         }
-        if (in_mask || (status > STATUS_WARNING && status != STATUS_TERMINATED)) {
-            copy_outputs(pool, me, e.outputs);
+        neighbours->components[count] = me->component;
+        neighbours->times[count] = communication_point(pool, me);
+        me->steps++;
+    }
+    return count;
+}
+
+static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) {
+    if (outcome.status <= STATUS_WARNING) {
+        return outcome.status;
+    }
+    if (outcome.stage == SETTING_INPUTS) {
+        me->steps--;
+        return fail_setting(pool, me, outcome.status);
+    }
+    return outcome.stage == DOING_STEP ? fail_step(pool, me, time, outcome.status)
+                                       : fail_reading(pool, me, outcome.status);
+}
+
+static size_t step_neighbours(Task *task, size_t begin, size_t count, Neighbours *neighbours,
+                              Scratch scratch) {
+    Pool *pool = task->pool;
+    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
+    const Exchange e = {
+        in->groups[0].references, out->groups[0].references,
+        in->count, out->count,
+        pool->step_size, pool->no_return,
+        count, neighbours->components, neighbours->times,
+        scratch.inputs, scratch.outputs, neighbours->outcomes,
+    };
+    size_t troubled = 0;
+
+    memset(pool->settings.status + begin, STATUS_OK, count);
+    if (pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
+        return 0;
+    }
+    for (size_t i = 0; i < count; i++) {
+        Instance *me = &pool->instances[begin + i];
+        const Status status =
+            status_of(pool, me, neighbours->times[i], neighbours->outcomes[i]);
+        troubled += conclude_step(task, begin + i, status, scratch.outputs + i * out->count);
+    }
+    return troubled;
+}
+
+static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
+    const Pool *pool = task->pool;
+    const bool together = pool->direct && scratch.sound;
+    Neighbours neighbours;
+    size_t troubled = 0;
+
+    for (size_t place = 0; place < count;) {
+        const size_t first = begin + place;
+        const size_t steps = together ? line_up(task, first, begin + count, &neighbours) : 0;
+        const Scratch rest = scratch_from(pool, scratch, place);
+        if (steps > 0) {
+            troubled += step_neighbours(task, first, steps, &neighbours, rest);
+            place += steps;
+        } else {
+            troubled += do_one(task, first, rest);
+            place++;
         }
-        e.inputs += in_width;
-        e.outputs += out_width;
     }
     return troubled;
 }
