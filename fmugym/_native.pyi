@@ -140,6 +140,7 @@ class Pool:
         rewards: Array,
         terminated: Array,
         truncated: Array,
+        drawn: Array,
         /,
     ) -> tuple[int, int]:
         """Do a step, with all that was taken over.

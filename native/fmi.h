@@ -68,7 +68,7 @@ typedef struct {
 } Outcome;
 
 /* A step of each of several instances, with the setting of its inputs and the getting of its
- * outputs; a row of either for each instance. */
+ * outputs; place says which row of either is its. */
 typedef struct {
     const uint32_t *input_references, *output_references;
     size_t number_of_inputs, number_of_outputs;
@@ -76,6 +76,7 @@ typedef struct {
     bool no_return; /* see do_step */
     size_t count;
     void *const *components;
+    const uint32_t *places;
     const double *times;
     const double *inputs;
     double *outputs;
@@ -126,39 +127,36 @@ static inline bool has_outputs(Outcome outcome) {
            (outcome.status <= STATUS_WARNING || outcome.status == STATUS_TERMINATED);
 }
 
-/* For the versions' own files: with a table that the compiler sees, calls become direct ones.
- *
- * One kind of call after the other: a step is a long chain of operations that wait for each other,
- * and the less there is between two steps, the more of the second one a processor does meanwhile. */
+static inline Outcome exchange_once(const Fmi *fmi, const Library *library, const Exchange *e,
+                                    size_t index) {
+    void *component = e->components[index];
+    const double *inputs = e->inputs + e->places[index] * e->number_of_inputs;
+    double *outputs = e->outputs + e->places[index] * e->number_of_outputs;
+    Outcome outcome = {.stage = SETTING_INPUTS};
+
+    outcome.status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
+                              e->number_of_inputs, inputs);
+    if (outcome.status <= STATUS_WARNING) {
+        outcome.stage = DOING_STEP;
+        outcome.status =
+            fmi->do_step(library, component, e->times[index], e->step, e->no_return);
+    }
+    if (has_outputs(outcome)) {
+        const Status got = fmi->get(library, component, TYPE_FLOAT64, e->output_references,
+                                    e->number_of_outputs, outputs);
+        outcome = got > STATUS_WARNING ? (Outcome){got, READING_OUTPUTS} : outcome;
+    }
+    return outcome;
+}
+
+/* For the versions' own files: with a table that the compiler sees, calls become direct ones. */
 static inline bool exchange_by(const Fmi *fmi, const Library *library, const Exchange *exchange) {
     const Exchange e = *exchange; /* which no FMU can change behind the compiler's back */
     bool good = true;
 
     for (size_t i = 0; i < e.count; i++) {
-        const double *row = e.inputs + i * e.number_of_inputs;
-        const Status status = fmi->set(library, e.components[i], TYPE_FLOAT64, e.input_references,
-                                       e.number_of_inputs, row);
-        e.outcomes[i] = (Outcome){status, SETTING_INPUTS};
-    }
-    for (size_t i = 0; i < e.count; i++) {
-        if (e.outcomes[i].status <= STATUS_WARNING) {
-            const Status status =
-                fmi->do_step(library, e.components[i], e.times[i], e.step, e.no_return);
-            e.outcomes[i] = (Outcome){status, DOING_STEP};
-        }
-        good = good && e.outcomes[i].status == STATUS_OK;
-    }
-    for (size_t i = 0; i < e.count; i++) {
-        double *row = e.outputs + i * e.number_of_outputs;
-        if (!has_outputs(e.outcomes[i])) {
-            continue;
-        }
-        const Status status = fmi->get(library, e.components[i], TYPE_FLOAT64,
-                                       e.output_references, e.number_of_outputs, row);
-        if (status > STATUS_WARNING) {
-            e.outcomes[i] = (Outcome){status, READING_OUTPUTS};
-            good = false;
-        }
+        e.outcomes[i] = exchange_once(fmi, library, &e, i);
+        good &= e.outcomes[i].status == STATUS_OK;
     }
     return good;
 }

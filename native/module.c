@@ -721,18 +721,20 @@ static bool require_play(const PyPool *self) {
     return ready;
 }
 
-enum { ACTIONS, SEEN, REWARDS, TERMINATED, TRUNCATED, TURN_BUFFERS };
+enum { ACTIONS, SEEN, REWARDS, TERMINATED, TRUNCATED, DRAWN, TURN_BUFFERS };
 
 static bool take_turn(PyPool *self, PyObject *const *args, Py_buffer *buffers) {
-    static const char *const formats[TURN_BUFFERS] = {"lq", "f", "d", "?", "?"};
+    static const char *const formats[TURN_BUFFERS] = {"lq", "f", "d", "?", "?", "d"};
     const Settings *s = &self->pool.settings;
     const Py_ssize_t n = (Py_ssize_t)s->count;
+    const Py_ssize_t draws = (Py_ssize_t)self->play.draws.draws;
+    const Py_ssize_t rows[TURN_BUFFERS] = {-1, n, -1, -1, -1, draws};
+    const Py_ssize_t columns[TURN_BUFFERS] = {n, (Py_ssize_t)s->num_observed, n, n, n, n};
 
     for (int i = 0; i < TURN_BUFFERS; i++) {
-        const bool table = i == SEEN;
         const int flags = PyBUF_C_CONTIGUOUS | (i == ACTIONS ? 0 : PyBUF_WRITABLE);
-        if (!take_buffer(args[i], &buffers[i], flags, "an array of play", formats[i],
-                         table ? n : -1, table ? (Py_ssize_t)s->num_observed : n)) {
+        if (!take_buffer(args[i], &buffers[i], flags, "an array of play", formats[i], rows[i],
+                         columns[i])) {
             return false;
         }
     }
@@ -754,7 +756,7 @@ static size_t run_play(PyPool *self, const Call *call, size_t *ended) {
 static PyObject *play_turn(PyPool *self, const Py_buffer *buffers) {
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &self->play_buffers[STARTS];
     const Turn turn = {&self->play, buffers[ACTIONS].buf, buffers[REWARDS].buf,
-                       buffers[TERMINATED].buf, buffers[TRUNCATED].buf};
+                       buffers[TERMINATED].buf, buffers[TRUNCATED].buf, buffers[DRAWN].buf};
     const Call call = {
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
         .start = &((PyAccess *)self->start)->access,

@@ -32,6 +32,10 @@ static double *fractions_of(const Draws *d, size_t index) {
     return d->block + (index * d->episodes + (size_t)d->used[index]) * d->draws;
 }
 
+void play_foresee(const Play *play, size_t index) {
+    prefetch(fractions_of(&play->draws, index));
+}
+
 static void draw_ahead(const Draws *d, size_t index) {
     const Stream *stream = d->streams[index];
     d->used[index] = 0;
@@ -43,7 +47,8 @@ static void draw_ahead(const Draws *d, size_t index) {
 }
 
 /* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
-void play_draw(const Play *play, size_t index) {
+void play_draw(const Turn *turn, size_t index) {
+    const Play *play = turn->play;
     const Draws *d = &play->draws;
 
     if (d->draws == 0) {
@@ -55,8 +60,9 @@ void play_draw(const Play *play, size_t index) {
     const double *fractions = fractions_of(d, index);
 
     for (size_t i = 0; i < d->draws; i++) {
-        const double scaled = d->width[i] * fractions[i];
-        play->start_values[(size_t)d->rows[i] * play->count + index] = d->low[i] + scaled;
+        const double scaled = d->width[i] * fractions[i], value = d->low[i] + scaled;
+        play->start_values[(size_t)d->rows[i] * play->count + index] = value;
+        turn->drawn[i * play->count + index] = value;
     }
     d->used[index]++;
 }
@@ -86,13 +92,10 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     }
     for (size_t index = begin; index < begin + count; index++) {
         play->step_counts[index] = play->ended[index] ? 0 : play->step_counts[index] + 1;
-        if (play->ended[index]) {
-            prefetch(fractions_of(&play->draws, index));
-        }
     }
 }
 
-/* Without branches, which nobody could foresee. */
+/* Without branches, which nobody could foresee; wide values first, then what is left in bytes. */
 WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const double *dones,
                          const double *cuts, const double *rewards) {
     const Play *play = turn->play;
@@ -102,18 +105,22 @@ WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const dou
     uint8_t *restrict terminated = turn->terminated + begin;
     uint8_t *restrict truncated = turn->truncated + begin;
     double *restrict given = turn->rewards + begin;
-    size_t number = 0;
+    uint8_t done[PROGRAM_WIDTH], cut[PROGRAM_WIDTH], number = 0;
 
+    for (size_t j = 0; j < PROGRAM_WIDTH; j++) {
+        done[j] = dones[j] != 0.0;
+        cut[j] = cuts[j] != 0.0;
+    }
+    for (size_t j = 0; j < count; j++) {
+        cut[j] |= step_counts[j] >= limit;
+    }
     for (size_t j = 0; j < count; j++) {
         given[j] = ended[j] ? 0.0 : rewards[j];
     }
     for (size_t j = 0; j < count; j++) {
-        const bool going = !ended[j];
-        terminated[j] = going & (dones[j] != 0.0);
-        truncated[j] = going & ((step_counts[j] >= limit) | (cuts[j] != 0.0));
+        terminated[j] = done[j] & !ended[j];
+        truncated[j] = cut[j] & !ended[j];
         ended[j] = terminated[j] | truncated[j];
-    }
-    for (size_t j = 0; j < count; j++) {
         number += ended[j];
     }
     return number;

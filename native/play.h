@@ -50,6 +50,7 @@ typedef struct {
     const int64_t *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
+    double *drawn; /* a row for each draw, of which only what is drawn now is written */
 } Turn;
 
 /* The first environment whose action is out of range, or -1. */
@@ -67,7 +68,10 @@ void play_open(const Turn *turn, PlayScratch *scratch);
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 
+/* Asks for the memory that play_draw will read. */
+void play_foresee(const Play *play, size_t index);
+
 /* Draws the start values of an episode, before its instance is reset. */
-void play_draw(const Play *play, size_t index);
+void play_draw(const Turn *turn, size_t index);
 
 #endif

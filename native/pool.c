@@ -792,8 +792,9 @@ static void gather_inputs(const Task *task, size_t begin, size_t count, double *
     for (size_t i = 0; i < width; i++) {
         const char *place = matrix->data + (ptrdiff_t)i * matrix->row_stride +
                             (ptrdiff_t)begin * matrix->column_stride;
-        for (size_t j = 0; j < count; j++, place += matrix->column_stride) {
-            memcpy(&inputs[j * width + i], place, sizeof *inputs);
+        double *to = inputs + i;
+        for (size_t j = 0; j < count; j++, place += matrix->column_stride, to += width) {
+            memcpy(to, place, sizeof *to);
         }
     }
 }
@@ -816,7 +817,7 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
     return troubled;
 }
 
-/* Takes one value of each of count rows; four at a time, as this is where the time goes. */
+/* One value of each of count rows; four at a time, as there are many. */
 static void take_column(const double *rows, size_t width, size_t count, double *column) {
     size_t j = 0;
 
@@ -888,7 +889,7 @@ static size_t do_one(Task *task, size_t index, Scratch scratch) {
     }
     if (task->operation != STEP) {
         if (call->turn != NULL) {
-            play_draw(call->turn->play, index);
+            play_draw(call->turn, index);
         }
         troubled = note_status(task, index, reset_instance(pool, me, call, scratch));
     }
@@ -896,30 +897,54 @@ static size_t do_one(Task *task, size_t index, Scratch scratch) {
     return troubled;
 }
 
-/* Neighbours that are stepped together, by one call of the FMI version. */
+/* Those of a run that are stepped together, by one call of the FMI version, and the others; by their
+ * places in the run. */
 typedef struct {
+    size_t count, others;
+    uint32_t places[RUN], other_places[RUN];
     void *components[RUN];
     double times[RUN];
     Outcome outcomes[RUN];
-} Neighbours;
+} LineUp;
 
-/* Those from begin on that are to be stepped, and can be; takes their steps for done. */
-static size_t line_up(const Task *task, size_t begin, size_t end, Neighbours *neighbours) {
+/* Takes the steps for done. Without branches: nobody can foresee which episodes have ended. */
+static void line_up(const Task *task, size_t begin, size_t count, bool together, LineUp *line) {
     const Pool *pool = task->pool;
     const Library *library = pool->instances[begin].library;
-    size_t count = 0;
 
-    for (; begin + count < end; count++) {
-        Instance *me = &pool->instances[begin + count];
-        if (is_in(task->call->mask, begin + count) || me->phase != PHASE_STEPPING ||
-            me->library != library) {
-            break;
-        }
-        neighbours->components[count] = me->component;
-        neighbours->times[count] = communication_point(pool, me);
-        me->steps++;
+    size_t steppers = 0, others = 0;
+
+    for (size_t j = 0; j < count; j++) {
+        Instance *me = &pool->instances[begin + j];
+        const bool steps = together & !is_in(task->call->mask, begin + j) &
+                           (me->phase == PHASE_STEPPING) & (me->library == library);
+
+        line->places[steppers] = line->other_places[others] = (uint32_t)j;
+        line->components[steppers] = me->component;
+        line->times[steppers] = communication_point(pool, me);
+        me->steps += steps;
+        steppers += steps;
+        others += !steps;
     }
-    return count;
+    line->count = steppers;
+    line->others = others;
+}
+
+/* Asks for the memory that a reset will read: many places, far from each other. */
+static void foresee_reset(const Task *task, size_t index) {
+    const Call *call = task->call;
+    const Matrix *values = &call->start_values;
+    const char *place = values->data + (ptrdiff_t)index * values->column_stride;
+
+    if (task->operation == STEP) {
+        return;
+    }
+    for (size_t i = 0; i < call->start->count; i++, place += values->row_stride) {
+        prefetch(place);
+    }
+    if (call->turn != NULL) {
+        play_foresee(call->turn->play, index);
+    }
 }
 
 static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) {
@@ -934,49 +959,46 @@ static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) 
                                        : fail_reading(pool, me, outcome.status);
 }
 
-static size_t step_neighbours(Task *task, size_t begin, size_t count, Neighbours *neighbours,
-                              Scratch scratch) {
+static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scratch) {
     Pool *pool = task->pool;
     const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
     const Exchange e = {
         in->groups[0].references, out->groups[0].references,
         in->count, out->count,
         pool->step_size, pool->no_return,
-        count, neighbours->components, neighbours->times,
-        scratch.inputs, scratch.outputs, neighbours->outcomes,
+        line->count, line->components, line->places, line->times,
+        scratch.inputs, scratch.outputs, line->outcomes,
     };
+    const bool good = pool->settings.fmi->exchange(pool->instances[begin].library, &e);
     size_t troubled = 0;
 
-    memset(pool->settings.status + begin, STATUS_OK, count);
-    if (pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
-        return 0;
-    }
-    for (size_t i = 0; i < count; i++) {
-        Instance *me = &pool->instances[begin + i];
-        const Status status =
-            status_of(pool, me, neighbours->times[i], neighbours->outcomes[i]);
-        troubled += conclude_step(task, begin + i, status, scratch.outputs + i * out->count);
+    for (size_t i = 0; i < line->count; i++) {
+        const size_t place = line->places[i], index = begin + place;
+        pool->settings.status[index] = STATUS_OK;
+        if (!good) {
+            const Status status = status_of(pool, &pool->instances[index], line->times[i],
+                                            line->outcomes[i]);
+            troubled += conclude_step(task, index, status, scratch_from(pool, scratch, place).outputs);
+        }
     }
     return troubled;
 }
 
 static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
-    const Pool *pool = task->pool;
-    const bool together = pool->direct && scratch.sound;
-    Neighbours neighbours;
+    Pool *pool = task->pool;
+    LineUp line;
     size_t troubled = 0;
 
-    for (size_t place = 0; place < count;) {
-        const size_t first = begin + place;
-        const size_t steps = together ? line_up(task, first, begin + count, &neighbours) : 0;
-        const Scratch rest = scratch_from(pool, scratch, place);
-        if (steps > 0) {
-            troubled += step_neighbours(task, first, steps, &neighbours, rest);
-            place += steps;
-        } else {
-            troubled += do_one(task, first, rest);
-            place++;
-        }
+    line_up(task, begin, count, pool->direct && scratch.sound, &line);
+    for (size_t i = 0; i < line.others; i++) {
+        foresee_reset(task, begin + line.other_places[i]);
+    }
+    if (line.count > 0) {
+        troubled += step_together(task, begin, &line, scratch);
+    }
+    for (size_t i = 0; i < line.others; i++) {
+        const size_t place = line.other_places[i];
+        troubled += do_one(task, begin + place, scratch_from(pool, scratch, place));
     }
     return troubled;
 }

@@ -408,9 +408,10 @@ class NativePool(Counted):
                 the next step, shape (N,); steps after which an episode is truncated.
 
         Returns:
-            A function of actions (int64), observations, rewards, terminated and truncated, which
-            does a step and fills the latter four, once ``set_streams`` was called. It returns how
-            many instances have a status worse than a warning, and how many episodes have ended.
+            A function of actions (int64), observations, rewards, terminated, truncated and drawn
+            values (draws, N), which does a step and fills all but the first, once ``set_streams``
+            was called; of the drawn values only those of episodes that start. It returns how many
+            instances have a status worse than a warning, and how many episodes have ended.
         """
         block, used, low, width, rows = draws
         count, ended, limit = episodes

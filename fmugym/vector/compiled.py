@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -95,11 +94,7 @@ class CompiledEngine(BatchEngine):
         self._shape = num_envs, env._output_count
         self._names = plan.drawn_names
         rows = [plan.parameter_names.index(name) for name in self._names]
-        together = rows == list(range(len(rows)))
-        copy: Any = self._start_values.take  # faster than an index, and slower than a slice
-        self._copy_drawn: Callable[[], FloatArray] = (
-            self._start_values[: len(rows)].copy if together else partial(copy, rows, 0)
-        )
+        self._drawn_shape = len(rows), num_envs
         pool: Any = self._pool
         self._stream_version = -1
         self._play = pool.prepare_play(
@@ -132,27 +127,25 @@ class CompiledEngine(BatchEngine):
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         arrays = observations, rewards, terminated, truncated
+        drawn = np.empty(self._drawn_shape)
         play = self._play if resetting is None else self._play_with_resets
         try:
-            troubled, ended = play(actions, *arrays)
+            troubled, ended = play(actions, *arrays, drawn)
         except (TypeError, ValueError, BufferError):
             actions = np.ascontiguousarray(self._checked(actions), np.int64)
-            troubled, ended = play(actions, *arrays)
+            troubled, ended = play(actions, *arrays, drawn)
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         if resetting is not None:
-            infos = {"drawn": self._drawn(resetting), "_drawn": resetting}
+            told = LateDict.of(self._named, drawn, resetting)  # few ever look at them
+            infos = {"drawn": told, "_drawn": resetting}
         result: StepResult = _make_tuple(StepResult, (*arrays, infos))
         if troubled:
             self._mend(actions, result, resetting)
         return result
 
-    def _drawn(self, mask: MaskArray) -> LateDict:
-        """The values of now, which later steps write again; few ever look at them."""
-        return LateDict.of(self._named, self._copy_drawn(), mask)
-
-    def _named(self, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
-        named = dict(zip(self._names, values, strict=True))
+    def _named(self, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+        named = dict(zip(self._names, np.where(mask, drawn, 0.0), strict=True))
         return named | {f"_{name}": mask.copy() for name in named}
 
     def note_attributes(self) -> None:
