@@ -63,12 +63,12 @@ Status enter_initialization(Instance *instance, const char *function) {
 }
 
 static bool all_finite(const double *values, int number) {
+    int64_t bad = 0; /* as wide as the values, for the compiler's sake */
+
     for (int i = 0; i < number; i++) {
-        if (!(fabs(values[i]) <= DBL_MAX)) {
-            return false;
-        }
+        bad |= !(fabs(values[i]) <= DBL_MAX);
     }
-    return true;
+    return bad == 0;
 }
 
 /* Solves the initial equations. */

@@ -1,5 +1,8 @@
 #include "solvers.h"
 
+/* What is too large to be a part of every step, of which the smallest are the ones that count. */
+#define APART [[gnu::noinline]]
+
 static void step_explicit_euler(const Reals *r, const Constants *k, double step, double *state) {
     double derivative[NUMBER_OF_STATES];
 
@@ -10,8 +13,8 @@ static void step_explicit_euler(const Reals *r, const Constants *k, double step,
 }
 
 /* Velocities first, then positions from the new, limited velocities. */
-static void step_semi_implicit_euler(const Reals *r, const Constants *k, double step,
-                                     double *state) {
+APART static void step_semi_implicit_euler(const Reals *r, const Constants *k, double step,
+                                           double *state) {
     double derivative[NUMBER_OF_STATES];
 
     model_derivatives(r, k, state, derivative);
@@ -31,7 +34,7 @@ static void move(const double *from, double step, const double *derivative, doub
 }
 
 /* The classical Runge-Kutta method of order 4. */
-static void step_rk4(const Reals *r, const Constants *k, double step, double *state) {
+APART static void step_rk4(const Reals *r, const Constants *k, double step, double *state) {
     double k1[NUMBER_OF_STATES];
     double k2[NUMBER_OF_STATES];
     double k3[NUMBER_OF_STATES];
@@ -50,16 +53,26 @@ static void step_rk4(const Reals *r, const Constants *k, double step, double *st
     }
 }
 
-void integrate(const Reals *r, const Constants *k, int32_t solver, double step, int32_t number,
-               double *state) {
+APART static void integrate_otherwise(const Reals *r, const Constants *k, int32_t solver,
+                                      double step, int32_t number, double *state) {
     for (int32_t i = 0; i < number; i++) {
-        if (solver == EXPLICIT_EULER) {
-            step_explicit_euler(r, k, step, state);
-        } else if (solver == SEMI_IMPLICIT_EULER) {
+        if (solver == SEMI_IMPLICIT_EULER) {
             step_semi_implicit_euler(r, k, step, state);
         } else {
             step_rk4(r, k, step, state);
         }
+        model_limit_state(r, state);
+    }
+}
+
+void integrate(const Reals *r, const Constants *k, int32_t solver, double step, int32_t number,
+               double *state) {
+    if (solver != EXPLICIT_EULER) {
+        integrate_otherwise(r, k, solver, step, number, state);
+        return;
+    }
+    for (int32_t i = 0; i < number; i++) {
+        step_explicit_euler(r, k, step, state);
         model_limit_state(r, state);
     }
 }

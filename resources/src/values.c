@@ -82,6 +82,7 @@ Status get_reals(Instance *instance, const char *function, const uint32_t refere
 
 static void assign(Reals *reals, const uint32_t references[], size_t number,
                    const double values[]) {
+#pragma clang loop unroll(disable) /* mostly it is one value */
     for (size_t i = 0; i < number; i++) {
         reals->values[references[i]] = values[i];
     }
@@ -125,9 +126,9 @@ Status set_reals(Instance *instance, const char *function, const uint32_t refere
         return STATUS_ERROR;
     }
     const int32_t phase = instance->simulation.phase;
+    const int32_t asked = phase == PHASE_STEP ? phase | TUNES : phase;
     for (size_t i = 0; i < number; i++) {
-        const int settable = references[i] < NUMBER_OF_REALS ? real_settable[references[i]] : 0;
-        if (!(settable & phase) || (phase == PHASE_STEP && (settable & TUNES))) {
+        if (references[i] >= NUMBER_OF_REALS || (real_settable[references[i]] & asked) != phase) {
             return set_any_reals(instance, function, references, number, values);
         }
     }
