@@ -911,7 +911,6 @@ typedef struct {
 static void line_up(const Task *task, size_t begin, size_t count, bool together, LineUp *line) {
     const Pool *pool = task->pool;
     const Library *library = pool->instances[begin].library;
-
     size_t steppers = 0, others = 0;
 
     for (size_t j = 0; j < count; j++) {
@@ -959,33 +958,49 @@ static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) 
                                        : fail_reading(pool, me, outcome.status);
 }
 
-static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scratch) {
+static size_t conclude_steps(Task *task, size_t begin, const LineUp *line, Scratch scratch) {
     Pool *pool = task->pool;
-    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
-    const Exchange e = {
-        in->groups[0].references, out->groups[0].references,
-        in->count, out->count,
-        pool->step_size, pool->no_return,
-        line->count, line->components, line->places, line->times,
-        scratch.inputs, scratch.outputs, line->outcomes,
-    };
-    const bool good = pool->settings.fmi->exchange(pool->instances[begin].library, &e);
     size_t troubled = 0;
 
     for (size_t i = 0; i < line->count; i++) {
         const size_t place = line->places[i], index = begin + place;
-        pool->settings.status[index] = STATUS_OK;
-        if (!good) {
-            const Status status = status_of(pool, &pool->instances[index], line->times[i],
-                                            line->outcomes[i]);
-            troubled += conclude_step(task, index, status, scratch_from(pool, scratch, place).outputs);
-        }
+        const Status status =
+            status_of(pool, &pool->instances[index], line->times[i], line->outcomes[i]);
+        double *outputs = scratch_from(pool, scratch, place).outputs;
+        troubled += conclude_step(task, index, status, outputs);
     }
     return troubled;
 }
 
+static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scratch) {
+    const Pool *pool = task->pool;
+    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
+    const Exchange e = {
+        .input_references = in->groups[0].references,
+        .output_references = out->groups[0].references,
+        .number_of_inputs = in->count,
+        .number_of_outputs = out->count,
+        .step = pool->step_size,
+        .no_return = pool->no_return,
+        .count = line->count,
+        .components = line->components,
+        .places = line->places,
+        .times = line->times,
+        .inputs = scratch.inputs,
+        .outputs = scratch.outputs,
+        .outcomes = line->outcomes,
+    };
+    if (!pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
+        return conclude_steps(task, begin, line, scratch);
+    }
+    for (size_t i = 0; i < line->count; i++) {
+        pool->settings.status[begin + line->places[i]] = STATUS_OK;
+    }
+    return 0;
+}
+
 static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
-    Pool *pool = task->pool;
+    const Pool *pool = task->pool;
     LineUp line;
     size_t troubled = 0;
 
