@@ -356,6 +356,16 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     return NULL;
 }
 
+static void drop_play(PyPool *self) {
+    self->can_play = false;
+    for (int i = 0; i < PLAY_BUFFERS; i++) {
+        release(&self->play_buffers[i]);
+        self->play_buffers[i].obj = NULL;
+    }
+    Py_XDECREF(self->start);
+    self->start = NULL;
+}
+
 /* The messages of closing go to Python, which must not touch an error that is on its way. */
 static void pool_dealloc(PyObject *object) {
     PyPool *self = (PyPool *)object;
@@ -367,14 +377,11 @@ static void pool_dealloc(PyObject *object) {
     for (int i = 0; i < BUFFERS; i++) {
         release(&self->buffers[i]);
     }
-    for (int i = 0; i < PLAY_BUFFERS; i++) {
-        release(&self->play_buffers[i]);
-    }
+    drop_play(self);
     free(self->paths);
     free(self->strings);
     free(self->streams);
     Py_XDECREF(self->generators);
-    Py_XDECREF(self->start);
     Py_XDECREF(self->arguments);
     free_object(object);
 }
@@ -649,10 +656,6 @@ static PyObject *prepare_play(PyObject *object, PyObject *args) {
     Py_ssize_t draws, episodes;
     long long lowest, highest, limit;
 
-    if (self->start != NULL) {
-        PyErr_SetString(PyExc_ValueError, "play was prepared before");
-        return NULL;
-    }
     if (!PyArg_ParseTuple(args, "O(y#y#y#)(y#y#y#)LLLnnOOOOOOOO", &start, &in.code, &in.code_size,
                           &in.constants, &in.constants_size, &in.results, &in.results_size,
                           &judge.code, &judge.code_size, &judge.constants, &judge.constants_size,
@@ -662,6 +665,7 @@ static PyObject *prepare_play(PyObject *object, PyObject *args) {
         !is_access(self, start)) {
         return NULL;
     }
+    drop_play(self);
     Py_INCREF(start);
     self->start = start;
     self->play.lowest_action = lowest;

@@ -17,6 +17,7 @@ from fmugym import Choice, ConfigError, ContractError, Normal, SimulationError, 
 from fmugym.pool import has_native_pool
 from fmugym.testing import check_hooks
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.batch import BatchEngine
 
 BACKENDS = ("python", "native") if has_native_pool() else ("python",)
 WAYS = [(backend, hooks) for backend in BACKENDS for hooks in ("array", "per_env")]
@@ -1188,6 +1189,48 @@ def test_parameters_that_the_config_does_not_name_or_draws(backend, hooks):
     )
     run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 20)
     vector.close()
+    theirs.close()
+
+
+CHANGES = {
+    "options": lambda vector: vector.reset(
+        options={
+            "model_parameters": {"m_pole": 0.3},
+            "reset_mask": np.array([True, False, False]),
+        }
+    ),
+    "parameters": lambda vector: vector.set_attr("m_pole", [0.05, 0.2, 0.3]),
+    "another parameter": lambda vector: vector.set_attr("theta_dot_0", [0.01, 0.02, 0.03]),
+    "an attribute": lambda vector: vector.set_attr("x_threshold", 0.05),
+}
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="hooks are compiled for the native pool")
+@pytest.mark.parametrize("change", CHANGES)
+def test_compiled_hooks_after_a_change(change, monkeypatch):
+    """Once the episodes from before have ended, steps are as fast as before."""
+    on_arrays = []
+    step = BatchEngine.step
+    monkeypatch.setattr(
+        BatchEngine, "step", lambda engine, *given: on_arrays.append(1) or step(engine, *given)
+    )
+    ours, theirs = (
+        FMUVectorEnv(CART_POLE, 3, hooks=hooks, max_episode_steps=12)
+        for hooks in ("compiled", "per_env")
+    )
+    run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 7)
+    assert not on_arrays
+    first, second = CHANGES[change](ours), CHANGES[change](theirs)
+    if first is not None:
+        require_equal(first[0], second[0])
+    for actions in sampled_actions(ours, 60):
+        already = len(on_arrays)
+        first, second = ours.step(actions), theirs.step(actions)
+        for ours_said, theirs_said in zip(first[:4], second[:4], strict=True):
+            require_equal(ours_said, theirs_said)
+        require_same_infos(first[4], second[4])
+    assert len(on_arrays) == already < 30
+    ours.close()
     theirs.close()
 
 

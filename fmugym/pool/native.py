@@ -392,9 +392,9 @@ class NativePool(Counted):
         draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
     ) -> Callable[..., tuple[int, int]]:
-        """Let whole steps of a vector environment be done here, hooks included; only once.
+        """Let whole steps of a vector environment be done here, hooks included.
 
-        The arrays are used as they are, from step to step.
+        What was prepared before is forgotten. The arrays are used as they are, from step to step.
 
         Args:
             variables: As for ``reset``.

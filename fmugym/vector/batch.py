@@ -95,30 +95,37 @@ class BatchEngine(Engine):
         self._streams = EpisodeStreams(num_envs, env._plan)
         self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
+        self._foreign = np.zeros(num_envs, np.bool_)
         batched(env, num_envs)
         env._values, env.inputs = self._pool.outputs, self._pool.inputs
         env.state = self._pool.outputs[: env._output_count]
         env._was_reset = True  # for the views of single environments
-        self.given: dict[str, npt.NDArray[Any]] = {}
+        self._given: dict[str, npt.NDArray[Any]] = {}
         self._make_parameters(env._plan)
+        self._note_foreign(slice(None), False)
 
     def _make_parameters(self, plan: EpisodePlan) -> None:
         self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
         names = [variable.name for variable in plan.model_variables]
         self._parameters = dict(zip(names, self._start_values, strict=True))
-        self._overridden = False
         self.env.parameters = MappingProxyType(self._parameters)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         env, before = self.env, self._parameters
-        self.given[name] = values
+        self._given[name] = values
         parameters = {**env._interface.parameters, name: values[0]}
         env._interface = replace(env._interface, parameters=parameters)
         env._plan = env._plan_episode({})
         self._make_parameters(env._plan)
         for known in before.keys() & self._parameters.keys():
             self._parameters[known][:] = before[known]
+        self._note_foreign(slice(None), True)
+
+    def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
+        """Keep whose rows of constants are those of another plan: of options, or of before."""
+        self._foreign[indices] = foreign
+        self._any_foreign = bool(self._foreign.any())
 
     # Episodes.
 
@@ -178,13 +185,13 @@ class BatchEngine(Engine):
             self._place(plan.drawn_names, drawn, indices)
         else:
             self._place_each(indices, plan)
-        if not default or self._overridden:
+        if not default or self._any_foreign:
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
-            self._overridden = True
+            self._note_foreign(indices, not default)
         self._place(plan.constant_variables, plan.constant_variables.values(), indices)
         constant = plan.constant_parameters.keys() - plan.told.keys()
-        given = {name: self.given[name][indices] for name in self.given if name in constant}
+        given = {name: self._given[name][indices] for name in self._given if name in constant}
         self._place(given, given.values(), indices)
         if default:
             return self._start_values

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -15,6 +16,7 @@ from fmugym.values import LateDict
 from fmugym.vector.batch import BatchEngine, StepResult
 from fmugym.vector.probe import sample_states
 from fmugym.vector.trace import Program, UntraceableError, evaluate, trace_hooks
+from fmugym.vector.views import light_copy
 
 __all__ = ["CompiledEngine", "find_programs"]
 
@@ -41,7 +43,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
         if not hasattr(env._open_pool("a vector environment"), "prepare_play"):
             raise UntraceableError("the pool is not the native one")
         programs = trace_hooks(env)
-        _require_same(env, programs)
+        _require_same(sample_states(env), programs)
     except Exception as reason:  # whatever numbers can do and symbols cannot
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
@@ -51,8 +53,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
     return programs
 
 
-def _require_same(env: FMUEnv, programs: tuple[Program, Program]) -> None:
-    batch = sample_states(env)
+def _require_same(batch: FMUEnv, programs: tuple[Program, Program]) -> None:
     with np.errstate(all="ignore"):
         inputs = np.array(evaluate(programs[0], batch))
         batch.inputs = inputs
@@ -70,8 +71,9 @@ def _require_same(env: FMUEnv, programs: tuple[Program, Program]) -> None:
 class CompiledEngine(BatchEngine):
     """A ``BatchEngine`` that leaves a step as a whole to the native pool.
 
-    Resets, and steps after parameters were set for single environments or overridden, go the way
-    of ``BatchEngine``, whose arrays are the same ones.
+    Resets go the way of ``BatchEngine``, whose arrays are the same ones; so do steps as long as
+    there is an episode whose parameters were overridden, or set since it began, and where hooks
+    cannot be compiled any more after their attributes were set.
 
     Args:
         env: The prototype, made with a native pool of N instances.
@@ -88,24 +90,52 @@ class CompiledEngine(BatchEngine):
         programs: tuple[Program, Program],
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
-        plan, streams = env._plan, self._streams
-        space: Any = env.action_space
-        self._outdated = False
         self._shape = num_envs, env._output_count
+        self._stream_version = -1
+        self._prepare(programs)
+
+    def _prepare(self, programs: tuple[Program, Program] | None) -> None:
+        """Hand over what steps consist of, as long as the pool can draw the episodes."""
+        plan, streams = self.env._plan, self._streams
+        self._programs = programs
+        self._prepared = False
+        if programs is None or plan.num_uniform is None or plan.num_uniform != streams.num_draws:
+            return
+        space: Any = self.env.action_space
         self._names = plan.drawn_names
         rows = [plan.parameter_names.index(name) for name in self._names]
-        self._drawn_shape = len(rows), num_envs
+        self._drawn_shape = len(rows), self._n
         pool: Any = self._pool
-        self._stream_version = -1
         self._play = pool.prepare_play(
             plan.model_variables,
             programs,
             (int(space.start), int(space.start + space.n - 1)),
             self._start_values,
             (streams.block, streams.used, *plan.limits, np.array(rows, np.int64)),
-            (env.step_count, self.ended, self._limit),
+            (self.env.step_count, self.ended, self._limit),
         )
         self._play_with_resets = pool.watched(self._play)
+        self._prepared = True
+
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """See ``Engine.set_parameter``."""
+        super().set_parameter(name, values)
+        self._prepare(self._programs)
+
+    def note_attributes(self) -> None:
+        """The programs have the former values in them."""
+        try:
+            programs = trace_hooks(self.env)
+            _require_same(self._copy_for_hooks(), programs)
+        except Exception as reason:  # as in find_programs
+            logger.debug("the hooks cannot be compiled any more: %s", reason)
+            programs = None
+        self._prepare(programs)
+
+    def _copy_for_hooks(self) -> FMUEnv:
+        batch = light_copy(self.env)
+        batch._in_hooks = True
+        return batch
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
@@ -120,9 +150,9 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
-        interpreted = self._outdated or self.given or self._overridden
-        if interpreted or self._streams.num_draws is None:
+        if self._any_foreign or not self._prepared:
             return super().step(actions, resetting)
+        self._longest = self._limit  # nobody follows it here
         observations = np.empty(self._shape, _FLOAT32)
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
@@ -137,20 +167,12 @@ class CompiledEngine(BatchEngine):
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         if resetting is not None:
-            told = LateDict.of(self._named, drawn, resetting)  # few ever look at them
+            told = LateDict.of(_told, self._names, drawn, resetting)  # few ever look at them
             infos = {"drawn": told, "_drawn": resetting}
         result: StepResult = _make_tuple(StepResult, (*arrays, infos))
         if troubled:
             self._mend(actions, result, resetting)
         return result
-
-    def _named(self, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-        named = dict(zip(self._names, np.where(mask, drawn, 0.0), strict=True))
-        return named | {f"_{name}": mask.copy() for name in named}
-
-    def note_attributes(self) -> None:
-        """The programs have the former values in them."""
-        self._outdated = True
 
     def _mend(self, actions: Any, result: StepResult, resetting: MaskArray | None) -> None:
         """Deal with FMUs that failed, or asked to stop: rare, and so left to numpy."""
@@ -165,3 +187,8 @@ class CompiledEngine(BatchEngine):
             result.rewards[stopped] = self._rewards(self.env._reward_policy())[stopped]
         self._take_faults(result, statuses)
         self.note_ends(result.terminated, result.truncated)
+
+
+def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    named = dict(zip(names, np.where(mask, drawn, 0.0), strict=True))
+    return named | {f"_{name}": mask.copy() for name in named}

@@ -277,6 +277,8 @@ def _require_simple(env: FMUEnv) -> None:
         raise UntraceableError("the observation is not the default one")
     if space.dtype != np.float32 or env._has_update or env._has_info or env._is_goal_task:
         raise UntraceableError("it has hooks that are not arithmetic")
+    if env._per_env_attributes:
+        raise UntraceableError("environments have attributes of their own")
     if not env._real_inputs or env.config.episode_variables:
         raise UntraceableError("it has episode variables, or inputs that are not Real")
 
