@@ -1192,6 +1192,59 @@ def test_parameters_that_the_config_does_not_name_or_draws(backend, hooks):
     theirs.close()
 
 
+class OwnStep(CART_POLE):
+    """Its hooks branch, and its ``step`` does more than the inherited one."""
+
+    def _is_done(self):
+        return True if abs(self.out["x"]) > 0.1 else super()._is_done()
+
+    def step(self, action):
+        *result, info = super().step(action)
+        return *result, info | {"force": self.inputs[0]}
+
+
+class Branching(CART_POLE):
+    def _is_done(self):
+        return True if abs(self.out["x"]) > 0.1 else super()._is_done()
+
+
+@pytest.mark.parametrize("cls", [OwnStep, Branching])
+@each_backend
+@each_mode
+def test_hooks_that_branch(cls, backend, mode):
+    assert require_pair_equal(cls, mode=mode, hooks="per_env", backend=backend) > 5
+
+
+@each_backend
+def test_fmus_step_together_whatever_the_hooks_are(backend, monkeypatch):
+    vector = FMUVectorEnv(Branching, 5, hooks="per_env", backend=backend)
+    vector.reset(seed=0)
+    calls, pool = [], type(vector.unwrapped._prototype._pool)
+    step = pool.step
+    monkeypatch.setattr(pool, "step", lambda *given: calls.append(1) or step(*given))
+    for actions in sampled_actions(vector, 30):
+        vector.step(actions)
+    assert len(calls) == 30
+    vector.close()
+
+
+@each_way
+def test_an_action_that_does_not_fit_changes_nothing(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    first = vector.reset(seed=0)[0]
+    with pytest.raises(ConfigError, match=r"action .*7.* is not in Discrete"):
+        vector.step(np.array([0, 1, 7]))
+    assert vector.get_attr("step_count") == (0, 0, 0)
+    assert vector.get_attr("action") == (0, 0, 0)
+    np.testing.assert_array_equal(np.array(vector.get_attr("state"), np.float32), first)
+    twin = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    twin.reset(seed=0)
+    for actions in sampled_actions(vector, 20):
+        require_equal(vector.step(actions)[0], twin.step(actions)[0])
+    vector.close()
+    twin.close()
+
+
 CHANGES = {
     "options": lambda vector: vector.reset(
         options={

@@ -26,7 +26,9 @@ AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
 
 
 class PerEnvEngine(Engine):
-    """Calls ``step`` and ``reset`` of light copies of a prototype, which share its pool.
+    """Calls the hooks of light copies of a prototype, which share its pool.
+
+    The FMUs step together all the same, on all threads, unless the class has a ``step`` of its own.
 
     Args:
         env: The prototype, made with a pool of N instances.
@@ -45,8 +47,9 @@ class PerEnvEngine(Engine):
         add_info: AddInfo,
     ) -> None:
         super().__init__(num_envs)
-        pool = env._open_pool("a vector environment")
+        self._pool = pool = env._open_pool("a vector environment")
         self.envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
+        self._together = type(env).step is FMUEnv.step
         self._limit = max_episode_steps
         self._action_space = action_space
         self._add_info = add_info
@@ -78,17 +81,35 @@ class PerEnvEngine(Engine):
         rewards = np.zeros(count)
         terminated, truncated = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         infos: dict[str, Any] = {}
-        for index, action in enumerate(self._actions(actions)):
+        items = self._actions(actions)
+        if self._together:
+            self._step_pool(items, resetting)
+        for index, action in enumerate(items):
+            env = self.envs[index]
             if resetting is not None and resetting[index]:
-                self._observations[index], info = self.envs[index].reset()
+                self._observations[index], info = env.reset()
             else:
-                result = self.envs[index].step(action)
+                result = _concluded(env) if self._together else env.step(action)
                 self._observations[index], rewards[index], terminated[index] = result[:3]
-                truncated[index] = result[3] or self._reached_limit(self.envs[index])
+                truncated[index] = result[3] or self._reached_limit(env)
                 info = result[4]
             infos = self._add_info(infos, info, index)
         self.note_ends(terminated, truncated)
         return StepResult(self._stacked(), rewards, terminated, truncated, infos)
+
+    def _step_pool(self, actions: list[Any], resetting: MaskArray | None) -> None:
+        """Step those FMUs whose episodes go on, once all of their actions are known to be good."""
+        taken: list[tuple[FMUEnv, tuple[Any, ...]]] = []
+        try:
+            for index, env in enumerate(self.envs):
+                if resetting is None or not resetting[index]:
+                    taken.append((env, _moment(env)))
+                    _take_action(env, actions[index])
+        except BaseException:
+            for env, moment in taken:
+                env.action, env.previous_action, env.previous_state, env.inputs = moment
+            raise
+        self._pool.step(None, resetting, self._pool.observations)
 
     def _actions(self, actions: Any) -> list[Any]:
         items = list(iterate(self._action_space, copy.deepcopy(actions)))  # hooks keep them
@@ -116,3 +137,31 @@ def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     single._step_pool = single._pool.step_own
     single._np_random = None
     return single
+
+
+def _moment(env: FMUEnv) -> tuple[Any, ...]:
+    """What taking an action changes."""
+    return env.action, env.previous_action, env.previous_state, env.inputs
+
+
+def _take_action(env: FMUEnv, action: Any) -> None:
+    """The part of ``FMUEnv.step`` before the FMU's step."""
+    env._in_hooks = True
+    try:
+        env._take_action(action)
+    finally:
+        env._in_hooks = False
+
+
+def _concluded(env: FMUEnv) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """The part of ``FMUEnv.step`` after the FMU's step."""
+    pool = env._open_pool("step")
+    env.step_count += 1
+    env._in_hooks = True
+    try:
+        result = env._evaluate(pool, pool.statuses.item(0))
+    finally:
+        env._in_hooks = False
+    if env.render_mode is not None:
+        env._note_for_picture(result[1])
+    return result
