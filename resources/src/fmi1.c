@@ -83,14 +83,14 @@ fmi1Component NAME(fmiInstantiateSlave)(fmi1String name, fmi1String guid, fmi1St
     }
     ((Component *)instance)->logger = functions.logger;
     if (!accepts(instance, __func__, guid)) {
-        free(instance);
+        instance_free(instance);
         return NULL;
     }
     return instance;
 }
 
 void NAME(fmiFreeSlaveInstance)(fmi1Component c) {
-    free(c);
+    instance_free(c);
 }
 
 /* Initialization, termination and reset */

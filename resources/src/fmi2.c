@@ -48,19 +48,19 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
         ((Component *)instance)->environment = functions->componentEnvironment;
     }
     if (!accepts(instance, __func__, guid)) {
-        free(instance);
+        instance_free(instance);
         return NULL;
     }
     if (type != fmi2CoSimulation) {
         report(instance, STATUS_ERROR, __func__, "the FMU is for co-simulation only");
-        free(instance);
+        instance_free(instance);
         return NULL;
     }
     return instance;
 }
 
 void fmi2FreeInstance(fmi2Component c) {
-    free(c);
+    instance_free(c);
 }
 
 /* Initialization, termination and reset */

@@ -42,7 +42,7 @@ static Instance *create(const char *function, fmi3String name, fmi3String token,
     ((Component *)instance)->logger = logger;
     ((Component *)instance)->environment = environment;
     if (!accepts(instance, function, token)) {
-        free(instance);
+        instance_free(instance);
         return NULL;
     }
     return instance;
@@ -52,7 +52,7 @@ static Instance *create(const char *function, fmi3String name, fmi3String token,
 static fmi3Instance refuse(Instance *instance, const char *function, const char *reason) {
     if (instance != NULL) {
         report(instance, STATUS_ERROR, function, "%s", reason);
-        free(instance);
+        instance_free(instance);
     }
     return NULL;
 }
@@ -93,7 +93,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
 }
 
 void fmi3FreeInstance(fmi3Instance c) {
-    free(c);
+    instance_free(c);
 }
 
 /* Initialization, termination and reset */

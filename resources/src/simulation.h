@@ -39,6 +39,7 @@ typedef struct {
 
 typedef struct {
     Simulation simulation;
+    void *memory; /* in which it lies */
     const char *name;
     uint32_t muted; /* log categories switched off: one bit per status */
 } Instance;
@@ -50,6 +51,7 @@ void emit_message(const Instance *instance, Status status, const char *category,
 
 /* Instances. instance_create allocates size bytes, which begin with an Instance. */
 Instance *instance_create(size_t size, const char *name);
+void instance_free(Instance *instance);
 bool accepts(const Instance *instance, const char *function, const char *token);
 Status reset(Instance *instance, const char *function);
 
