@@ -13,7 +13,6 @@
 #define _GNU_SOURCE
 #define LAPSE 100.0
 
-
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>

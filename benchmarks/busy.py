@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 import zipfile
 from pathlib import Path
 from typing import Any
 
-import c_limit
 import fmpy
+from c_limit import compile_c
 from gymnasium import spaces
-from measure import MissingError
 
 import fmugym
 
@@ -24,15 +22,10 @@ def build(folder: Path) -> Path:
     """Compile and pack the FMU.
 
     Raises:
-        MissingError: Without a compiler.
+        MissingError: See ``compile_c``.
     """
     library = folder / f"Busy{fmpy.sharedLibraryExtension}"
-    options = ["-shared", "-fPIC", "-O2", "-Wall", "-Wextra", "-o", str(library)]
-    source = str(Path(__file__).with_suffix(".c"))
-    try:
-        subprocess.run([*c_limit.compiler(), *options, source, "-lm"], check=True)
-    except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
-        raise MissingError("no C compiler") from error
+    compile_c(Path(__file__).with_suffix(".c"), library, "-shared", "-fPIC", "-lm")
     path = folder / "Busy.fmu"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", _model_description())

@@ -19,9 +19,11 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+from measure import MissingError
+
 import fmugym
 
-__all__ = ["Rates", "build", "compiler", "measure"]
+__all__ = ["Rates", "build", "compile_c", "measure"]
 
 SOURCE = Path(__file__).with_suffix(".c")
 TIME_STEP = 0.02
@@ -49,28 +51,39 @@ class Rates(NamedTuple):
     cpu: float
 
 
-def compiler() -> list[str]:
-    """The command of a C compiler.
+def compile_c(source: Path, target: Path, *options: str) -> None:
+    """Compile a C program, or a library.
 
     Raises:
-        RuntimeError: If there is none.
+        MissingError: Without a compiler, or if it refuses the program, as that of another system.
     """
+    command = [*_compiler(), "-O2", "-Wall", "-Wextra", "-o", str(target), str(source), *options]
+    try:
+        subprocess.run(command, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise MissingError("not compiled here") from error
+
+
+def _compiler() -> list[str]:
     for name in ("cc", "gcc", "clang"):
         if shutil.which(name):
             return [name]
     if importlib.util.find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "cc"]
-    raise RuntimeError("no C compiler was found; pip install ziglang")
+    raise MissingError("no C compiler")
 
 
 @functools.cache
 def build() -> tuple[Path, fmugym.FMU]:
-    """Compile the program once; the FMU is kept, as its folder goes with it."""
+    """Compile the program once; the FMU is kept, as its folder goes with it.
+
+    Raises:
+        MissingError: See ``compile_c``.
+    """
     folder = Path(tempfile.mkdtemp(prefix="c-limit-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     program = folder / "c_limit"
-    options = ["-O2", "-Wall", "-Wextra", "-o", str(program), str(SOURCE)]
-    subprocess.run([*compiler(), *options, "-lm", "-ldl", "-lpthread"], check=True)
+    compile_c(SOURCE, program, "-lm", "-ldl", "-lpthread")
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     fmu.extract()
     return program, fmu

@@ -76,8 +76,7 @@ def _run(stack: ExitStack, path: Path, mean: float, kind: str, threads: int) -> 
         watch, observations = Stopwatch(), None
         while watch.wall < seconds:
             watch.start()
-            for _ in range(max(1, int(1e-3 * 1e6 / mean / SIZE))):
-                observations = env.step(actions)[0]
+            observations = env.step(actions)[0]
             watch.stop()
         return watch.sample(1e-6 * float(np.sum(observations, dtype=np.float64)))
 

@@ -67,7 +67,9 @@ def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run
     threads = thread_counts()
     for count, text in threads.items():
         yield f"fmugym, {text}", lambda n=count: _fmugym(stack, size, threads=n)
-    yield 'fmugym, hooks="array"', lambda: _fmugym(stack, size, hooks="array")
+    *_, (most, text) = threads.items()
+    arrays = {"hooks": "array", "threads": most}
+    yield f'fmugym, hooks="array", {text}', lambda: _fmugym(stack, size, **arrays)
     yield "fmugym, Python pool", lambda: _fmugym(stack, size, backend="python")
     yield BASE, lambda: _gymnasium(stack, size, "vector_entry_point")
     yield "Gymnasium SyncVectorEnv", lambda: _gymnasium(stack, size, "sync")
