@@ -65,7 +65,7 @@ class Held(Oscillator):
 
 
 class RigEnv(FMI2CSEnv):
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
 
     def __init__(self, backend, render_mode=None, **config):
         config = {

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import types
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -479,8 +480,8 @@ class TestCells:
 class Published:
     """A client with the published methods only, and an arm that does as it is told."""
 
-    calls: list = []  # noqa: RUF012
-    answers: dict = {}  # noqa: RUF012
+    calls: ClassVar[list] = []
+    answers: ClassVar[dict] = {}
 
     def __init__(self):
         """The real one takes no arguments."""

@@ -273,7 +273,7 @@ class TestHealth:
         env = make_env()
         env.close()
         with pytest.raises(SimulationError, match="health was called on a closed"):
-            env.health  # noqa: B018
+            _ = env.health
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows is not asked for its memory")

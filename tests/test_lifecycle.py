@@ -238,7 +238,7 @@ TWELVE_DEGREES_IN_RAD = np.pi / 15
 class TutorialCartPoleEnv(FMI2CSEnv):
     """A subclass as ModelicaGym's tutorial has it, in our own words."""
 
-    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
 
     def __init__(
         self, m_cart, m_pole, theta_0, theta_dot_0, time_step, good, bad, force, log_level

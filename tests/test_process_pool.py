@@ -291,6 +291,17 @@ class TestPool:
         assert step(pool, skip=np.array([True, False]))[1].tolist() == [0, 0]
         assert step(pool)[1].tolist() == [4, 0]
 
+    def test_a_new_process_does_as_the_former_one(self, make_pool, faulty):
+        def rollout(pool):
+            set_up(pool, faulty, ["none"] * 3)
+            return [step(pool, 0.1 * index)[0].tobytes() for index in range(5)]
+
+        pool = make_pool(3)
+        before = rollout(pool)
+        set_up(pool, faulty, ["crash", "none", "abort"], at=1)
+        assert step(pool)[1].any()
+        assert rollout(pool) == before
+
     def test_snapshots_go_with_their_process(self, make_pool, faulty):
         pool = make_pool(2)
         set_up(pool, faulty, ["crash", "none"], at=2)
@@ -361,8 +372,9 @@ class TestPool:
         assert step(pool)[1].tolist() == [Status.OK]
 
     def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
-        start = lambda end, memory, folder: _SpawnedProcess(end, memory)  # noqa: E731
-        monkeypatch.setattr("fmugym.pool.supervisor.launch", start)
+        monkeypatch.setattr(
+            "fmugym.pool.supervisor.launch", lambda end, memory, _: _SpawnedProcess(end, memory)
+        )
         pool = make_pool()
         set_up(pool, faulty, ["crash"], at=2)
         assert step(pool)[0][0].tolist() == [0.5]
@@ -561,49 +573,6 @@ class TestEndOfParent:
         assert "the process that this one was forked from" in lines[0]
         assert lines[1:] == ["[1.]", "True", "[0.5]"]
         assert "Error" not in stderr
-
-
-class TestReproducibility:
-    """The same seed and actions give the same bits, wherever the FMU runs."""
-
-    WAYS = (
-        {"backend": "python"},
-        {"backend": "auto", "threads": 1},
-        {"backend": "auto", "threads": 2},
-        *({"isolation": "process", "workers": workers} for workers in (1, 2, 3)),
-        {"isolation": "process", "workers": 2, "backend": "python"},
-    )
-
-    @staticmethod
-    def rollout(env):
-        observations = [env.reset(seed=3)[0].tobytes()]
-        rng = np.random.default_rng(4)
-        for _ in range(60):  # long enough for random actions to let poles fall
-            result = env.step(rng.integers(0, 2, env.num_envs))
-            observations += [array.tobytes() for array in result[:4]]
-        return observations
-
-    @pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
-    def test_of_vector_environments(self, opened, version):
-        rollouts = []
-        for options in self.WAYS:
-            arguments = {"num_envs": 5, "fmi_version": version} | options
-            env = opened(gymnasium.make_vec("fmugym/CartPole-v0", **arguments))
-            rollouts += [self.rollout(env), self.rollout(env)]
-        assert all(rollout == rollouts[0] for rollout in rollouts)
-
-    def test_of_pools_on_both_sides_of_a_death(self, make_pool, faulty):
-        """A new process goes on as the former one would have."""
-
-        def rollout(pool):
-            set_up(pool, faulty, ["none"] * 3)
-            return [step(pool, 0.1 * index)[0].tobytes() for index in range(5)]
-
-        pool = make_pool(3)
-        before = rollout(pool)
-        set_up(pool, faulty, ["crash", "none", "abort"], at=1)
-        assert step(pool)[1].any()
-        assert rollout(pool) == before
 
 
 def test_the_bundled_fmus_run_in_processes(opened):

@@ -79,7 +79,7 @@ def test_render_modes_are_checked_and_render_without_one_warns():
 
 def test_a_class_with_modes_but_no_scene_says_so():
     class Sceneless(fmugym.FMUEnv):
-        metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+        metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
 
         def _is_done(self):
             return False

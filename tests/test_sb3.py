@@ -31,21 +31,22 @@ def test_without_sb3_the_import_names_the_extra():
 
 
 sb3 = pytest.importorskip("stable_baselines3", reason=WHY)
+# ruff: noqa: E402  (what follows needs SB3)
 
-import torch  # noqa: E402
-from PIL import Image  # noqa: E402
-from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
-from stable_baselines3.common.env_checker import check_env  # noqa: E402
-from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
-from stable_baselines3.common.monitor import Monitor  # noqa: E402
-from stable_baselines3.common.vec_env import (  # noqa: E402
+import torch
+from PIL import Image
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecMonitor,
     VecNormalize,
     is_vecenv_wrapped,
 )
 
-from fmugym.sb3 import FMUVecEnv, make_sb3_env  # noqa: E402
+from fmugym.sb3 import FMUVecEnv, make_sb3_env
 
 IDS = ["fmugym/CartPole-v0", "fmugym/Pendulum-v0", "fmugym/ModelicaCartPole-v0"]
 TWINS = {"fmugym/CartPole-v0": "CartPole-v1", "fmugym/Pendulum-v0": "Pendulum-v1"}
@@ -103,7 +104,7 @@ class OneByOne(CartPoleEnv):
 
     def _is_done(self):
         x, _, theta, _ = self.state
-        return True if abs(x) > 0.3 or abs(theta) > 0.1 else False  # noqa: SIM210
+        return bool(abs(x) > 0.3 or abs(theta) > 0.1)
 
 
 @pytest.fixture(scope="module", autouse=True)

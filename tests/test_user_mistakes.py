@@ -280,7 +280,7 @@ class TestOrder:
 
     def test_render_modes_without_a_scene(self, make_env):
         class Drawn(PlainEnv):
-            metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+            metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
 
         env = make_env(cls=Drawn, render_mode="rgb_array")
         env.reset()
