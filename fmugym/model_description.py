@@ -21,7 +21,7 @@ from fmpy.validation import validate_model_description
 from lxml import etree
 
 from fmugym.errors import ConfigError, FMULoadError, unknown_name
-from fmugym.safe_zip import ZIP_ERRORS, ArchiveLimits
+from fmugym.safe_zip import ZIP_ERRORS, ArchiveLimits, over_limit
 
 __all__ = ["Capabilities", "ModelDescription", "Variable", "read_model_description"]
 
@@ -39,17 +39,19 @@ _MARKUP_PER_VARIABLE = 25
 """Elements and attributes that a variable may have for each of the most variables."""
 
 _EXPERIMENT = ("startTime", "stopTime", "tolerance", "stepSize")
+_POSITIVE = {"tolerance", "stepSize", "fixedInternalStepSize"}
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """One scalar variable of the model description, in the terms of the FMI standard.
+    """One variable of the model description, in the terms of the FMI standard.
 
     ``type`` is the standard's own name (``Real``, ``Float64``, ``Int32``, ...); ``kind`` is one of
-    real, integer, boolean, enumeration, string, binary and clock. ``minimum`` and ``maximum`` are
-    infinite where neither the variable nor its declared type gives them. ``items`` are the names
-    and values of an enumeration.
+    real, integer, boolean, enumeration, string, binary and clock. ``start`` is the XML's text.
+    ``minimum`` and ``maximum`` are infinite, and ``nominal`` is None, where neither the variable
+    nor its declared type gives a value of use. ``items`` are the names and values of an
+    enumeration. ``shape`` is that of an array of FMI 3.0, () for a scalar.
     """
 
     name: str
@@ -220,10 +222,8 @@ def _read_xml(path: Path, limit: int) -> bytes:
         with zipfile.ZipFile(path) as archive:
             info = archive.getinfo("modelDescription.xml")
             if info.file_size > limit:
-                raise FMULoadError(
-                    f"{path.name}: modelDescription.xml has {info.file_size} bytes, the limit is "
-                    f"{limit}; if you trust it, raise max_xml_bytes of ArchiveLimits"
-                )
+                found = f"{path.name}: modelDescription.xml has {info.file_size} bytes"
+                raise over_limit(found, limit, "max_xml_bytes")
             xml = archive.read(info)
     except KeyError:
         raise FMULoadError(f"{path.name} is not an FMU: it has no modelDescription.xml") from None
@@ -238,10 +238,8 @@ def _check_markup(path: Path, xml: bytes, max_variables: int) -> None:
     """Each element or attribute takes a quarter of a kilobyte once parsed, however short it is."""
     count, limit = xml.count(b"<") + xml.count(b"="), _MARKUP_PER_VARIABLE * max_variables + 1000
     if count > limit:
-        raise FMULoadError(
-            f"{path.name}: modelDescription.xml has some {count} elements and attributes, the "
-            f"limit is {limit}; if you trust it, raise max_variables of ArchiveLimits"
-        )
+        found = f"{path.name}: modelDescription.xml has some {count} elements and attributes"
+        raise over_limit(found, limit, "max_variables")
 
 
 def _doctype_error(path: Path) -> FMULoadError:
@@ -257,12 +255,9 @@ def _check_root(path: Path, root: Any, limit: int) -> None:
             f"{path.name}: expected a model description of FMI 1.0, 2.0 or 3.0, "
             f"found <{root.tag} fmiVersion={version!r}>"
         )
-    count = len(root.find("ModelVariables")) if root.find("ModelVariables") is not None else 0
+    count = len(root.findall("ModelVariables/*"))
     if count > limit:
-        raise FMULoadError(
-            f"{path.name} has {count} variables, the limit is {limit}; if you trust it, raise "
-            "max_variables of ArchiveLimits"
-        )
+        raise over_limit(f"{path.name} has {count} variables", limit, "max_variables")
 
 
 def _parse_with_fmpy(xml: bytes) -> Any:
@@ -295,7 +290,7 @@ def _convert(source: Any, root: Any) -> ModelDescription:
         stop_time=_time(experiment, "stopTime"),
         tolerance=_time(experiment, "tolerance"),
         step_size=_time(experiment, "stepSize"),
-        fixed_internal_step_size=_optional_float(co_simulation.fixedInternalStepSize),
+        fixed_internal_step_size=_time(co_simulation, "fixedInternalStepSize"),
         capabilities=_capabilities(source, root),
         variables=variables,
         state_derivatives=_state_derivatives(source),
@@ -325,16 +320,14 @@ def _c_identifier(name: str | None) -> str:
     return name
 
 
-def _time(experiment: Any, attribute: str) -> float | None:
-    """A value of the default experiment; None also for one with which nothing can be simulated."""
-    value = None if experiment is None else _optional_float(getattr(experiment, attribute))
-    positive = attribute in {"stepSize", "tolerance"}
-    usable = value is not None and math.isfinite(value) and (value > 0 or not positive)
+def _time(source: Any, attribute: str) -> float | None:
+    """A time, or the tolerance; None also for one with which nothing can be simulated."""
+    text = getattr(source, attribute, None)
+    if text is None:
+        return None
+    value = float(text)
+    usable = math.isfinite(value) and (value > 0 or attribute not in _POSITIVE)
     return value if usable else None
-
-
-def _optional_float(text: Any) -> float | None:
-    return None if text is None else float(text)
 
 
 def _capabilities(source: Any, root: Any) -> Capabilities:
@@ -394,7 +387,7 @@ def _convert_variable(source: Any) -> Variable:
         unit=_inherited(source, "unit", str),
         minimum=_bound(source, "min", -math.inf),
         maximum=_bound(source, "max", math.inf),
-        nominal=_inherited(source, "nominal", float),
+        nominal=_nominal(source),
         description=source.description or "",
         items=_items(source),
         shape=tuple(source.shape or ()),
@@ -418,7 +411,12 @@ def _inherited(source: Any, attribute: str, convert: Callable[[str], Any]) -> An
 
 def _bound(source: Any, attribute: str, default: float) -> float:
     value = _inherited(source, attribute, float)
-    return default if value is None else float(value)
+    return default if value is None or math.isnan(value) else float(value)
+
+
+def _nominal(source: Any) -> float | None:
+    value = _inherited(source, "nominal", float)
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _items(source: Any) -> tuple[tuple[str, int], ...]:
@@ -427,15 +425,17 @@ def _items(source: Any) -> tuple[tuple[str, int], ...]:
 
 
 def _findings(source: Any) -> tuple[str, ...]:
-    return _unused_times(source.defaultExperiment) + _broken_rules(source)
+    experiment = _unused_times(source.defaultExperiment, _EXPERIMENT)
+    internal = _unused_times(source.coSimulation, ("fixedInternalStepSize",))
+    return experiment + internal + _broken_rules(source)
 
 
-def _unused_times(experiment: Any) -> tuple[str, ...]:
-    given = {name: getattr(experiment, name, None) for name in _EXPERIMENT}
+def _unused_times(source: Any, attributes: tuple[str, ...]) -> tuple[str, ...]:
+    given = {name: getattr(source, name, None) for name in attributes}
     return tuple(
-        f"{name} of the default experiment is {text}, which cannot be used"
+        f"{name} is {text}, which cannot be used"
         for name, text in given.items()
-        if text is not None and _time(experiment, name) is None
+        if text is not None and _time(source, name) is None
     )
 
 

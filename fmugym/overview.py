@@ -61,8 +61,8 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         "library": fmu.library,
         "runs_here": fmu.runs_here,
         "capabilities": asdict(description.capabilities),
-        "default_experiment": {name: _finite(getattr(description, name)) for name in _TIMES},
-        "fixed_internal_step_size": _finite(description.fixed_internal_step_size),
+        "default_experiment": {name: getattr(description, name) for name in _TIMES},
+        "fixed_internal_step_size": description.fixed_internal_step_size,
         "findings": list(description.findings),
         "variable_counts": dict(Counter(variable.causality for variable in variables)),
         "variables": [_row(v) for v in variables if _is_wanted(v, everything, pattern)],
@@ -98,7 +98,7 @@ def _row(variable: Variable) -> dict[str, Any]:
         "unit": variable.unit,
         "min": _finite(variable.minimum),
         "max": _finite(variable.maximum),
-        "nominal": _finite(variable.nominal),
+        "nominal": variable.nominal,
         "start": start_value(variable),
         "items": [{"name": name, "value": value} for name, value in variable.items],
         "description": variable.description,
@@ -107,9 +107,9 @@ def _row(variable: Variable) -> dict[str, Any]:
     }
 
 
-def _finite(number: float | None) -> float | None:
+def _finite(number: float) -> float | None:
     """JSON has no infinities."""
-    return number if number is not None and math.isfinite(number) else None
+    return number if math.isfinite(number) else None
 
 
 def start_value(variable: Variable) -> bool | int | float | str | None:
@@ -122,12 +122,12 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
     if text is None or variable.shape or variable.kind in {"string", "binary", "clock"}:
         return text
     if variable.kind == "boolean":
-        return {"true": True, "1": True, "false": False, "0": False}.get(str(text).lower(), text)
+        return {"true": True, "1": True, "false": False, "0": False}.get(text.lower(), text)
     try:
         number = float(text) if variable.kind == "real" else int(text)
-    except ValueError:
+        return number if math.isfinite(number) else text
+    except (ValueError, OverflowError):
         return text
-    return number if math.isfinite(number) else text
 
 
 def plain(text: object) -> str:

@@ -22,7 +22,7 @@ from typing import BinaryIO, Final
 
 from fmugym.errors import ConfigError, FMULoadError
 
-__all__ = ["ZIP_ERRORS", "ArchiveLimits", "checked_entries"]
+__all__ = ["ZIP_ERRORS", "ArchiveLimits", "checked_entries", "over_limit"]
 
 ZIP_ERRORS = (
     OSError,
@@ -55,7 +55,7 @@ class ArchiveLimits:
         max_ratio: Ratio of that size to the archive's own, beyond 16 MiB. Zeros reach 1000, the
             libraries and tables of FMUs 2 to 20.
         max_xml_bytes: Size of ``modelDescription.xml``.
-        max_variables: Number of variables; 100,000 take some five seconds to read.
+        max_variables: Number of variables; 100,000 take some four seconds to read.
 
     Raises:
         ConfigError: If a limit is not a positive integer.
@@ -87,9 +87,9 @@ def checked_entries(path: Path, limits: ArchiveLimits) -> tuple[str, ...]:
     Raises:
         FMULoadError: If it is no zip archive, too large, or not sound.
     """
-    if not path.is_file():
-        raise FMULoadError(f"there is no FMU at {path}")
     try:
+        if not path.is_file():
+            raise FMULoadError(f"there is no FMU at {path}")
         return _checked_files(path, limits)
     except ZIP_ERRORS as error:
         raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
@@ -109,7 +109,7 @@ def _checked_files(path: Path, limits: ArchiveLimits) -> tuple[str, ...]:
 
 
 class _BoundedReader(io.BufferedReader):
-    """Refuses to be read at once what a directory of an archive could not be.
+    """Refuses to read more at once than the directory of an archive may have.
 
     Python's zipfile reads the whole directory, of whatever size, before it can be asked for it.
     """
@@ -139,10 +139,20 @@ def _check_sizes(path: Path, entries: Sequence[zipfile.ZipInfo], limits: Archive
 def _check_limit(path: Path, what: str, value: int, limits: ArchiveLimits, name: str) -> None:
     limit = getattr(limits, name)
     if value > limit:
-        raise FMULoadError(
-            f"{path.name} {what.format(value)}, the limit is {limit}; if you trust it, raise "
-            f"{name} of ArchiveLimits"
-        )
+        raise over_limit(f"{path.name} {what.format(value)}", limit, name)
+
+
+def over_limit(found: str, limit: int, name: str) -> FMULoadError:
+    """Make the error for what is too large.
+
+    Args:
+        found: What is how large, with the name of the FMU.
+        limit: What would have been allowed.
+        name: The attribute of ``ArchiveLimits`` that says so.
+    """
+    return FMULoadError(
+        f"{found}, the limit is {limit}; if you trust it, raise {name} of ArchiveLimits"
+    )
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:

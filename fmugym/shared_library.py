@@ -135,7 +135,7 @@ class _Segment:
 
 def _check_elf(source: _Source, architecture: str) -> None:
     identity = source.read(0, 20)
-    machine, *_ = struct.unpack_from("<H", identity, 18)
+    (machine,) = struct.unpack_from("<H", identity, 18)
     name = _ELF_MACHINES.get(machine, f"ELF machine {machine}")
     source.require_machine([name], architecture)
     if identity[4:6] != b"\x02\x01":  # 32 bits, or the other byte order: no more is known of it
@@ -177,10 +177,14 @@ def _elf_strings(source: _Source, dynamic: list[tuple[int, int]]) -> bytes:
 
 def _elf_dependencies(library: Path) -> tuple[list[str], list[Path]]:
     """The libraries that a library needs, and the folders where it wants them looked for."""
+    size = library.stat().st_size
     with library.open("rb") as file:
-        source = _Source(file, library.stat().st_size, library.name)
-        dynamic = _elf_dynamic(source)
-        strings = _elf_strings(source, dynamic)
+        source = _Source(file, size, library.name)
+        try:
+            dynamic = _elf_dynamic(source)
+            strings = _elf_strings(source, dynamic)
+        except struct.error:  # one that comes with the FMU's own library, which has been checked
+            raise _cut_short(library.name, size) from None
 
     def texts(*tags: int) -> Iterator[str]:
         for tag, value in dynamic:
@@ -271,6 +275,9 @@ def missing_libraries(library: Path) -> list[str]:
 
     Returns:
         Their names; empty on systems other than Linux, where the loader's own message must do.
+
+    Raises:
+        FMULoadError: If a library that the FMU brings along is cut short.
     """
     if sys.platform != "linux":
         return []

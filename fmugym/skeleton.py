@@ -11,7 +11,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 from fmugym.archive import FMU
 from fmugym.errors import ConfigError
@@ -26,8 +26,6 @@ MOST_PARAMETERS: Final = 40
 MOST_LOCALS: Final = 8
 """Locals that stand in for outputs where the FMU has none."""
 
-_TODO: Final = "TODO"
-
 _PROGRAM: Final = '''\
 """An environment for the FMU {file}; what is marked with TODO is yours to decide.
 
@@ -39,7 +37,9 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-{imports}
+{import_}import fmugym
+from fmugym.testing import check_fmu_env
+
 FMU_PATH = {path}  # a relative path is relative to this file
 
 
@@ -70,17 +70,7 @@ if __name__ == "__main__":
     print("{name} keeps the contract of an environment.")
 '''
 
-_IMPORTS: Final = """\
-import fmugym
-from fmugym.testing import check_fmu_env
-"""
-
-_IMPORTS_WITH_SPACES: Final = """\
-from gymnasium import spaces
-
-import fmugym
-from fmugym.testing import check_fmu_env
-"""
+_IMPORT_WITHOUT_INPUT: Final = "from gymnasium import spaces\n\n"
 
 _HOOKS_WITHOUT_INPUT: Final = '''
     def _get_action_space(self) -> spaces.Space[Any]:
@@ -157,7 +147,7 @@ class Skeleton:
         """The Python file, ASCII."""
         return _PROGRAM.format(
             file=re.sub(r'["\\]', "_", plain(self._fmu.path.name)),
-            imports=_IMPORTS if self.inputs else _IMPORTS_WITH_SPACES,
+            import_="" if self.inputs else _IMPORT_WITHOUT_INPUT,
             path=_quoted(self._fmu.path.as_posix()),
             name=self.class_name,
             version=self._description.fmi_major_version,
@@ -177,7 +167,7 @@ class Skeleton:
     def _bounds(self) -> Iterator[str]:
         unbounded = [v for v in self.inputs if _needs_bounds(v)]
         if unbounded:
-            yield f"# {_TODO}: the FMU gives no limits of these; (low, high)."
+            yield "# TODO: the FMU gives no limits of these; (low, high)."
             yield from _listing("bounds", [_bounds_line(v) for v in unbounded], "{}")
 
     def _parameter_lines(self) -> Iterator[str]:
@@ -191,7 +181,7 @@ class Skeleton:
         step = self._description.step_size
         if step is None:
             step = self._description.fixed_internal_step_size or 0.01
-            yield f'"time_step": {step!r},  # s; {_TODO}: the FMU gives none'
+            yield f'"time_step": {step!r},  # s; TODO: the FMU gives none'
         else:
             yield f'"time_step": {step!r},  # s, the default of the FMU'
         yield f'"max_episode_steps": {self._episode_steps(step)},'
@@ -199,10 +189,8 @@ class Skeleton:
     def _episode_steps(self, step: float) -> int:
         """The steps of the FMU's default experiment, where it has one of sensible length."""
         stop = self._description.stop_time
-        if stop is None or not math.isfinite(stop):
-            return 200
-        steps = round((stop - self._description.start_time) / step)
-        return steps if 1 <= steps <= 100_000 else 200
+        steps = 0.0 if stop is None else (stop - self._description.start_time) / step
+        return round(steps) if 1 <= steps <= 100_000 else 200
 
 
 def _listing(key: str, lines: list[str], brackets: str = "[]") -> Iterator[str]:
@@ -231,7 +219,7 @@ def _bounds_line(variable: Variable) -> str:
         low = -reach if not math.isfinite(high) else min(high - reach, -reach)
     if not math.isfinite(high):
         high = max(low + reach, reach)
-    return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # {_TODO}"
+    return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # TODO"
 
 
 def _literal(variable: Variable) -> str:
@@ -254,6 +242,6 @@ def _quoted(text: str) -> str:
 
 
 def _comment(variable: Variable) -> str:
-    unit: Any = f"[{variable.unit}] " if variable.unit else ""
+    unit = f"[{variable.unit}] " if variable.unit else ""
     text = textwrap.shorten(plain(unit + variable.description), 60, placeholder=" ...")
     return f"  # {text}" if text else ""

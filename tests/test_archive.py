@@ -106,6 +106,9 @@ class TestBadArchives:
     def test_a_folder(self, tmp_path):
         refused(tmp_path, "there is no FMU at")
 
+    def test_a_name_that_no_file_can_have(self, tmp_path):
+        refused(tmp_path / ("long" * 100), "there is no FMU at|is not an FMU.*too long")
+
     @pytest.mark.parametrize("content", [b"", b"PK", b"not a zip archive" * 100])
     def test_not_a_zip(self, tmp_path, content):
         path = tmp_path / "some.fmu"

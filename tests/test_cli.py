@@ -87,7 +87,7 @@ class TestInfo:
         text = info(fmugym.bundled_fmu(model, fmi_version))
         assert text.startswith(f"{model} (FMI {fmi_version})\n")
         inputs = 2 if model == "DoublePendulum" else 1
-        for heading in (f"Inputs ({inputs})", "Outputs (", f"Parameters ({inputs}"):
+        for heading in (f"Inputs ({inputs})", "Outputs (", "Parameters ("):
             assert heading in text
         assert "Locals" not in text
         assert text.isascii()
@@ -159,9 +159,10 @@ class TestInfo:
             parameter("b", '<Integer start="x"/>'),
             parameter("c", '<Boolean start="true"/>'),
             parameter("d", '<String start="007"/>'),
+            parameter("e", f'<Integer start="{"9" * 400}"/>'),
         )
         starts = [v["start"] for v in facts(path)["variables"]]
-        assert starts == ["INF", "x", True, "007"]
+        assert starts == ["INF", "x", True, "007", "9" * 400]
 
 
 class TestSkeleton:
@@ -200,6 +201,13 @@ class TestSkeleton:
         assert "limits of input 'u'" in made.err
         assert "no step size" in made.err
         assert "does not run on this machine" in made.err
+
+    def test_numbers_of_no_use_get_placeholders_too(self, skeleton, make_fmu):
+        odd = variable("v", '<Real start="0" min="NaN" nominal="NaN"/>')
+        experiment = '/><DefaultExperiment stopTime="1e300" stepSize="1e-300"'
+        config = config_of(skeleton(make_fmu(odd, OUTPUT, flags=experiment)).out)
+        assert config["bounds"] == {"v": (-1.0, 1.0)}
+        assert (config["time_step"], config["max_episode_steps"]) == (1e-300, 200)
 
     def test_what_a_number_cannot_carry_is_left_out(self, skeleton, make_fmu):
         made = skeleton(

@@ -154,6 +154,12 @@ class TestTypes:
         assert (variable.minimum, variable.maximum) == (-1.0, 2.0)
         assert (variable.unit, variable.nominal) == ("rad", 0.5)
 
+    def test_limits_that_are_no_numbers_are_none(self, tmp_path):
+        edits = {'min="-9" max="9"': 'min="NaN" max="9" nominal="NaN"'}
+        variable = describe(probe_fmu(tmp_path, 2, edits)).variable("trim")
+        assert (variable.minimum, variable.maximum) == (-math.inf, 9.0)
+        assert variable.nominal is None
+
 
 class TestOtherFacts:
     @pytest.mark.parametrize("value", ["0", "-0.1", "NaN", "1e999"])
@@ -161,7 +167,14 @@ class TestOtherFacts:
         experiment = f'<DefaultExperiment stepSize="{value}"/><ModelVariables>'
         fmu = FMU(probe_fmu(tmp_path, 2, {"<ModelVariables>": experiment}))
         assert fmu.description.step_size is None
-        assert any("stepSize of the default experiment is" in f for f in fmu.description.findings)
+        assert f"stepSize is {value}, which cannot be used" in fmu.description.findings
+
+    @pytest.mark.parametrize("value", ["0", "-0.1", "NaN"])
+    def test_internal_step_sizes_that_no_one_can_use(self, tmp_path, value):
+        step = f'<CoSimulation fixedInternalStepSize="{value}"'
+        description = describe(probe_fmu(tmp_path, 3, {"<CoSimulation": step}))
+        assert description.fixed_internal_step_size is None
+        assert any(f.startswith("fixedInternalStepSize is") for f in description.findings)
 
     @pytest.mark.parametrize("value", ["low", "", "NaN", "1e999"])
     def test_start_values_that_are_no_numbers(self, tmp_path, value):

@@ -48,7 +48,7 @@ class Rich(Plain):
 
     def _is_done(self):
         x, _, phi, phi_dot = self.state
-        gone = (np.abs(x) >= 1.0) | np.logical_and(phi < -0.6, phi_dot <= 0.0)
+        gone = (np.abs(x) >= 1.0) | np.logical_and(phi < -0.6, np.float64(0.0) >= phi_dot)
         return gone | ~(phi <= 0.6) & np.logical_not(x == 0.25) & (x != 0.125)
 
     def _is_truncated(self):
@@ -58,7 +58,8 @@ class Rich(Plain):
         x, x_dot, phi, _ = self.state
         cost = np.sqrt(np.square(x) + x_dot * x_dot) + abs(self.inputs[0]) / 20.0
         bonus = np.where(self.done, -5.0, 1.0 - cost) + 0.1 * self.parameters["m_pole"]
-        return bonus - 0.01 * (self.out["theta"] - np.pi / 2) * self.time - phi * phi
+        weight = np.float64(0.01)
+        return bonus - weight * (self.out["theta"] - np.pi / 2) * self.time - phi * phi
 
 
 @needs_native
@@ -182,7 +183,12 @@ def test_other_reasons():
         def _get_info(self):
             return {"x": self.state[0]}
 
-    for env in (Observing(), Informing(), Plain(episode_variables={"target": 1.0})):
-        with pytest.raises(UntraceableError):
+    reasons = {
+        "the observation is not the default one": Observing(),
+        "its steps have an info": Informing(),
+        "it has episode variables": Plain(episode_variables={"target": 1.0}),
+    }
+    for reason, env in reasons.items():
+        with pytest.raises(UntraceableError, match=reason):
             trace_hooks(env)
         env.close()

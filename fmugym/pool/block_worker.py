@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.adapters import Status
 from fmugym.archive import FMU
 from fmugym.errors import FMUGymError
 from fmugym.model_description import ModelDescription, Variable
@@ -166,7 +167,7 @@ class BlockWorker:
     def _step_some(self) -> None:
         pool, block = self._pool, self._block
         pool.step(block.inputs, block.mask, pool.observations)
-        self._note(int(np.count_nonzero(pool.statuses > 1)))
+        self._note(int(np.count_nonzero(pool.statuses > Status.WARNING)))
 
     def _note(self, troubled: int) -> None:
         self._channel.require_open()  # else the outputs would be those of a step that is lost

@@ -15,7 +15,6 @@ try:
         warnings.simplefilter("ignore")
         import pygame
         import pygame.pkgdata  # imports the deprecated pkg_resources where it is installed
-        import pygame.surfarray
 finally:
     if _before is None:
         del os.environ[_GREETING]

@@ -91,7 +91,7 @@ class Renderer(Generic[FrameT]):
     def close(self) -> None:
         """Close the window, if this renderer is the last to use it; a second call does nothing.
 
-        Frames are not shown in a window any more; arrays are still made.
+        A window that was closed is not opened again; arrays are still made.
         """
         self._canvas = None
         if self._window is not None:

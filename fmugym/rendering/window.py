@@ -6,7 +6,7 @@ from weakref import WeakSet
 
 from fmugym.rendering._pygame import pygame
 
-_LOGGER = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 _KEYS = (pygame.KEYDOWN, pygame.KEYUP)
 
 
@@ -65,7 +65,7 @@ class Window:
         return surface
 
     def _dismiss(self) -> None:
-        _LOGGER.warning("The window was closed; the environment goes on without it.")
+        logger.warning("The window was closed; the environment goes on without it.")
         for share in tuple(Window._shares):
             share.close()
 

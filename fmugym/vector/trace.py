@@ -69,8 +69,8 @@ class Program:
 
     Attributes:
         code: Operation and three operands (registers, or indices of what is loaded), shape (n, 4).
-        constants: What the instructions of the operation ``constant`` refer to.
-        results: The registers of the results.
+        constants: What the instructions of the operation ``constant`` refer to, shape (c,).
+        results: The registers of the results, shape (r,).
     """
 
     code: npt.NDArray[np.uint16]
@@ -99,7 +99,7 @@ class Symbol:
         function = _UFUNCS.get(ufunc)
         if function is None or method != "__call__" or kwargs:
             raise UntraceableError(f"it uses numpy.{ufunc.__name__}")
-        return function(*inputs)
+        return function(*map(_symbol, inputs))  # a scalar of numpy would call this method again
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Symbol:
         if func is np.where and len(args) == 3 and not kwargs:
@@ -172,6 +172,8 @@ class Symbol:
 
 def _symbol(value: Any) -> Symbol:
     """A constant becomes a symbol; anything that is no plain number cannot be traced."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:  # numpy wraps scalars and symbols so
+        value = value.item()
     if isinstance(value, Symbol):
         return value
     if isinstance(value, bool | np.bool_):
@@ -262,25 +264,29 @@ def _traced(symbolic: FMUEnv) -> tuple[Program, Program]:
     done = _flag(symbolic._is_done())
     symbolic.done = done
     truncated = _flag(symbolic._is_truncated())
-    reward = _symbol(_plain(symbolic._reward_policy()))
+    reward = _symbol(symbolic._reward_policy())
     if set(symbolic.__dict__) != before:
         raise UntraceableError("a hook sets attributes")
     return _compile(inputs), _compile([done, truncated, reward])
 
 
 def _require_simple(env: FMUEnv) -> None:
-    cls = type(env)
     space = env.observation_space
-    if not isinstance(env.action_space, spaces.Discrete):
-        raise UntraceableError("the actions are no single integers")
-    if cls._get_observation is not FMUEnv._get_observation or not isinstance(space, spaces.Box):
-        raise UntraceableError("the observation is not the default one")
-    if space.dtype != np.float32 or env._has_update or env._has_info or env._is_goal_task:
-        raise UntraceableError("it has hooks that are not arithmetic")
-    if env._per_env_attributes:
-        raise UntraceableError("environments have attributes of their own")
-    if not env._real_inputs or env.config.episode_variables:
-        raise UntraceableError("it has episode variables, or inputs that are not Real")
+    own_observation = type(env)._get_observation is not FMUEnv._get_observation
+    is_flat = isinstance(space, spaces.Box) and space.dtype == np.float32
+    obstacles = {
+        "the actions are no single integers": not isinstance(env.action_space, spaces.Discrete),
+        "the observation is not the default one": own_observation or not is_flat,
+        "it has a hook _update": env._has_update,
+        "its steps have an info": env._has_info,
+        "it is a goal task": env._is_goal_task,
+        "environments have attributes of their own": env._per_env_attributes,
+        "it has episode variables": env.config.episode_variables,
+        "it has inputs that are not Real": not env._real_inputs,
+    }
+    for obstacle, is_there in obstacles.items():
+        if is_there:
+            raise UntraceableError(obstacle)
 
 
 def _symbolic(env: FMUEnv) -> FMUEnv:
@@ -316,20 +322,15 @@ class _Missing:
         raise UntraceableError("it looks at the step before")
 
 
-def _plain(value: Any) -> Any:
-    """Numpy wraps a symbol that went through it into an array of objects."""
-    return value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
-
-
 def _values(values: Any, count: int) -> list[Symbol]:
-    rows = list(values) if isinstance(values, list | tuple) else [_plain(values)]
+    rows = list(values) if isinstance(values, list | tuple) else [values]
     if len(rows) != count:
         raise UntraceableError("the number of inputs is not that of the config")
     return [_symbol(row) for row in rows]
 
 
 def _flag(value: Any) -> Symbol:
-    symbol = _symbol(_plain(value))
+    symbol = _symbol(value)
     if not symbol.is_bool:
         raise UntraceableError("a flag is no Boolean")
     return symbol
