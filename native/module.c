@@ -771,7 +771,7 @@ static PyObject *play_turn(PyPool *self, const Py_buffer *buffers) {
     };
     size_t ended = 0;
 
-    if (play_find_bad_action(&turn) >= 0) {
+    if (play_has_bad_action(&turn)) {
         PyErr_SetString(PyExc_ValueError, "an action is out of range");
         return NULL;
     }

@@ -4,28 +4,19 @@
 
 enum { DONE, TRUNCATED, REWARD };
 
-WIDE static bool has_bad_action(const int64_t *actions, size_t count, int64_t lowest,
+WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t lowest,
                                 int64_t highest) {
-    int64_t bad = 0;
+    int64_t outside = 0; /* as wide as the values, for the compiler's sake */
 
     for (size_t i = 0; i < count; i++) {
-        bad |= (actions[i] < lowest) | (actions[i] > highest);
+        outside |= (values[i] < lowest) | (values[i] > highest);
     }
-    return bad != 0;
+    return outside != 0;
 }
 
-ptrdiff_t play_find_bad_action(const Turn *turn) {
+bool play_has_bad_action(const Turn *turn) {
     const Play *play = turn->play;
-
-    if (!has_bad_action(turn->actions, play->count, play->lowest_action, play->highest_action)) {
-        return -1;
-    }
-    for (size_t i = 0; i < play->count; i++) {
-        if (turn->actions[i] < play->lowest_action || turn->actions[i] > play->highest_action) {
-            return (ptrdiff_t)i;
-        }
-    }
-    return -1;
+    return is_any_outside(turn->actions, play->count, play->lowest_action, play->highest_action);
 }
 
 static double *fractions_of(const Draws *d, size_t index) {

@@ -53,8 +53,8 @@ typedef struct {
     double *drawn; /* a row for each draw, of which only what is drawn now is written */
 } Turn;
 
-/* The first environment whose action is out of range, or -1. */
-ptrdiff_t play_find_bad_action(const Turn *turn);
+/* Whether an action is out of range. */
+bool play_has_bad_action(const Turn *turn);
 
 /* Scratch memory of one thread. */
 typedef struct {

@@ -929,13 +929,13 @@ static void line_up(const Task *task, size_t begin, size_t count, bool together,
     line->others = others;
 }
 
-/* Asks for the memory that a reset will read: many places, far from each other. */
+/* Asks for the memory that a reset will read, if there is one: many places, far from each other. */
 static void foresee_reset(const Task *task, size_t index) {
     const Call *call = task->call;
     const Matrix *values = &call->start_values;
     const char *place = values->data + (ptrdiff_t)index * values->column_stride;
 
-    if (task->operation == STEP) {
+    if (task->operation == STEP || !is_in(call->mask, index)) {
         return;
     }
     for (size_t i = 0; i < call->start->count; i++, place += values->row_stride) {
