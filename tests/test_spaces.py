@@ -61,9 +61,7 @@ class TestActionSpace:
             ("a", 'min="-1" max="1"', 'min="NaN" max="1"', "'a' has no min and max in the FMU"),
         ],
     )
-    def test_limits_of_the_fmu_that_are_of_no_use(
-        self, make_env, tmp_path, name, old, new, match
-    ):
+    def test_limits_of_the_fmu_that_are_of_no_use(self, make_env, tmp_path, name, old, new, match):
         path = probe_fmu(tmp_path, 2, {old: new})
         with pytest.raises(ConfigError, match=f"{match}.*give (it )?'bounds'"):
             make_env(path=path, model_input_names=name)
