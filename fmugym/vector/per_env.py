@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, FMUGymError
 from fmugym.pool import Pool
 from fmugym.pool.base import MaskArray
 from fmugym.values import EpisodeVariables
@@ -69,8 +69,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.reset``."""
         infos: dict[str, Any] = {}
         for index in np.flatnonzero(mask).tolist():
-            observation, info = self.envs[index].reset(seed=seeds[index], options=dict(options))
-            self._observations[index] = observation
+            self._observations[index], info = self._reset(index, seeds[index], options)
             infos = self._add_info(infos, info, index)
         self.note_starts(mask)
         return self._stacked(), infos
@@ -85,17 +84,31 @@ class PerEnvEngine(Engine):
         if self._together:
             self._step_pool(items, resetting)
         for index, action in enumerate(items):
-            env = self.envs[index]
             if resetting is not None and resetting[index]:
-                self._observations[index], info = env.reset()
+                self._observations[index], info = self._reset(index, None, {})
             else:
-                result = _concluded(env) if self._together else env.step(action)
+                result = self._stepped(index, action)
                 self._observations[index], rewards[index], terminated[index] = result[:3]
-                truncated[index] = result[3] or self._reached_limit(env)
+                truncated[index] = result[3] or self._reached_limit(self.envs[index])
                 info = result[4]
             infos = self._add_info(infos, info, index)
         self.note_ends(terminated, truncated)
         return StepResult(self._stacked(), rewards, terminated, truncated, infos)
+
+    def _reset(
+        self, index: int, seed: int | None, options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        try:
+            return self.envs[index].reset(seed=seed, options=dict(options))
+        except FMUGymError as error:
+            raise _located(error, index) from error
+
+    def _stepped(self, index: int, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        env = self.envs[index]
+        try:
+            return _concluded(env) if self._together else env.step(action)
+        except FMUGymError as error:
+            raise _located(error, index) from error
 
     def _step_pool(self, actions: list[Any], resetting: MaskArray | None) -> None:
         """Step those FMUs whose episodes go on, once all of their actions are known to be good."""
@@ -105,9 +118,11 @@ class PerEnvEngine(Engine):
                 if resetting is None or not resetting[index]:
                     taken.append((env, _moment(env)))
                     _take_action(env, actions[index])
-        except BaseException:
+        except BaseException as error:
             for env, moment in taken:
                 env.action, env.previous_action, env.previous_state, env.inputs = moment
+            if isinstance(error, FMUGymError):
+                raise _located(error, index) from error
             raise
         self._pool.step(None, resetting, self._pool.observations)
 
@@ -137,6 +152,10 @@ def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     single._step_pool = single._pool.step_own
     single._np_random = None
     return single
+
+
+def _located(error: FMUGymError, index: int) -> FMUGymError:
+    return type(error)(f"environment {index}: {error}")
 
 
 def _moment(env: FMUEnv) -> tuple[Any, ...]:
