@@ -123,7 +123,7 @@ class CompiledEngine(BatchEngine):
         self._prepare(self._programs)
 
     def note_attributes(self) -> None:
-        """The programs have the former values in them."""
+        """Compile the hooks anew, as the programs have the former values in them, or give it up."""
         try:
             programs = trace_hooks(self.env)
             _require_same(self._copy_for_hooks(), programs)
