@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import fmugym
-from fmugym.cli import main
 from fmugym.config import EnvConfig
+from fmugym.tools.cli import main
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted((ROOT / "docs").glob("*.md")) + sorted(ROOT.glob("README.md"))
