@@ -16,7 +16,8 @@ from measure import Effort, Run, Sample, by_turns, cpu_rate, make_runs, ratio, r
 from tables import Table, duration, rate, times
 
 import fmugym
-from fmugym.pool import PoolSpec, make_pool
+from fmugym.pool import PoolSpec
+from fmugym.trial.opening import make_pool
 
 __all__ = ["tables"]
 

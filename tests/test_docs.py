@@ -14,8 +14,9 @@ import pytest
 
 import fmugym
 import fmugym.lab
-from fmugym.cli import main
 from fmugym.config import EnvConfig
+from fmugym.tools.cli import main
+from fmugym.trial.opening import make_pool
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -179,7 +180,7 @@ def test_table_of_health_is_what_is_counted():
 def test_table_of_vector_arguments_has_every_argument():
     documented = set(rows_of(CONFIG, "Vector environments"))
     own = inspect.signature(fmugym.FMUVectorEnv).parameters
-    pool = inspect.signature(fmugym.pool.make_pool).parameters
+    pool = inspect.signature(make_pool).parameters
     pool_options = {name for name, p in pool.items() if p.kind is p.KEYWORD_ONLY} | {"backend"}
     assert documented == set(own) - {"make_env", "pool_options"} | pool_options
 

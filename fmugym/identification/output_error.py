@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive import FMU
+from fmugym.archive.fmu import FMU
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
 from fmugym.identification.problem import Experiment, Limits, Problem
@@ -165,7 +165,7 @@ def fit_parameters(
             Cluster-Robust Inference", Journal of Human Resources 50 (2015).
         drop_repeats: Leave out stale samples first; see ``Trajectory.without_repeats``.
         max_evaluations: Limit of the optimization's steps.
-        backend: See ``fmugym.pool.make_pool``.
+        backend: See ``fmugym.trial.opening.make_pool``.
 
     Returns:
         Values, standard errors, and the comparison of measurement and simulation.

@@ -15,13 +15,13 @@ A program written for the lab runs here after one import was changed::
 ``Lab(clock=ManualClock())`` has a time that moves by hand.
 """
 
-from fmugym.clock import Clock, ManualClock, RealClock
 from fmugym.lab.client import Client
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
 from fmugym.lab.errors import LabError
 from fmugym.lab.lab import Lab, current_lab
 from fmugym.lab.presets import HARDWARE, IDEAL, Options
 from fmugym.lab.users import User
+from fmugym.pool.backend.clock import Clock, ManualClock, RealClock
 
 __all__ = [
     "HARDWARE",

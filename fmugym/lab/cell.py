@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.archive import FMU
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.archive.fmu import FMU
 from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance
 from fmugym.lab.drive import Drive
@@ -21,7 +21,8 @@ from fmugym.lab.experiments import EXPERIMENTS, PLANTS
 from fmugym.lab.presets import Options
 from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
-from fmugym.pool import Pool, PoolSpec, make_pool
+from fmugym.pool import Pool, PoolSpec
+from fmugym.trial.opening import make_pool
 
 __all__ = ["Cell", "Fault"]
 

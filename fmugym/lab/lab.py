@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.clock import Clock, RealClock
 from fmugym.errors import unknown_name
 from fmugym.lab.bookings import Bookings, new_token
 from fmugym.lab.cell import Cell
@@ -35,6 +34,7 @@ from fmugym.lab.recording import Recording, check_can_record, write_video
 from fmugym.lab.requests import Request, check_range, entries_of, gains_of
 from fmugym.lab.sessions import Gym, Session
 from fmugym.lab.users import Account, User
+from fmugym.pool.backend.clock import Clock, RealClock
 
 if TYPE_CHECKING:
     from fmugym.lab.client import Client

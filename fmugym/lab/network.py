@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.clock import Clock
 from fmugym.lab.presets import Options
+from fmugym.pool.backend.clock import Clock
 
 __all__ = ["Network"]
 
