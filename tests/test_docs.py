@@ -1,4 +1,4 @@
-"""What the documents say: their Python runs, and what they quote is what the package has."""
+"""The documents: their Python runs, and their tables and quotations agree with the package."""
 
 import ast
 import dataclasses
@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,14 @@ def test_the_readme_is_short():
 def test_the_index_names_every_page():
     listed = set(re.findall(r"\]\(([\w-]+\.md)", INDEX.read_text()))
     assert {path.name for path in DOCS.glob("*.md")} - {INDEX.name} == listed
+
+
+def test_the_index_lists_every_extra():
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    table = section(INDEX, "Install")
+    names = re.findall(r"`([\w-]+)`", " ".join(re.findall(r"^\| (`.+?) \|", table, re.M)))
+    assert set(names) == set(extras)
 
 
 def test_contributors_are_told_of_every_folder_of_the_package():
