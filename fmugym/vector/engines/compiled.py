@@ -15,7 +15,8 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.values import LateDict
 from fmugym.vector.engines.batch import BatchEngine, StepResult
 from fmugym.vector.hooks.check import sample_states
-from fmugym.vector.hooks.trace import Program, UntraceableError, evaluate, trace_hooks
+from fmugym.vector.hooks.program import Program, UntraceableError, evaluate
+from fmugym.vector.hooks.trace import trace_hooks
 from fmugym.vector.views import light_copy
 
 __all__ = ["CompiledEngine", "find_programs"]
