@@ -57,6 +57,7 @@ class Pool:
         private_libraries: bool,
         logging: bool,
         can_save: bool,
+        reset_method: int,
         start_time: float,
         stop_time: float | None,
         tolerance: float | None,

@@ -16,6 +16,7 @@ from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
+    ResetMethod,
 )
 
 __all__ = ["EnvConfig"]
@@ -39,7 +40,7 @@ class EnvConfig:
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         start_time: First communication point; by default the FMU's own default start time.
         stop_time: Given to the FMU where it is not None; the episode is truncated there.
-        tolerance: For the FMU's solver; by default the FMU's own.
+        tolerance: For the FMU's solver; by default that of the FMU's default experiment.
         substeps: Communication steps within one ``step``.
         warm_up: Time simulated at each reset before the first observation, a multiple of
             ``time_step``, with the inputs at their start values.
@@ -53,6 +54,8 @@ class EnvConfig:
         fault_reward: Reward of a step that failed.
         leak_limit: Bytes of memory that resets may take for good before the FMU's instances are
             freed and made anew; None for ever.
+        reset_method: How episodes begin: ``"restore"``, ``"reset"``, ``"instance"``, ``"library"``
+            or ``"process"``; by default the fastest one that a trial has found to be right.
         archive_limits: What is too large to be opened; by default ``ArchiveLimits()``.
         preload: Shared libraries to be loaded before the FMU's; a relative path is relative to the
             class's file.
@@ -83,6 +86,7 @@ class EnvConfig:
     fault_retries: int = 0
     fault_reward: float = 0.0
     leak_limit: int | None = DEFAULT_LEAK_LIMIT
+    reset_method: str | None = None
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
@@ -126,6 +130,8 @@ class EnvConfig:
             _check_value(f"episode variable {name!r}", value)
         if self.on_fault not in ON_FAULT:
             raise unknown_name("on_fault policy", self.on_fault, ON_FAULT)
+        if self.reset_method not in (None, *ResetMethod):
+            raise unknown_name("reset method", self.reset_method, list(ResetMethod))
         if self.isolation not in (None, *ISOLATIONS):
             raise unknown_name("isolation", self.isolation, ISOLATIONS)
 

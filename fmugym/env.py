@@ -166,6 +166,11 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._pool_tells = bool(self._pool.info())
         self._has_info = self._has_info or self._pool_tells
 
+    @property
+    def reset_method(self) -> str:
+        """How episodes begin; see ``EnvConfig``."""
+        return str(self._open_pool("reset_method").reset_method)
+
     def _checked_render_mode(self, mode: str | None) -> str | None:
         if mode is not None and mode not in self.metadata["render_modes"]:
             raise unknown_name("render mode", mode, self.metadata["render_modes"])
@@ -185,6 +190,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         options: dict[str, Any] = {
             "isolation": self.config.isolation if isolation is None else isolation,
             "call_timeout": self.config.call_timeout,
+            "reset_method": self.config.reset_method,
+            "starts": self._plan.starts(),
             **requested,
         }
         if backend is not None:

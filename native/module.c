@@ -159,15 +159,16 @@ typedef struct {
     PyObject *paths, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
-    int version, private_libraries, logging, can_save;
+    int version, private_libraries, logging, can_save, reset_method;
     long long substeps, warm_up_steps, retries;
 } Arguments;
 
 static bool parse(PyPool *self, PyObject *args, Arguments *a) {
     Settings *s = &self->pool.settings;
     return PyArg_ParseTuple(
-        args, "iyyyO!pppdOOdLLLO!O!O!nnnOOOOOO", &a->version, &s->model, &s->token, &s->resources,
+        args, "iyyyO!pppidOOdLLLO!O!O!nnnOOOOOO", &a->version, &s->model, &s->token, &s->resources,
         &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging, &a->can_save,
+        &a->reset_method,
         &s->experiment.start_time, &a->stop_time, &a->tolerance, &s->time_step, &a->substeps,
         &a->warm_up_steps, &a->retries, &PyTuple_Type, &a->strings, access_type, &a->inputs, access_type,
         &a->outputs, &a->num_observed, &a->count, &a->threads, &self->arrays[INPUTS],
@@ -178,7 +179,8 @@ static bool parse(PyPool *self, PyObject *args, Arguments *a) {
 static bool check_numbers(const Arguments *a) {
     const bool sound = a->count >= 1 && a->count <= INT32_MAX && a->threads >= 1 &&
                        a->substeps >= 1 && a->warm_up_steps >= 0 && a->num_observed >= 0 &&
-                       a->retries >= 0 && a->retries < 31 && (a->retries == 0 || a->can_save) &&
+                       a->retries >= 0 && a->retries < 31 && a->reset_method >= 0 &&
+                       a->reset_method < RESET_METHODS && (a->retries == 0 || a->can_save) &&
                        (size_t)a->num_observed <= a->outputs->access.count;
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a number is out of range");
@@ -254,6 +256,9 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;
     s->can_save = a->can_save && s->fmi != NULL && s->fmi->get_state != NULL;
+    s->reset_method = s->can_save || a->reset_method != RESET_BY_RESTORE
+                          ? (ResetMethod)a->reset_method
+                          : RESET_BY_RESET;
     s->substeps = a->substeps;
     s->warm_up_steps = a->warm_up_steps;
     s->retries = s->can_save ? a->retries : 0;
@@ -952,7 +957,8 @@ static PyObject *uses_states(PyObject *object, PyObject *unused) {
     PyPool *self = (PyPool *)object;
     (void)unused;
     return PyBool_FromLong(self->pool.settings.can_save &&
-                           !atomic_get(&self->pool.trial.refuted));
+                           self->pool.settings.reset_method == RESET_BY_RESTORE &&
+                               !atomic_get(&self->pool.states_too_large));
 }
 
 /* The memory of the echo, which is the process's. */

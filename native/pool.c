@@ -17,8 +17,6 @@ static const double LARGEST_CHUNK = 50e3; /* ns */
 static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states of one pool */
 
 enum {
-    TRIALS = 5,
-    REHEARSED = 3, /* steps */
     STACK_VALUES = 512,
     RUN = PROGRAM_WIDTH, /* instances of a run */
     MANY = 64,         /* instances from which on every call is measured */
@@ -195,12 +193,11 @@ static void reload_private_library(Pool *pool, Instance *me) {
     }
 }
 
-static Status replace(Pool *pool, Instance *me) {
+static Status rebuild(Pool *pool, Instance *me) {
     const bool was_dead = me->phase == PHASE_DEAD;
 
-    health_of(pool, me)[REPLACEMENTS]++;
     discard(pool, me);
-    if (was_dead) {
+    if (was_dead || pool->settings.reset_method >= RESET_BY_LIBRARY) {
         reload_private_library(pool, me);
     }
     if (me->library->functions != NULL && build(pool, me)) {
@@ -213,14 +210,9 @@ static Status replace(Pool *pool, Instance *me) {
     return STATUS_FATAL;
 }
 
-/* Memory that an instance has leaked may go with it. */
-static Status recycle(Pool *pool, Instance *me) {
-    me->due = false;
-    if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
-        return STATUS_OK;
-    }
-    health_of(pool, me)[RECYCLINGS]++;
-    return replace(pool, me);
+static Status replace(Pool *pool, Instance *me) {
+    health_of(pool, me)[REPLACEMENTS]++;
+    return rebuild(pool, me);
 }
 
 /* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
@@ -503,17 +495,8 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
  * restored from then on. */
 
 static bool states_are_of_use(Pool *pool, const Instance *me) {
-    return pool->settings.can_save && !me->unsavable && !atomic_get(&pool->trial.refuted);
-}
-
-static void give_states_up(Pool *pool) {
-    atomic_set(&pool->trial.refuted, 1);
-}
-
-static bool owns_trial(Pool *pool, const Instance *me) {
-    const uint64_t mine = index_of(pool, me) + 1;
-    uint64_t owner = atomic_get(&pool->trial.owner);
-    return owner == mine || (owner == 0 && atomic_replace(&pool->trial.owner, &owner, mine));
+    return pool->settings.reset_method == RESET_BY_RESTORE && pool->settings.can_save &&
+           !me->unsavable && !atomic_get(&pool->states_too_large);
 }
 
 static Status save_state(Pool *pool, Instance *me, void **state) {
@@ -541,68 +524,12 @@ static bool too_large(Pool *pool, Instance *me) {
     return size > STATES_LIMIT / s->count;
 }
 
-/* Steps with inputs; returns whether that went well. */
-static bool try_steps(Pool *pool, Instance *me, const double *inputs, double *outputs,
-                      void *typed) {
-    const Access *access = pool->settings.outputs;
-    const int64_t before = me->steps;
-
-    atomic_set(&pool->log.muted, index_of(pool, me) + 1); /* nobody has asked for these steps */
-    bool well = access_set(pool->settings.inputs, me->library, me->component, inputs, typed) <=
-                STATUS_WARNING;
-
-    for (size_t i = 0; i < REHEARSED && well; i++, outputs += access->count) {
-        well = advance(pool, me) <= STATUS_WARNING &&
-               access_get(access, me->library, me->component, outputs, typed) <= STATUS_WARNING;
-    }
-    atomic_set(&pool->log.muted, 0);
-    me->steps = before;
-    return well;
-}
-
-/* Steps twice from the kept state, with the inputs that were written last: an FMU may have left a part
- * of its state out. */
-static bool rehearse(Pool *pool, Instance *me, const Matrix *inputs, void *typed) {
-    const size_t width = pool->settings.inputs->count;
-    const size_t size = REHEARSED * pool->settings.outputs->count;
-    double *memory = malloc((width + 2 * size + 1) * sizeof *memory);
-    bool well = memory != NULL;
-
-    if (well) {
-        gather(inputs, index_of(pool, me), width, memory);
-        well = all_finite(memory, width);
-    }
-    for (size_t i = 0; i < 2 && well; i++) {
-        well = try_steps(pool, me, memory, memory + width + i * size, typed) &&
-               restore_state(pool, me, me->saved) <= STATUS_WARNING;
-    }
-    well = well && memcmp(memory + width, memory + width + size, size * sizeof *memory) == 0;
-    free(memory);
-    return well;
-}
-
-static Status keep_state(Pool *pool, Instance *me, uint64_t initialization, const Matrix *inputs,
-                         void *typed) {
-    const Status status = save_state(pool, me, &me->saved);
-
-    if (status > STATUS_WARNING) {
+static void keep_state(Pool *pool, Instance *me) {
+    if (save_state(pool, me, &me->saved) > STATUS_WARNING) {
         me->unsavable = true;
-        return status;
+    } else if (too_large(pool, me)) {
+        atomic_set(&pool->states_too_large, 1);
     }
-    if (!owns_trial(pool, me)) {
-        return STATUS_OK;
-    }
-    pool->trial.initialization = initialization;
-    if (too_large(pool, me)) {
-        give_states_up(pool);
-    } else if (!pool->trial.rehearsed && !rehearse(pool, me, inputs, typed)) {
-        give_states_up(pool);
-        drop_failure(me);
-        free_state(pool, me, &me->saved);
-        return judge(me, STATUS_ERROR); /* to be initialized anew */
-    }
-    pool->trial.rehearsed = true;
-    return STATUS_OK;
 }
 
 static double *start_values_of(const Pool *pool, const Instance *me) {
@@ -618,8 +545,6 @@ static bool starts_as_before(const Pool *pool, const Instance *me, const Access 
 static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
                          Scratch scratch) {
     const Access *start = call->start;
-    const uint64_t began = again ? clock_now() : 0;
-
     free_state(pool, me, &me->saved);
     const Status status = initialize(pool, me, start, scratch);
     if (status > STATUS_WARNING) {
@@ -628,32 +553,10 @@ static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
     again = again && me->start_id == start->id; /* it may have been replaced */
     me->start_id = start->id;
     memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
-    if (!again || !states_are_of_use(pool, me)) {
-        return STATUS_OK;
-    }
-    if (keep_state(pool, me, clock_now() - began, &call->inputs, scratch.typed) <= STATUS_WARNING) {
-        return STATUS_OK;
+    if (again && states_are_of_use(pool, me)) {
+        keep_state(pool, me);
     }
     return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
-}
-
-/* Compares a restored instance with the initialized one; returns whether it may go on so. */
-static bool passes_trial(Pool *pool, Instance *me, uint64_t restoration, Scratch scratch) {
-    Trial *trial = &pool->trial;
-    const size_t size = pool->settings.outputs->count * sizeof(double);
-
-    copy_outputs(pool, me, scratch.values);
-    if (memcmp(scratch.values, trial->outputs, size) != 0) {
-        give_states_up(pool);
-        return false;
-    }
-    if (trial->trials == 0 || restoration < trial->restoration) {
-        trial->restoration = restoration;
-    }
-    if (++trial->trials == TRIALS && trial->restoration > trial->initialization) {
-        give_states_up(pool);
-    }
-    return true;
 }
 
 static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
@@ -663,11 +566,7 @@ static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Sc
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
     begin_counting_at(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    status = read_outputs(pool, me, scratch);
-    if (status == STATUS_OK && me->saved != NULL && owns_trial(pool, me)) {
-        copy_outputs(pool, me, pool->trial.outputs);
-    }
-    return status;
+    return read_outputs(pool, me, scratch);
 }
 
 static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
@@ -682,7 +581,22 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
     return read_outputs(pool, me, scratch);
 }
 
-/* By the cheapest way that gives the same as a fresh instance. */
+/* Makes an instance anew that has leaked memory, or that no reset would make as new. */
+static Status make_anew_if_due(Pool *pool, Instance *me) {
+    const bool due = me->due;
+
+    me->due = false;
+    if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
+        return STATUS_OK;
+    }
+    if (due) {
+        health_of(pool, me)[RECYCLINGS]++;
+        return replace(pool, me);
+    }
+    return pool->settings.reset_method >= RESET_BY_INSTANCE ? rebuild(pool, me) : STATUS_OK;
+}
+
+/* By the reset method of the settings. */
 static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
     const Access *start = call->start;
     const Matrix *values = &call->start_values;
@@ -691,7 +605,7 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     count_steps(pool, me);
     health_of(pool, me)[RESETS]++;
     health_of(pool, me)[RETRIED] = 0;
-    if (me->due && recycle(pool, me) > STATUS_WARNING) {
+    if (make_anew_if_due(pool, me) > STATUS_WARNING) {
         return STATUS_FATAL;
     }
     gather(values, index_of(pool, me), start->count, scratch.values);
@@ -700,15 +614,11 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
         return restart(pool, me, call, again && stepped, scratch);
     }
-    const bool trying = owns_trial(pool, me) && pool->trial.trials < TRIALS;
-    const uint64_t began = trying ? clock_now() : 0;
     const Status status = return_to_start(pool, me, scratch);
-    const bool refused = me->saved == NULL;
-    if (!refused && (!trying || status > STATUS_WARNING ||
-                     passes_trial(pool, me, clock_now() - began, scratch))) {
+    if (me->saved != NULL) {
         return status;
     }
-    gather(values, index_of(pool, me), start->count, scratch.values);
+    gather(values, index_of(pool, me), start->count, scratch.values); /* it refused */
     return restart(pool, me, call, again, scratch);
 }
 
@@ -1408,6 +1318,7 @@ ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot) {
     ptrdiff_t failed = -1;
 
     mutex_lock(&pool->lock);
+    pool->no_return = false;
     snapshot->pool = pool;
     snapshot->next = pool->snapshots;
     pool->snapshots = snapshot;
@@ -1466,9 +1377,8 @@ static bool allocate(Pool *pool) {
     pool->names = calloc(s->count, pool->name_size);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
-    pool->trial.outputs = calloc(s->outputs->count + 1, sizeof *pool->trial.outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
-           pool->chosen != NULL && pool->starts != NULL && pool->trial.outputs != NULL;
+           pool->chosen != NULL && pool->starts != NULL;
 }
 
 static void prepare_instance(Pool *pool, size_t index) {
@@ -1512,7 +1422,7 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     mutex_reset(&pool->lock);
     pool->settings = *settings;
     pool->step_size = settings->time_step / (double)settings->substeps;
-    pool->no_return = !settings->can_save;
+    pool->no_return = settings->reset_method != RESET_BY_RESTORE && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
                    settings->outputs->direct;
     pool->open = true;
@@ -1559,7 +1469,6 @@ void pool_close(Pool *pool) {
         free(pool->starts);
         free(pool->names);
         free(pool->chosen);
-        free(pool->trial.outputs);
         unlink_pool(pool);
     }
     mutex_unlock(&pool->lock);

@@ -17,6 +17,17 @@ typedef struct {
     const char *text;
 } StringValue;
 
+/* How an instance begins an episode; in the order of ResetMethod in fmugym/pool/spec.py. A new
+ * process is as good as a new instance here: the pool of processes sees to it. */
+typedef enum {
+    RESET_BY_RESTORE,
+    RESET_BY_RESET,
+    RESET_BY_INSTANCE,
+    RESET_BY_LIBRARY,
+    RESET_BY_PROCESS,
+    RESET_METHODS
+} ResetMethod;
+
 /* What a pool is made from; it must all stay in place as long as the pool does. */
 typedef struct {
     const Fmi *fmi;
@@ -27,6 +38,7 @@ typedef struct {
     bool private_libraries;   /* whether there is one for each instance */
     bool logging;
     bool can_save;
+    ResetMethod reset_method;
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -109,18 +121,6 @@ typedef struct {
 
 enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
 
-/* The first instance that saves its initial state finds out whether that was a good idea: whether
- * the FMU comes out the same, sooner, and small enough. */
-typedef struct {
-    Atomic owner; /* its index + 1 */
-    Atomic refuted;
-    bool rehearsed; /* whether steps from a restored state were found to be the same */
-    size_t trials;
-    uint64_t initialization; /* shortest times, ns */
-    uint64_t restoration;
-    double *outputs; /* after the initialization */
-} Trial;
-
 typedef struct Pool {
     struct Pool *next; /* in the list of all pools */
     Settings settings;
@@ -140,7 +140,7 @@ typedef struct Pool {
     Snapshot *snapshots;
     Cost costs[OPERATIONS];
     Atomic quick[OPERATIONS]; /* whether a call is short */
-    Trial trial;
+    Atomic states_too_large;
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

@@ -73,6 +73,7 @@ class Instance(ABC):
         self._instantiate_checked()
         self._component = ctypes.c_void_p(self._slave.component)
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
+        self._may_return = False  # to a state of an earlier time, of which FMI tells the FMU
         self.step = self._prepare_step()
         self._initialize = self._prepare_initialization()
         self._reset_function = self._function("Reset")
@@ -111,11 +112,6 @@ class Instance(ABC):
     def _prepare_initialization(self) -> Initialize: ...
 
     # What they have in common.
-
-    @property
-    def _may_return(self) -> bool:
-        """Whether states of earlier times may be restored, of which FMI tells the FMU."""
-        return self._description.capabilities.can_get_and_set_fmu_state
 
     def _function(self, name: str, *argtypes: Any, restype: Any = ctypes.c_int) -> Any:
         """Look a function up anew, so that FMPy's prototype of it stays as it is."""
@@ -333,6 +329,9 @@ class Instance(ABC):
         state = ctypes.c_void_p()
         get_state = self._function(self._state_function("Get"))
         self.check("saving the FMU state", get_state(self._component, ctypes.byref(state)))
+        if not self._may_return:
+            self._may_return = True
+            self.step = self._prepare_step()
         saved = SavedState(self, state)
         self._saved_states.add(saved)
         return saved

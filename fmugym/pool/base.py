@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import Variable
-from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
+from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -151,6 +151,11 @@ class Pool(ABC):
     def is_real(self) -> bool:
         """Whether a step may move something real, so that nothing is to be tried with it."""
         return False
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """How instances start an episode anew."""
+        return ResetMethod.RESET
 
     @property
     def can_play(self) -> bool:

@@ -39,6 +39,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["NativePool"]
 
@@ -155,6 +156,7 @@ class NativePool(CountedPool):
                 private_libraries,
                 log.isEnabledFor(logging.INFO),
                 description.capabilities.can_get_and_set_fmu_state,
+                list(ResetMethod).index(spec.reset_method),
                 spec.start_time,
                 spec.stop_time,
                 spec.tolerance,

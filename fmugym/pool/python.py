@@ -17,7 +17,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import CountedPool, HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
-from fmugym.pool.slot import Slot, Snapshot, States
+from fmugym.pool.slot import Slot, Snapshot
 
 __all__ = ["PythonPool"]
 
@@ -55,10 +55,9 @@ class PythonPool(CountedPool):
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
         self._library = Library(fmu, log)
-        states = States()
         try:
             self._slots = [
-                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], states)
+                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i])
                 for i in range(num_instances)
             ]
         except BaseException:

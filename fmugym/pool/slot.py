@@ -14,8 +14,9 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.health import Column, HealthArray
+from fmugym.pool.spec import ResetMethod
 
-__all__ = ["Slot", "Snapshot", "States"]
+__all__ = ["Slot", "Snapshot"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +34,7 @@ class Snapshot:
     count: int
 
 
-class States:
-    """What the instances of a pool know of FMU states.
-
-    Attributes:
-        complete: Whether steps from a restored state were found to be the same; None before.
-    """
-
-    complete: bool | None = None
-
-
-_REHEARSED = 3  # steps
+_REUSING = (ResetMethod.RESTORE, ResetMethod.RESET)
 _STEPPING = Phase.STEPPING
 _WARNING = int(Status.WARNING)
 _STATUSES = {Phase.FAILED: Status.ERROR, Phase.DEAD: Status.FATAL}
@@ -68,10 +59,8 @@ class Slot:
         input_row: FloatArray,
         output_row: FloatArray,
         counts: HealthArray,
-        states: States,
     ) -> None:
         self.failure = ""
-        self._states = states
         self.is_due = False
         self._counts = counts
         self._count = self._counted = 0
@@ -79,6 +68,7 @@ class Slot:
         self._spec = spec
         self._input_row, self._output_row = input_row, output_row
         self._step_size = spec.communication_step_size
+        self._restores = library.can_save_state and spec.reset_method is ResetMethod.RESTORE
         self._build()
 
     def _build(self) -> None:
@@ -92,11 +82,11 @@ class Slot:
         self._good_outputs = self._output_row.tolist()
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
-        """Start anew by the cheapest way that gives the same as a fresh instance.
+        """Start an episode anew by the spec's reset method.
 
-        The state after initialization is kept once the same start values come a second time, after
-        an episode with steps, and restored from then on; other start values take a reset and an
-        initialization.
+        With ``RESTORE``, the state after initialization is kept once the same start values come a
+        second time after an episode with steps, and it is restored from then on. Other start values
+        take a reset and an initialization.
         """
         key = (variables, values.tobytes())
         stepped = self._count > self._spec.warm_up_steps * self._spec.substeps
@@ -104,11 +94,10 @@ class Slot:
         self._counts[Column.RESETS] += 1
         self._counts[Column.RETRIED] = 0
         try:
-            self._recycle_if_due()
+            self._make_anew_if_due()
             if not self._restored(key):
                 self._initialize(variables, values)
-                if not self._keeps_state(key, stepped):
-                    self._initialize(variables, values)
+                self._keep_state(key, stepped)
         except FMUGymError as error:
             return self._failed(str(error))
         self._begin_counting_at(self._spec.warm_up_steps * self._spec.substeps)
@@ -122,12 +111,16 @@ class Slot:
     def _begin_counting_at(self, count: int) -> None:
         self._count = self._counted = count
 
-    def _recycle_if_due(self) -> None:
-        """Memory that an instance has leaked may go with it."""
+    def _make_anew_if_due(self) -> None:
+        """Replace an instance that has leaked memory, or that no reset would make as new."""
         is_due, self.is_due = self.is_due, False
-        if is_due and self._instance.phase not in (Phase.DEAD, Phase.INSTANTIATED):
+        if self._instance.phase in (Phase.DEAD, Phase.INSTANTIATED):
+            return
+        if is_due:
             self._counts[Column.RECYCLINGS] += 1
             self._replace()
+        elif self._spec.reset_method not in _REUSING:
+            self._rebuild()
 
     def _restored(self, key: tuple[tuple[Variable, ...], bytes]) -> bool:
         if self._saved is None or key != self._start_key or self._instance.phase is Phase.DEAD:
@@ -138,48 +131,12 @@ class Slot:
             self._saved = None
         return self._saved is not None
 
-    def _keeps_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> bool:
-        """Keep the state if it will be of use; returns whether the instance may go on."""
+    def _keep_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> None:
+        """Keep the state if it will be of use."""
         again = stepped and key == self._start_key
         self._start_key, self._saved = key, None
-        if not again or not self._library.can_save_state or self._states.complete is False:
-            return True
-        self._saved = self._instance.save_state()
-        if self._states.complete is None:
-            self._states.complete = self._rehearse(self._saved)
-            if not self._states.complete:
-                self._saved = None
-                return False
-        return True
-
-    def _rehearse(self, start: SavedState) -> bool:
-        """Step twice from the kept state, with the inputs that were written last.
-
-        An FMU may have left a part of its state out.
-        """
-        results = []
-        if not _all_finite(self._input_row.tolist()):
-            return False
-        try:
-            for _ in range(2):
-                with self._instance.muted():
-                    results.append(self._try_steps())
-                self._instance.restore_state(start)
-        except SimulationError:
-            return False
-        return results[0] == results[1]
-
-    def _try_steps(self) -> bytes:
-        """Set the inputs and step; returns the outputs."""
-        before, values = self._count, b""
-        self._instance.check("setting the inputs", self._inputs.set())
-        access = Access(self._instance, self._spec.outputs)
-        for _ in range(_REHEARSED):
-            if not (_is_fine(self._advance()) and _is_fine(access.get())):
-                raise SimulationError(self.failure)
-            values += access.values.tobytes()
-        self._count = before
-        return values
+        if again and self._restores:
+            self._saved = self._instance.save_state()
 
     def _initialize(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         self._return_to_instantiated()
@@ -204,6 +161,9 @@ class Slot:
 
     def _replace(self) -> None:
         self._counts[Column.REPLACEMENTS] += 1
+        self._rebuild()
+
+    def _rebuild(self) -> None:
         self._library.discard(self._instance)
         self._build()
 

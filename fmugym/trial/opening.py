@@ -17,7 +17,7 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
-from fmugym.trial.trial import Candidate, examine, meet
+from fmugym.trial.trial import Candidate, examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = ["make_pool"]
@@ -91,7 +91,6 @@ def make_pool(
             threads=plan.threads,
             call_timeout=call_timeout,
         )
-    meet(fmu)
     return local_pool(
         fmu,
         spec,
@@ -199,6 +198,7 @@ def _verdict(
 ) -> Verdict:
     """What is known of an FMU: from a trial, or from here where trials are turned off."""
     candidate = Candidate.of(fmu)
+    spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
     if is_bundled(fmu.path):
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
     once = fmu.description.capabilities.can_be_instantiated_only_once_per_process

@@ -56,6 +56,10 @@ _ALONE: Final = {"loading and instantiation", "initialization", "the first step"
 the FMU writes where it must not."""
 
 
+_MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
+"""How glibc begins what it says of a memory error."""
+
+
 @dataclass(frozen=True)
 class Candidate:
     """An FMU that may have to be tried; the attributes are those of ``fmugym.FMU``."""
@@ -135,6 +139,11 @@ class _Outcome:
     last_lines: list[str]
 
     @property
+    def shows_memory_error(self) -> bool:
+        """Whether the C library has ended the process, which may live on where it looks away."""
+        return any(map(_MEMORY_ERROR.match, self.last_lines))
+
+    @property
     def said(self) -> str:
         """The last lines as the end of an error's text."""
         return f"; its last lines: {' | '.join(self.last_lines)}" if self.last_lines else ""
@@ -180,14 +189,14 @@ def examine(
     Raises:
         FMULoadError: As ``meet``, with ``must_survive``.
     """
-    asked = _digest(repr((spec, starts, several)).encode())
-    key = f"{_content_key(candidate.path)}-{asked}"
+    key = f"{_content_key(candidate.path)}-{_digest(repr((spec, starts)).encode())}"
     known = Verdict.from_text(recall(key))
-    if known is None:
-        known = _examine(Request(candidate, spec, starts, several), must_survive)
-        if known.complete:
-            remember(key, known.to_text())
-    return known
+    if known is not None and (known.neighbours is not None or not several):
+        return known
+    found = _examine(Request(candidate, spec, starts, several), must_survive)
+    if found.complete:
+        remember(key, found.to_text())
+    return found
 
 
 def _examine(request: Request, must_survive: bool) -> Verdict:
@@ -202,7 +211,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         if "finished" in outcome.answer:
             break
         if "complete" not in outcome.answer:
-            if not request.check_memory:
+            if not (request.check_memory and outcome.shows_memory_error):
                 return notes.died_alone(name, must_survive)
             request = replace(request, check_memory=False)
         elif outcome.stage in request.skip:  # it dies where it is not asked anything
@@ -253,7 +262,7 @@ class _Notes:
                 f"{name} cannot be used: in {last.stage} it {last.end}{last.said}. That was a "
                 "trial in a process of its own; probe_timeout=None turns it off"
             )
-        return replace(self.verdict, isolate=True)
+        return replace(self.verdict, isolate=True, neighbours=Neighbours.PROCESSES)
 
 
 def _run(request: Request) -> _Outcome:

@@ -39,6 +39,7 @@ from fmugym.pool.process.channel import Code
 from fmugym.pool.process.shared_memory import Arrays, Memory, make_arrays, size_for
 from fmugym.pool.process.supervisor import LostError, Supervisor
 from fmugym.pool.process.worker import Setup
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["ProcessPool"]
 
@@ -139,6 +140,8 @@ class ProcessPool(CountedPool):
         mask = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask, np.bool_)
         with self._lock:
             concerned = [s for s in self._supervisors if mask[s.block].any()]
+            if self._spec.reset_method is ResetMethod.PROCESS:
+                self._retire_used(concerned)
             self._retire_grown(concerned, mask)
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
@@ -169,6 +172,13 @@ class ProcessPool(CountedPool):
             block = supervisor.block
             self._lost[block] &= ~mask[block]
         return [s for s in used if s.is_new]
+
+    def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
+        """End the workers that have played an episode, so that each episode has a new process."""
+        for supervisor in supervisors:
+            if not supervisor.is_new:
+                supervisor.retire("each episode has a new process", self._deadline())
+                self._lost[supervisor.block] = True
 
     def _retire_grown(self, supervisors: Sequence[Supervisor], mask: MaskArray) -> None:
         """Replace workers that leak, though their instances were recycled.
