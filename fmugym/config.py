@@ -131,7 +131,7 @@ class EnvConfig:
         if self.on_fault not in ON_FAULT:
             raise unknown_name("on_fault policy", self.on_fault, ON_FAULT)
         if self.reset_method not in (None, *ResetMethod):
-            raise unknown_name("reset method", self.reset_method, list(ResetMethod))
+            raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
         if self.isolation not in (None, *ISOLATIONS):
             raise unknown_name("isolation", self.isolation, ISOLATIONS)
 

@@ -16,6 +16,10 @@ from fmpy.fmi2 import FMU2Slave
 from fmu_tools import HERE, library_name, write_fmu
 
 import fmugym
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
+from fmugym.trial.trial import Candidate, examine
+from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -195,3 +199,121 @@ def test_reset_method(make_fmu, token, method):
     env = QuirkEnv(make_fmu(token))
     assert env.reset_method == method
     env.close()
+
+
+class TestNeighbours:
+    """Several instances: right by default, whatever that takes."""
+
+    @pytest.mark.parametrize(
+        ("token", "need"),
+        [
+            ("well behaved", Neighbours.INDEPENDENT),
+            ("globals", Neighbours.LIBRARIES),
+            ("one in a process", Neighbours.LIBRARIES),
+            ("strtok", Neighbours.ONE_THREAD),
+        ],
+    )
+    def test_in_a_vector_environment(self, make_fmu, token, need):
+        path = make_fmu(token)
+        envs = fmugym.FMUVectorEnv(
+            lambda: QuirkEnv(path), 4, autoreset_mode="Disabled", hooks="array", threads=None
+        )
+        for length in LENGTHS:
+            _, infos = envs.reset(seed=length)
+            actions = np.stack([inputs_of(length, i) for i in range(4)], axis=1)[..., None]
+            for action in actions:
+                envs.step(action)
+            for index, state in enumerate(envs.get_attr("state")):
+                gain = infos["drawn"]["gain"][index]
+                assert list(state) == reference(path, gain, actions[:, index, 0])[-1]
+        spec, starts = envs.get_attr("_spec")[0], envs.get_attr("_plan")[0].starts()
+        envs.close()
+        fmu = fmugym.FMU(path)
+        verdict = examine(Candidate.of(fmu), spec, starts, several=True)
+        assert verdict.neighbours is need
+
+    def test_inputs_stay_within_their_limits(self, make_fmu):
+        """An FMU may not bear others, and what follows is no sign of shared globals."""
+        fmu = fmugym.FMU(make_fmu("well behaved"))
+        u = fmu.variable("u")
+        spec = PoolSpec((u,), (), STEP, input_limits=((-0.5, 0.25),))
+        rows = [start_inputs(spec), neighbour_inputs(spec), *moving_inputs(spec, 50, 1.0)]
+        assert np.min(rows) < -0.4
+        assert np.max(rows) == 0.25
+        assert np.all((np.array(rows) >= -0.5) & (np.array(rows) <= 0.25))
+
+
+def test_an_fmu_that_overruns_its_memory_is_isolated(make_fmu, caplog):
+    env = QuirkEnv(make_fmu("overruns"))
+    assert "Quirks.fmu harms its process" in caplog.text
+    for length in LENGTHS:
+        gain, rows = play_single(env, length)
+        assert rows == reference_of(make_fmu("well behaved"), gain, length)
+    env.close()
+
+
+def reference_of(path, gain, length):
+    return reference(path, gain, inputs_of(length, 0))
+
+
+def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
+    env = QuirkEnv(make_fmu("noise"))
+    assert "gives other outputs each time, even if it begins afresh" in caplog.text
+    env.close()
+
+
+class TestConfig:
+    def test_demands_a_method(self, make_fmu):
+        env = QuirkEnv(make_fmu("well behaved"), reset_method="library")
+        assert env.reset_method == "library"
+        for length in LENGTHS:
+            gain, rows = play_single(env, length)
+            assert rows == reference_of(make_fmu("well behaved"), gain, length)
+        env.close()
+
+    def test_refuses_others(self, make_fmu):
+        with pytest.raises(fmugym.ConfigError, match="did you mean 'restore'"):
+            QuirkEnv(make_fmu("well behaved"), reset_method="restoer")
+
+
+class TestVerdict:
+    def test_survives_its_text(self):
+        verdict = Verdict(
+            complete=True,
+            deterministic=False,
+            resets={ResetMethod.RESTORE: Grade.WRONG, ResetMethod.RESET: Grade.TOLERANCE},
+            neighbours=Neighbours.ONE_THREAD,
+            isolate=True,
+            reasons=("in the first step it hung",),
+        )
+        assert Verdict.from_text(verdict.to_text()) == verdict
+        assert verdict.reset_method is ResetMethod.RESET
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            *("", "true", "[]", "{}", "null", '{"format": 1}', "[" * 100_000, "\0", "NaN"),
+            Verdict().to_text().replace("1", "2"),
+            Verdict().to_text().replace("false", '"no"'),
+        ],
+    )
+    def test_anything_else_is_none(self, text):
+        assert Verdict.from_text(text) is None
+
+    def test_a_damaged_cache_is_no_verdict(self, make_fmu, monkeypatch, tmp_path):
+        monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))
+        path = make_fmu("reset does nothing")
+        QuirkEnv(path).close()
+        verdicts = list(tmp_path.iterdir())
+        for damage in (
+            lambda file: file.write_text("yes"),
+            lambda file: file.write_bytes(b"\xff" * 5_000_000),
+            lambda file: (file.unlink(), os.mkfifo(file)),
+            lambda file: (file.unlink(), file.symlink_to("/dev/zero")),
+            lambda file: (file.unlink(), file.mkdir()),
+        ):
+            for file in verdicts:
+                damage(file)
+            env = QuirkEnv(path)
+            assert env.reset_method == "instance"
+            env.close()

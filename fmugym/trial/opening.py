@@ -76,7 +76,7 @@ def make_pool(
     if isolation not in (None, *ISOLATIONS):
         raise unknown_name("isolation", isolation, ISOLATIONS)
     if reset_method not in (None, *ResetMethod):
-        raise unknown_name("reset method", reset_method, list(ResetMethod))
+        raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
     plan = plan.completed(fmu, _verdict(fmu, spec, starts, num_instances, plan), num_instances, log)
     spec = replace(spec, reset_method=plan.method)
