@@ -156,15 +156,20 @@ class _Plan:
         if neighbours is Neighbours.INDEPENDENT:
             return self
         plan, what = replace(self, threads=1), "all are stepped by one thread"
-        if neighbours is Neighbours.LIBRARIES and self.native and self.isolation is None:
+        in_process = self.isolation == "none"
+        if neighbours is Neighbours.LIBRARIES and (in_process or self._can_copy_libraries):
             plan, what = replace(self, private_libraries=True), "each gets a copy of the library"
+        elif neighbours is Neighbours.PROCESSES and in_process:
+            plan, what = self, "isolation='none' keeps them in one process all the same"
         elif neighbours is not Neighbours.ONE_THREAD:
             workers = self.workers or num_instances
-            isolation = self.isolation or "process"
-            plan = replace(self, isolation=isolation, workers=workers)
-            what = "each gets a process"
+            plan, what = replace(self, isolation="process", workers=workers), "each gets a process"
         log.warning("the instances of %s disturb each other: %s", fmu.path.name, what)
         return plan
+
+    @property
+    def _can_copy_libraries(self) -> bool:
+        return self.native and self.isolation is None
 
     def _with_means_of_reset(self, num_instances: int) -> _Plan:
         """New libraries need private ones of the native pool, new processes one each."""
@@ -201,28 +206,24 @@ def _verdict(
     spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
     if is_bundled(fmu.path):
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
-    once = fmu.description.capabilities.can_be_instantiated_only_once_per_process
     several = num_instances > 1 and plan.private_libraries is None and not plan.has_own_workers
+    once = fmu.description.capabilities.can_be_instantiated_only_once_per_process
     isolated = plan.isolation == "process"
     if not candidate.exempt:
-        verdict = examine(
-            candidate, spec, starts, several=several and not once, must_survive=not isolated
+        return examine(
+            candidate, spec, starts, several=several, alone=once, must_survive=not isolated
         )
-    elif several and not once:
-        verdict = Verdict(neighbours=_neighbours(candidate, spec, isolated))
-    else:
-        verdict = Verdict()
-    return replace(verdict, neighbours=Neighbours.LIBRARIES) if several and once else verdict
+    if several and (once or isolated or _disturb_here(candidate, spec)):
+        verdict = examine(
+            candidate, spec, several=True, alone=not isolated or once, must_survive=False
+        )
+        return Verdict(neighbours=verdict.neighbours or Neighbours.PROCESSES)
+    return Verdict()
 
 
-def _neighbours(candidate: Candidate, spec: PoolSpec, isolated: bool) -> Neighbours:
-    """Compare two instances where the FMU was not tried: here, if it will run here anyway."""
-    if isolated:
-        verdict = examine(candidate, spec, several=True, must_survive=False)
-        return verdict.neighbours or Neighbours.PROCESSES
+def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:
+    """Compare two instances in this process, where the FMU will run untried anyway."""
     try:
-        if disturb_in_turn(candidate, spec):
-            return Neighbours.LIBRARIES
+        return disturb_in_turn(candidate, spec)
     except SimulationError:  # it fails alone too, without the values that the caller will set
-        pass
-    return Neighbours.INDEPENDENT
+        return False

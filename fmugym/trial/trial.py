@@ -112,6 +112,7 @@ class Request:
         spec: The ``PoolSpec`` with which resets and several instances are tried, or None.
         starts: The ``Starts`` of two episodes, or None for the FMU's own start values.
         several: Whether to try several instances.
+        alone: Whether it is known that instances must not share a copy of the library.
         skip: The stages that have ended a worker before.
         check_memory: Whether the C library looks for memory errors (glibc only).
     """
@@ -120,6 +121,7 @@ class Request:
     spec: Any = None
     starts: Any = None
     several: bool = False
+    alone: bool = False
     skip: frozenset[str] = frozenset()
     check_memory: bool = True
 
@@ -171,6 +173,7 @@ def examine(
     starts: Any = None,
     *,
     several: bool = False,
+    alone: bool = False,
     must_survive: bool = True,
 ) -> Verdict:
     """Find out in worker processes how an FMU has to be treated; ``meet`` included.
@@ -180,6 +183,7 @@ def examine(
         spec: The ``PoolSpec`` to try it with.
         starts: The ``Starts`` of two episodes, or None.
         several: Whether to try several instances.
+        alone: Whether it is known that instances must not share a copy of the library.
         must_survive: Whether it is an error if an instance alone ends the process; otherwise that
             asks for isolation.
 
@@ -193,7 +197,7 @@ def examine(
     known = Verdict.from_text(recall(key))
     if known is not None and (known.neighbours is not None or not several):
         return known
-    found = _examine(Request(candidate, spec, starts, several), must_survive)
+    found = _examine(Request(candidate, spec, starts, several, alone), must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found

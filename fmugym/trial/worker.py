@@ -170,7 +170,7 @@ def _try_several(request: Request, notes: Notes) -> None:
 
 def _need_of_several(request: Request, notes: Notes) -> Neighbours:
     """Find the least that keeps instances from disturbing each other."""
-    if _disturbed(request, notes, private_libraries=False):
+    if request.alone or _disturbed(request, notes, private_libraries=False):
         copies = has_native_pool() and not _disturbed(request, notes, private_libraries=True)
         return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
     notes.stage(Stage.THREADS)
