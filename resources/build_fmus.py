@@ -1,8 +1,8 @@
 """Builds the bundled FMUs: `python resources/build_fmus.py`.
 
 The build needs two packages from PyPI and no system compiler: `ziglang` cross-compiles for all
-platforms, and the wheel of `fmpy` contains the FMI headers. The same sources and the same version of
-`ziglang` give the same bytes on every machine.
+platforms, and the wheel of `fmpy` contains the FMI headers. The same sources and the same version
+of `ziglang` give the same bytes on every machine.
 """
 
 from __future__ import annotations
