@@ -301,16 +301,16 @@ class TestOutputError:
         [
             ({"parameters": {}}, "no parameter"),
             ({"parameters": {"bb": 1.0}}, "unknown variable of Pendulum 'bb'"),
-            ({"parameters": {"q": 1.0}}, "'q' is no numeric parameter"),
+            ({"parameters": {"q": 1.0}}, "'q' is not a numeric parameter"),
             ({"parameters": {"b": (1.0, 0.5, 2.0, 3.0)}}, "low <= start <= high"),
             ({"parameters": {"b": -1.0}}, "low <= start <= high"),
             ({"fixed": {"b": 1e-4}}, "both fixed and to be fitted"),
-            ({"scales": {"q": 0.0}}, "positive"),
+            ({"scales": {"q": 0.0}}, "scale of 'q'"),
             ({"scales": {"p": 1.0}}, "unknown measured output 'p'"),
             ({"initial_states": {"q_0": "p"}}, "unknown measured output 'p'"),
             ({"trajectories": []}, "at least one trajectory"),
             ({"clustered": True}, "more trajectories than parameters"),
-            ({"time_step": 0.0}, "time_step must be positive"),
+            ({"time_step": 0.0}, "time_step"),
         ],
     )
     def test_mistakes(self, arguments, match):

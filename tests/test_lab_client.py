@@ -1,12 +1,16 @@
 """The client's methods, one by one: what they give, take and refuse."""
 
+import graphlib
 import logging
+import re
 from datetime import timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
 from lab_tools import TOKEN, experiment, track
 
+import fmugym
 from fmugym import ConfigError, FMUGymError
 from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, User, current_lab
 from fmugym.lab.disturbance import (
@@ -51,6 +55,18 @@ class TestImports:
     def test_errors_are_runtime_errors_of_this_package(self):
         assert issubclass(LabError, RuntimeError)
         assert issubclass(LabError, FMUGymError)
+
+    @pytest.mark.parametrize("room", ["lab", "identification", "rendering"])
+    def test_modules_of_a_room_form_no_circle(self, room):
+        """Neither by imports at the top nor by imports in functions or for types."""
+        folder = Path(fmugym.__file__).parent / room
+        needs = {}
+        for path in folder.glob("*.py"):
+            if path.stem != "__init__":
+                found = re.findall(rf"from fmugym\.{room}(\.\w+)? import (\w+)", path.read_text())
+                needs[path.stem] = {module.lstrip(".") or name for module, name in found}
+        assert any(needs.values())
+        graphlib.TopologicalSorter(needs).prepare()  # raises CycleError
 
 
 class TestWhichLab:
