@@ -11,7 +11,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["as_float", "flag", "mapping", "number", "whole_number"]
+__all__ = ["as_float", "flag", "mapping", "number", "text", "whole_number"]
 
 
 def as_float(value: Any) -> float:
@@ -73,7 +73,7 @@ def whole_number(what: str, value: Any, low: int, high: int) -> int:
     Raises:
         ConfigError: If the value is not an integer or is out of its range.
     """
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool | np.timedelta64)
     if not (is_integer and low <= int(value) <= high):
         raise ConfigError(f"{what} must be an integer from {low} to {high}, not {shown(value)}")
     return int(value)
@@ -88,6 +88,17 @@ def flag(what: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ConfigError(f"{what} must be True or False, not {shown(value)}")
     return bool(value)
+
+
+def text(what: str, value: Any) -> str:
+    """Return a text.
+
+    Raises:
+        ConfigError: If the value is not a text.
+    """
+    if not isinstance(value, str):
+        raise ConfigError(f"{what} must be a text, not {shown(value)}")
+    return str.__str__(value)  # a subclass may compare in its own way
 
 
 def mapping(what: str, value: Any) -> dict[Any, Any]:

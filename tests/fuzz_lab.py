@@ -11,22 +11,13 @@ time. A hang ends the program with the Python stack after ``HANG`` seconds.
 Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
 """
 
-import argparse
-import datetime
-import decimal
-import faulthandler
-import fractions
 import itertools
-import os
-import random
 import sys
-import tempfile
-import time
-from collections import Counter
 from pathlib import Path
 
+import fuzz_tools
 import numpy as np
-from fuzz import HANG, SLOW, say, temporary_folder
+from fuzz_tools import NUMBERS, Unspeakable, check_text, main, run_cases
 
 from fmugym import ConfigError
 from fmugym.lab import (
@@ -50,38 +41,6 @@ USER = "a user's token"
 
 
 # Odd values
-
-
-class Unspeakable:
-    """An object that can be neither shown, compared, counted nor converted."""
-
-    def _refuse(self, *arguments):
-        raise ZeroDivisionError("this object refuses everything")
-
-    __repr__ = __str__ = __eq__ = __hash__ = __bool__ = __len__ = __iter__ = _refuse
-    __float__ = __int__ = __index__ = __lt__ = __le__ = __gt__ = __ge__ = __fspath__ = _refuse
-    __array__ = __getitem__ = __call__ = __contains__ = _refuse
-
-
-class Slippery(float):
-    """A float that cannot be shown."""
-
-    def __repr__(self):
-        raise ZeroDivisionError("this number has no text")
-
-    __str__ = __format__ = __repr__
-
-
-class OddText(str):
-    """A text that cannot be looked up."""
-
-    __slots__ = ()
-
-    def __hash__(self):
-        raise ZeroDivisionError("this text has no hash")
-
-    def __eq__(self, other):
-        raise ZeroDivisionError("this text has no equal")
 
 
 class Unready:
@@ -110,54 +69,26 @@ class OddClock:
             raise ZeroDivisionError("this clock cannot go back")
 
 
-def nested():
-    """Make a list that contains itself."""
-    circle = []
-    circle.append(circle)
-    return circle
-
-
-NUMBERS = (
-    *(None, True, 0, 0.0, -0.0, -1, 1, 7, -1e-300, 1e-320, 1e308, -1e308, 10**400, -(10**400)),
-    *(2**31, 2**63, 2**64, float("nan"), float("inf"), -float("inf"), 1j, Slippery(2.0)),
-    *(Slippery("nan"), decimal.Decimal("1.5"), decimal.Decimal("sNaN"), fractions.Fraction(1, 3)),
-    *(np.float32(0.1), np.float64("nan"), np.int8(-3), np.uint64(2**64 - 1), np.bool_(True)),
-    *(np.datetime64("2020-01-01"), np.timedelta64(1, "s"), datetime.timedelta(seconds=1)),
-)
-TEXTS = (
-    *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum", "None"),
-    *("\0", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5", bytearray(b"5")),
-    *(OddText("5"), OddText("SimplePendulum"), "ideal", "hardware", "rgb_array", "../x", "/"),
-)
-GROUPS = (
-    *((), [], {}, set(), frozenset([1]), [1], [1.0, 2.0], (None,), [None, None], [[1]], [[]]),
-    *([[1], [2, 3]], {"a": 1}, {1: 2}, {CellType.SINGLE: 1}, ["up"], [float("nan")], [10**400]),
-    *([CellType.SINGLE], [CellType.DOUBLE] * 3, (CellType.SINGLE, "single"), [1] * 1000),
-    *(range(3), range(10**12), np.zeros(2), np.zeros((2, 2)), np.array(1.0), np.array(["a"])),
-    *(np.array([], float), np.ma.masked, np.array([None]), np.zeros(1, [("a", "f8")])),
-)
 OTHERS = (
-    *(object(), Unspeakable(), Unspeakable, type, len, lambda *_: None, Ellipsis, NotImplemented),
-    *(CellType, CellType.SINGLE, CellType.DOUBLE, Path("x"), ValueError("a value"), sys, Unready()),
-    *(TimedTorqueDisturbance(0.0, 0.1, (0.01,)), User(), Options(), datetime.datetime.now()),
-)
-MAKERS = (
-    *(nested, lambda: iter([1.0]), lambda: itertools.repeat(CellType.SINGLE), lambda: [Unready()]),
-    *(lambda: itertools.repeat(Unready()), lambda: (1 / 0 for _ in range(2)), lambda: [nested()]),
     *(
-        lambda: [Unspeakable()],
-        lambda: {USER: Unspeakable()},
-        lambda: ManualClock(),
-        lambda: Client,
+        CellType,
+        CellType.SINGLE,
+        CellType.DOUBLE,
+        Unready(),
+        User(),
+        Options(),
+        {CellType.SINGLE: 1},
     ),
+    *([CellType.SINGLE], [CellType.DOUBLE] * 3, (CellType.SINGLE, "single"), [None]),
+    *(TimedTorqueDisturbance(0.0, 0.1, (0.01,)), lambda: itertools.repeat(CellType.SINGLE)),
+    *(lambda: [Unready()], lambda: itertools.repeat(Unready()), lambda: {USER: Unspeakable()}),
+    *(lambda: ManualClock(), lambda: Client),
 )
 
 
 def odd(rng):
-    """Draw an odd value."""
-    group = rng.choice((NUMBERS, NUMBERS, TEXTS, TEXTS, GROUPS, GROUPS, OTHERS, MAKERS))
-    value = rng.choice(group)
-    return value() if group is MAKERS else value
+    """Draw an odd value, one of the lab's own now and then."""
+    return fuzz_tools.odd(rng, OTHERS)
 
 
 def odd_clock(rng, folder):
@@ -296,10 +227,6 @@ def watch_call(rng, folder):
     except ConfigError as error:  # only the mode of a view is no request to the lab
         outcome, trouble = "refused", "" if "render mode" in str(error) else f"ConfigError: {error}"
     return outcome, trouble or check_rest(scene)
-
-
-def check_text(error):
-    return "" if str(error).isprintable() and len(str(error)) < 1000 else f"text: {str(error)!r}"
 
 
 def check_rest(scene):
@@ -442,55 +369,16 @@ def client_of(rng, folder):
 # Cases
 
 
+def case(rng, folder):
+    """Run one case; see the top of this file."""
+    kinds = (watch_constructor, client_of, *(watch_call,) * 6)
+    return rng.choice(kinds)(rng, folder)
+
+
 def run(count, seed, first=0, report=lambda line: None):
-    """Run cases one after another.
-
-    Returns:
-        How many cases had which outcome, and the failures as texts.
-    """
-    counts, failures = Counter(), []
-    with temporary_folder() as folder:
-        for number in range(first, first + count):
-            outcome, trouble = watch(random.Random(f"{seed}/{number}"), folder)
-            counts[outcome] += 1
-            if trouble:
-                failures.append(f"case {number}: {trouble}")
-                report(failures[-1])
-    return counts, failures
-
-
-def watch(rng, folder):
-    """Run one case; returns its outcome and what is wrong with it."""
-    faulthandler.dump_traceback_later(HANG, exit=True)
-    begin = time.process_time()  # the machine may be busy with something else
-    case = rng.choice((watch_call, watch_call, watch_constructor, client_of) + (watch_call,) * 4)
-    try:
-        with tempfile.TemporaryDirectory(dir=folder) as own:
-            outcome, trouble = case(rng, Path(own))
-    except Exception as error:
-        return "failed", f"{type(error).__name__}: {error}"
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-    duration = time.process_time() - begin
-    left = os.listdir(folder)
-    trouble = trouble or (
-        f"{duration:.1f} s" if duration > SLOW else f"left {left}" if left else ""
-    )
-    return outcome, trouble
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=4000)
-    parser.add_argument("--seed", default="0")
-    parser.add_argument("--first", type=int, default=0)
-    arguments = parser.parse_args()
-    faulthandler.enable()
-    begin = time.perf_counter()
-    counts, failures = run(arguments.count, arguments.seed, arguments.first, say)
-    say(f"{dict(counts)}, {len(failures)} failures, {time.perf_counter() - begin:.0f} s")
-    return 1 if failures else 0
+    """Run cases; see ``fuzz_tools.run_cases``."""
+    return run_cases(case, count, seed, first, report)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(run, __doc__))

@@ -6,6 +6,7 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+import fuzz_identification
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -323,6 +324,14 @@ class TestOutputError:
         fixed = {"v_c": -1.0}
         with pytest.raises(fmugym.SimulationError, match="v_c must be positive"):
             fit_parameters(PENDULUM, {"b": 1e-3}, noisy(0, 1.0), fixed=fixed)
+
+
+def test_odd_arguments_raise_nothing_but_our_own_errors(same_working_directory):
+    """A short form of ``python tests/fuzz_identification.py``."""
+    counts, failures = fuzz_identification.run(400, seed="tests")
+    assert failures == []
+    assert sum(counts.values()) == 400
+    assert min(counts["accepted"], counts["refused"]) > 10
 
 
 class TestTrajectory:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive import FMU
-from fmugym.checks import flag, mapping, number, whole_number
+from fmugym.checks import flag, mapping, number, text, whole_number
 from fmugym.distributions import Normal
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.identification.problem import Experiment, Limits, Problem
 from fmugym.identification.results import Comparison
 from fmugym.identification.statistics import confidence_intervals, normal_distributions
@@ -194,19 +194,28 @@ def fit_parameters(
     if not wanted:
         raise ConfigError("there is no parameter to fit")
     experiment = Experiment(
-        FMU.of(fmu),
+        _opened(fmu),
         _mapping("initial_states", initial_states),
         _mapping("fixed", fixed),
         _mapping("scales", scales),
         time_step,
         flag("drop_repeats", drop_repeats),
-        backend,
+        text("backend", backend),
     )
     clustered = flag("clustered", clustered)
     max_evaluations = whole_number("max_evaluations", max_evaluations, 1, 10**9)
     fit_states = flag("fit_initial_states", fit_initial_states)
     with closing(Problem(experiment, wanted, trajectories, fit_states)) as problem:
         return _result(experiment, problem, problem.solve(max_evaluations), clustered)
+
+
+def _opened(fmu: Any) -> FMU:
+    if not isinstance(fmu, FMU):
+        try:
+            fmu = text("fmu", os.fspath(fmu))
+        except Exception:  # a path may be any object
+            raise ConfigError(f"fmu must be a path or an FMU, not {shown(fmu)}") from None
+    return FMU.of(fmu)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:

@@ -1,8 +1,8 @@
 """The least-squares problem behind an output-error fit.
 
 Variable projection eliminates the initial states of the trajectories. For given parameters, the fit
-of each trajectory finds its best initial state. The Jacobian of the parameters then loses its part in
-the directions of these states (Kaufman's form; see Golub and Pereyra, "Separable nonlinear least
+of each trajectory finds its best initial state. The Jacobian of the parameters then loses its part
+in the directions of these states (Kaufman's form; see Golub and Pereyra, "Separable nonlinear least
 squares", Inverse Problems 19, 2003). The size of the optimization therefore does not depend on the
 number of trajectories.
 """
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive import FMU
-from fmugym.checks import as_float, number
+from fmugym.checks import as_float, number, text
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.identification._scipy import scipy_module
 from fmugym.identification.results import Comparison
@@ -345,6 +345,7 @@ def _measured_states(
     states = np.empty((len(initial_states), len(trajectories)))
     for k, (name, source) in enumerate(initial_states.items()):
         if isinstance(source, str):
+            source = text("initial_states", source)
             if source not in trajectories[0].outputs:
                 raise unknown_name("measured output", source, trajectories[0].outputs)
             states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
@@ -358,7 +359,7 @@ def _scales(
 ) -> FloatArray:
     """Return the scale of each output, shape (outputs,)."""
     for name, scale in given.items():
-        if not isinstance(name, str) or name not in outputs:
+        if text("scales", name) not in outputs:
             raise unknown_name("measured output", name, outputs)
         number(f"the scale of {name!r}", scale, positive=True)
     spread = {

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fmugym.checks import mapping, number, whole_number
+from fmugym.checks import mapping, number, text, whole_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
@@ -43,8 +43,8 @@ class Comparison:
         Raises:
             ConfigError: If the output was not measured.
         """
-        known = self.trajectories[0].outputs
-        if not isinstance(output, str) or output not in known:
+        known, output = self.trajectories[0].outputs, text("output", output)
+        if output not in known:
             raise unknown_name("measured output", output, known)
         pairs = zip(self.simulated, self.trajectories, strict=True)
         return [simulated[output] - measured.outputs[output] for simulated, measured in pairs]
@@ -111,7 +111,7 @@ def plot_comparison(
     axes = figure.subplots(len(outputs), sharex=True, squeeze=False)[:, 0]
     for ax, output in zip(axes, outputs, strict=True):
         _draw_output(ax, comparison, output)
-        ax.set_ylabel(str(texts.get(output, output)))
+        ax.set_ylabel(text("labels", texts.get(output, output)))
     axes[0].legend(loc="upper right")
     axes[-1].set_xlabel("time [s]")
     return figure
@@ -122,9 +122,10 @@ def _chosen(comparison: Comparison, outputs: Sequence[str] | None) -> list[str]:
         return list(comparison.trajectories[0].outputs)
     if not isinstance(outputs, list | tuple) or not outputs:
         raise ConfigError(f"outputs must be a list of names, not {shown(outputs)}")
-    for output in outputs:
-        comparison.residuals(output)  # refuses an unknown name
-    return list(outputs)
+    names = [text("outputs", output) for output in outputs]
+    for name in names:
+        comparison.residuals(name)  # refuses an unknown name
+    return names
 
 
 def _draw_output(ax: Axes, comparison: Comparison, output: str) -> None:
