@@ -7,7 +7,6 @@ import math
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -29,25 +28,12 @@ from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
 from fmugym.pool import Pool, PoolSpec, make_pool
 
-__all__ = ["Cell", "Fault", "checked_parameters"]
+__all__ = ["Cell", "checked_parameters"]
 
 logger = logging.getLogger(__name__)
 
 _HOLD_TIME: Final = 3.0  # s until a held arm is at rest
 _AT_REST: Final = 1e-4  # rad/s
-
-
-@dataclass(frozen=True)
-class Fault:
-    """The reason why a cell came to rest early.
-
-    Attributes:
-        time: Time of the session, in s.
-        text: The reason, in the words that clients get.
-    """
-
-    time: float
-    text: str
 
 
 class Cell:
@@ -69,7 +55,7 @@ class Cell:
         torque: Torques of the motors over the last step, in N m.
         drive: The drive of the present session.
         sensors: The sensors.
-        fault: Why it came to rest, or None.
+        fault: Why it came to rest early, in the words that clients get, or None.
     """
 
     def __init__(
@@ -100,7 +86,7 @@ class Cell:
         self.position, self.velocity = [0.0] * joints, [0.0] * joints
         self.torque = [0.0] * joints
         self.drive = Drive(self._options, [True] * joints)
-        self.fault: Fault | None = None
+        self.fault: str | None = None
         self.recording: Recording | None = None
         self._steps = 0
         self._disturbances: list[Acting] = []
@@ -197,8 +183,8 @@ class Cell:
                 break
 
     def _step(self) -> None:
-        self.torque = self.drive.evaluate(self.position, self.velocity)
-        self._push(self._disturbed(self.torque))
+        torque = self.torque = self.drive.evaluate(self.position, self.velocity)
+        self._push(self._disturbed(torque) if self._disturbances else torque)
         self._steps += 1
         self.sensors.observe(self.position, self.velocity, self.torque)
         self._record()
@@ -209,14 +195,14 @@ class Cell:
             try:
                 torque = each.apply(self.time, self.position, self.velocity, torque)
             except Exception as error:  # a disturbance may be the user's own class
-                self.fault = Fault(self.time, f"a disturbance failed: {shown(error)}")
+                self.fault = f"a disturbance failed: {shown(error)}"
         return torque
 
     def _push(self, torque: Sequence[float]) -> None:
         pool = self._open()
         pool.inputs[:, 0] = torque
         if pool.step_own():
-            self.fault = Fault(self.time, f"the cell failed: {pool.failure(0)}")
+            self.fault = f"the cell failed: {pool.failure(0)}"
         self._read(pool)
 
     def _read(self, pool: Pool) -> None:
@@ -236,7 +222,7 @@ class Cell:
         ):
             for joint, value in enumerate(values):
                 if abs(value) > limit and self.fault is None:
-                    self.fault = Fault(self.time, self._violation(kind, joint, value, limit))
+                    self.fault = self._violation(kind, joint, value, limit)
 
     def _violation(self, kind: str, joint: int, value: float, limit: float) -> str:
         return (

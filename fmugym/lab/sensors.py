@@ -20,13 +20,11 @@ class Sample:
     """The readings of one moment.
 
     Attributes:
-        time: Time of the session, in s.
         position: Angle of each joint, in rad.
         velocity: Angular velocity of each joint, in rad/s.
         torque: Torque of each motor, in N m.
     """
 
-    time: float
     position: list[float]
     velocity: list[float]
     torque: list[float]
@@ -51,7 +49,7 @@ class Sensors:
         lag = options.velocity_lag
         self._gain = 1.0 if lag == 0.0 else -math.expm1(-self._step / lag)
         self._noise: list[list[float]] = []
-        self.sample = Sample(0.0, [0.0] * joints, [0.0] * joints, [0.0] * joints)
+        self.sample = Sample([0.0] * joints, [0.0] * joints, [0.0] * joints)
 
     def restart(self, position: Sequence[float]) -> None:
         """Begin a session with joints at rest, at positions in rad."""
@@ -80,7 +78,6 @@ class Sensors:
         sigmas = options.velocity_noise[: self._joints]
         velocities = zip(self._filtered, sigmas, of_velocity, strict=True)
         self.sample = Sample(
-            self._count * self._step,
             list(map(_quantized, position, options.encoder_step)),
             [v + sigma * x for v, sigma, x in velocities],
             [tau + options.torque_noise * x for tau, x in zip(torque, of_torque, strict=True)],

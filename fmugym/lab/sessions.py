@@ -70,7 +70,6 @@ class Session:
         recording: The recording of the cell, or None.
         ended: Why it has ended, or None.
         is_stopped: Whether the user has stopped it.
-        duration: How long it lasted, in s, once it has ended.
         log: One line for each event.
     """
 
@@ -85,7 +84,6 @@ class Session:
     recording: Recording | None
     ended: str | None = None
     is_stopped: bool = False
-    duration: float = 0.0
     log: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -127,7 +125,7 @@ class Session:
         deadline, reason = self._deadline()
         self.cell.advance(min(now, deadline) - self.began)
         if self.cell.fault is not None:
-            self._end(self.cell.fault.text)
+            self._end(self.cell.fault)
         elif now >= deadline:
             self.end(reason)
 
@@ -143,9 +141,9 @@ class Session:
         if self.ended is not None:
             return
         self.note(reason)
-        self.ended, self.duration = reason, self.cell.time
+        self.ended = reason
         if self.recording is not None:
-            self.recording.cut(min(self.duration, self.length))
+            self.recording.cut(min(self.cell.time, self.length))
         self.cell.park()
 
     def stop(self) -> None:
