@@ -27,7 +27,7 @@ from fmugym.rendering.window import Window
 
 __all__ = ["ArmScene", "CellFrame", "CellPicture", "CellScene", "LiveView"]
 
-_THICKNESS: Final = 0.09  # of a link, as a fraction of its length
+_THICKNESS: Final = 0.09  # of a link, in lengths of the arm
 _SCALE: Final = 0.15  # N m, for arrows where the torque limit is 0 or infinite
 
 _drawing = threading.Lock()
