@@ -11,7 +11,17 @@ import numpy as np
 
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["as_float", "flag", "mapping", "number", "text", "whole_number"]
+__all__ = [
+    "as_float",
+    "check_count",
+    "check_number",
+    "flag",
+    "mapping",
+    "number",
+    "number_of",
+    "text",
+    "whole_number",
+]
 
 
 def as_float(value: Any) -> float:
@@ -110,6 +120,52 @@ def mapping(what: str, value: Any) -> dict[Any, Any]:
     if not isinstance(value, Mapping):
         raise ConfigError(f"{what} must be a dict, not {shown(value)}")
     return dict(value)
+
+
+def check_number(
+    what: str, value: Any, minimum: float = -math.inf, *, positive: bool = False
+) -> None:
+    """Check that a value is a finite number in its range.
+
+    Args:
+        what: The name of the value, for the error.
+        value: Any object.
+        minimum: The lowest number allowed.
+        positive: Whether 0 is refused too.
+
+    Raises:
+        ConfigError: If it is not.
+    """
+    result = number_of(what, value)
+    if not math.isfinite(result) or result < minimum or (positive and result <= 0):
+        wanted = "positive and finite" if positive else "finite and not negative"
+        raise ConfigError(
+            f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {shown(value)}"
+        )
+
+
+def number_of(what: str, value: Any) -> float:
+    """Turn a value into a float.
+
+    Raises:
+        ConfigError: If it is not a real number.
+    """
+    if isinstance(value, Real) or (hasattr(value, "__float__") and np.shape(value) == ()):
+        try:
+            return float(value)
+        except (TypeError, ValueError, OverflowError):
+            pass
+    raise ConfigError(f"{what} must be a number, got {shown(value)}")
+
+
+def check_count(what: str, value: Any) -> None:
+    """Check that a value is a positive integer.
+
+    Raises:
+        ConfigError: If it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ConfigError(f"{what} must be a positive integer, got {shown(value)}")
 
 
 def _range(low: float, high: float, positive: bool) -> str:

@@ -5,28 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from numbers import Real
 from typing import Any
 
-import numpy as np
-
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
+from fmugym.archive.safe_zip import ArchiveLimits
+from fmugym.checks import check_count, check_number, number_of
 from fmugym.distributions import is_distribution
 from fmugym.errors import ConfigError, unknown_name
-from fmugym.model_description import ModelDescription, Variable
-from fmugym.pool_spec import (
+from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
-    PoolSpec,
-    whole_number_of_steps,
 )
-from fmugym.probing import DEFAULT_TIMEOUT
-from fmugym.safe_zip import ArchiveLimits
 
 __all__ = ["EnvConfig"]
-
-_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
-_LARGEST_EXACT_INTEGER = 2.0**53
 
 ON_FAULT = ("truncate", "terminate", "raise")
 MOST_RETRIES = 10
@@ -66,7 +58,8 @@ class EnvConfig:
             class's file.
         probe_timeout: Seconds of real time that an FMU which is not known yet may take for a first
             load and step in a process of its own; None to go without.
-        isolation: Where the FMU runs: ``"process"`` or ``"none"``; see ``fmugym.pool.make_pool``.
+        isolation: Where the FMU runs: ``"process"`` or ``"none"``; see
+            ``fmugym.trial.opening.make_pool``.
         call_timeout: Seconds of real time that a call of an FMU may take where it runs in a worker
             process; None for ever.
     """
@@ -92,7 +85,7 @@ class EnvConfig:
     leak_limit: int | None = DEFAULT_LEAK_LIMIT
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
-    probe_timeout: float | None = DEFAULT_TIMEOUT
+    probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
     isolation: str | None = None
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT
 
@@ -138,17 +131,17 @@ class EnvConfig:
 
     def _check_numbers(self) -> None:
         for key in ("positive_reward", "negative_reward", "fault_reward"):
-            _check_number(key, getattr(self, key))
-        _check_number("warm_up", self.warm_up, minimum=0)
+            check_number(key, getattr(self, key))
+        check_number("warm_up", self.warm_up, minimum=0)
         times = ("time_step", "start_time", "stop_time", "probe_timeout", "call_timeout")
         for key in (*times, "tolerance"):
             value = getattr(self, key)
             if value is not None:
-                _check_number(key, value, positive=key not in {"start_time", "stop_time"})
-        _check_count("substeps", self.substeps)
+                check_number(key, value, positive=key not in {"start_time", "stop_time"})
+        check_count("substeps", self.substeps)
         for key in ("max_episode_steps", "leak_limit"):
             if getattr(self, key) is not None:
-                _check_count(key, getattr(self, key))
+                check_count(key, getattr(self, key))
         retries = self.fault_retries
         if isinstance(retries, bool) or retries not in range(MOST_RETRIES + 1):
             raise ConfigError(
@@ -169,217 +162,6 @@ class EnvConfig:
         for name, limits in self.bounds.items():
             _check_bounds(name, limits)
 
-    def resolve(self, description: ModelDescription) -> Interface:
-        """Look all names up in the FMU and settle what the config left to it.
-
-        Raises:
-            ConfigError: If a name is unknown, or its variable cannot be used so.
-        """
-        given = [
-            (start_variable(description, name, value), value)
-            for name, value in self.model_parameters.items()
-        ]
-        interface = Interface(
-            inputs=tuple(input_variable(description, n) for n in self.model_input_names),
-            outputs=tuple(output_variable(description, n) for n in self.model_output_names),
-            monitors=tuple(output_variable(description, n) for n in self.monitor_names),
-            parameters={v.name: checked(v, value) for v, value in given if v.numeric},
-            strings=tuple((v, value) for v, value in given if not v.numeric),
-            config=self,
-            description=description,
-        )
-        for name in self.bounds:
-            if name not in self.model_input_names + self.model_output_names:
-                raise unknown_name(
-                    "input or output in 'bounds'",
-                    name,
-                    self.model_input_names + self.model_output_names,
-                )
-        return interface
-
-
-@dataclass(frozen=True)
-class Interface:
-    """A config with its names looked up in one FMU."""
-
-    inputs: tuple[Variable, ...]
-    outputs: tuple[Variable, ...]
-    monitors: tuple[Variable, ...]
-    parameters: Mapping[str, Any]
-    strings: tuple[tuple[Variable, str], ...]
-    config: EnvConfig
-    description: ModelDescription
-
-    @property
-    def time_step(self) -> float:
-        """Length of one step in seconds."""
-        step = self.config.time_step or self.description.step_size
-        if step is None:
-            raise ConfigError(
-                f"config key 'time_step' is missing, and {self.description.model_name} "
-                "has no default step size"
-            )
-        return step
-
-    def bounds(self, variable: Variable) -> tuple[float, float]:
-        """The limits of a variable: the config's, or else the FMU's.
-
-        Raises:
-            ConfigError: If the FMU's contradict each other.
-        """
-        low, high = self.config.bounds.get(variable.name, (variable.minimum, variable.maximum))
-        if not low <= high:
-            raise ConfigError(
-                f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds'"
-            )
-        return low, high
-
-    def pool_spec(self) -> PoolSpec:
-        """What the pool has to do.
-
-        Raises:
-            ConfigError: If the warm-up is not a whole number of steps.
-        """
-        config, description = self.config, self.description
-        self._require_retries()
-        warm_up_steps = whole_number_of_steps(config.warm_up, self.time_step)
-        if warm_up_steps is None:
-            raise ConfigError(
-                f"warm_up must be a multiple of the time step of {self.time_step} s, "
-                f"got {config.warm_up}"
-            )
-        start = config.start_time
-        return PoolSpec(
-            inputs=self.inputs,
-            outputs=self.outputs + self.monitors,
-            time_step=self.time_step,
-            num_observed=len(self.outputs),
-            substeps=config.substeps,
-            start_time=description.start_time if start is None else start,
-            stop_time=config.stop_time,
-            tolerance=config.tolerance,
-            warm_up_steps=warm_up_steps,
-            strings=self.strings,
-            fault_retries=config.fault_retries,
-            leak_limit=config.leak_limit,
-        )
-
-    def _require_retries(self) -> None:
-        able = self.description.capabilities
-        if not self.config.fault_retries or (
-            able.can_handle_variable_communication_step_size and able.can_get_and_set_fmu_state
-        ):
-            return
-        raise ConfigError(
-            f"config key 'fault_retries': {self.description.model_name} must be able to get and "
-            "set its FMU state and to handle variable communication step sizes, and is not"
-        )
-
-
-def input_variable(description: ModelDescription, name: str) -> Variable:
-    """Find a variable that can be written before every step.
-
-    Raises:
-        ConfigError: If there is none of this name, or it must not be written then.
-    """
-    variable = description.variable(name)
-    _require_numeric(variable, "an input")
-    if not variable.settable_in_step:
-        raise ConfigError(
-            f"{name!r} cannot be an input: it is a {variable.variability} {variable.causality}; "
-            "only inputs and tunable parameters may be set between steps"
-        )
-    return variable
-
-
-def output_variable(description: ModelDescription, name: str) -> Variable:
-    """Find a variable that can be read after every step.
-
-    Raises:
-        ConfigError: If there is none of this name, or a float cannot carry its value.
-    """
-    variable = description.variable(name)
-    _require_numeric(variable, "an output")
-    return variable
-
-
-def _require_numeric(variable: Variable, role: str) -> None:
-    if not variable.numeric:
-        what = "an array" if variable.shape else f"of type {variable.type}"
-        raise ConfigError(
-            f"{variable.name!r} cannot be {role}: it is {what}; expected a scalar Real, "
-            "Integer, Boolean or Enumeration"
-        )
-
-
-def start_variable(description: ModelDescription, name: str, value: Any) -> Variable:
-    """Find a variable that can be set before initialization.
-
-    Raises:
-        ConfigError: If there is none of this name, or it cannot be set or not be carried.
-    """
-    variable = description.variable(name)
-    if not variable.settable_at_start:
-        raise ConfigError(
-            f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "
-            f"with initial={variable.initial!r}"
-        )
-    if variable.kind == "string" and not variable.shape:
-        if not isinstance(value, str):
-            raise ConfigError(f"{name!r} is a String, got {value!r}")
-        return variable
-    _require_numeric(variable, "given a start value")
-    return variable
-
-
-def checked(variable: Variable, value: Any) -> Any:
-    """Check a start value of a numeric variable; a distribution is left for what it draws."""
-    return value if is_distribution(value) else checked_value(variable, value)
-
-
-def checked_value(variable: Variable, value: Any) -> float:
-    """Convert a value for a numeric variable, without loss.
-
-    Raises:
-        ConfigError: If the value is not finite, not of the variable's kind, or out of its type's
-            range.
-    """
-    if variable.type in {"Real", "Float64"} and isinstance(value, float) and math.isfinite(value):
-        return value
-    if isinstance(value, str) and variable.items:
-        return _item_value(variable, value)
-    _check_number(repr(variable.name), value)
-    number = float(value)
-    if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
-        raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {value!r}")
-    if variable.kind == "boolean" and number not in {0.0, 1.0}:
-        raise ConfigError(f"{variable.name!r} is a Boolean, got {value!r}")
-    if variable.kind in {"integer", "enumeration"}:
-        _check_integer(variable, number)
-    return number
-
-
-def _item_value(variable: Variable, name: str) -> float:
-    items = dict(variable.items)
-    if name not in items:
-        raise unknown_name(f"item of {variable.name!r}", name, items)
-    return float(items[name])
-
-
-def _check_integer(variable: Variable, number: float) -> None:
-    low, high = variable.integer_limits
-    if not number.is_integer() or not low <= number <= high:
-        raise ConfigError(
-            f"{variable.name!r} is of type {variable.type}: expected an integer from {low} to "
-            f"{high}, got {number}"
-        )
-    if abs(number) > _LARGEST_EXACT_INTEGER:
-        raise ConfigError(f"{variable.name!r}: integers beyond 2**53 are not exact, got {number}")
-    values = [value for _, value in variable.items]
-    if values and number not in values:
-        listing = ", ".join(f"{value} ({name})" for name, value in variable.items)
-        raise ConfigError(f"{variable.name!r}: expected one of {listing}, got {number:g}")
-
 
 def _names(key: str, value: Any) -> tuple[str, ...]:
     """A bare name stands for one: ModelicaGym split it into its letters."""
@@ -397,37 +179,12 @@ def _mapping(key: str, value: Any) -> dict[str, Any]:
 
 def _check_value(what: str, value: Any) -> None:
     if not is_distribution(value):
-        _check_number(what, value)
-
-
-def _check_number(
-    what: str, value: Any, minimum: float = -math.inf, *, positive: bool = False
-) -> None:
-    number = _number(what, value)
-    if not math.isfinite(number) or number < minimum or (positive and number <= 0):
-        wanted = "positive and finite" if positive else "finite and not negative"
-        raise ConfigError(
-            f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {value!r}"
-        )
-
-
-def _number(what: str, value: Any) -> float:
-    if isinstance(value, Real) or (hasattr(value, "__float__") and np.shape(value) == ()):
-        try:
-            return float(value)
-        except (TypeError, ValueError, OverflowError):
-            pass
-    raise ConfigError(f"{what} must be a number, got {value!r}")
-
-
-def _check_count(what: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ConfigError(f"{what} must be a positive integer, got {value!r}")
+        check_number(what, value)
 
 
 def _check_bounds(name: str, limits: Any) -> None:
     try:
-        low, high = (_number("limit", limit) for limit in limits)
+        low, high = (number_of("limit", limit) for limit in limits)
     except (ConfigError, TypeError, ValueError):
         low = high = math.nan
     if not low < high:

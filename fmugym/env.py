@@ -21,15 +21,17 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym import spaces as fmu_spaces
-from fmugym.adapters import Status
-from fmugym.archive import FMU
-from fmugym.config import EnvConfig, checked, output_variable, start_variable
-from fmugym.episode import Episode, EpisodePlan
+from fmugym.archive.fmu import FMU
+from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError, unknown_name
-from fmugym.pool import Pool, PoolSpec, make_pool
+from fmugym.fmi.status import Status
+from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.health import fault_rates
-from fmugym.values import EpisodeVariables, NamedValues
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.episode import Episode, EpisodePlan
+from fmugym.task.interface import checked, output_variable, resolve, start_variable
+from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.trial.opening import make_pool
 
 if TYPE_CHECKING:
     from fmugym.rendering import Renderer, Scene
@@ -49,7 +51,7 @@ def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
 
     Args:
         num_instances: Number of FMU instances; a vector environment's prototype has all of them.
-        options: Passed to ``fmugym.pool.make_pool``.
+        options: Passed to ``fmugym.trial.opening.make_pool``.
     """
     token = _pool_request.set((num_instances, options))
     try:
@@ -73,7 +75,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         render_mode: One of the class's ``metadata["render_modes"]``, or None.
         backend: What stands in for the FMU, which then only describes the variables: an object
             with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
-            it. Or the name of a way to step the FMU, see ``fmugym.pool.make_pool``.
+            it. Or the name of a way to step the FMU, see ``fmugym.trial.opening.make_pool``.
         isolation: Where the FMU runs, if not where the config says.
 
     Attributes:
@@ -150,7 +152,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.render_mode = self._checked_render_mode(render_mode)
         self.fmu = self._open_fmu(fmu_path)
         self._require_fmi_version()
-        self._interface = self.config.resolve(self.fmu.description)
+        self._interface = resolve(self.config, self.fmu.description)
         self._spec = self._interface.pool_spec()
         self._warn_of_peculiarities()
         self._prepare_values()
@@ -160,8 +162,8 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._step_pool = self._pool.step_own
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
         self._observation_row = self._pool.observations[0]
-        self._halt = getattr(self._pool, "halt", _nothing)
-        self._pool_tells = bool(pool_info(self._pool))
+        self._halt = self._pool.halt
+        self._pool_tells = bool(self._pool.info())
         self._has_info = self._has_info or self._pool_tells
 
     def _checked_render_mode(self, mode: str | None) -> str | None:
@@ -590,7 +592,9 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """What the hook tells, and the pool."""
         info: dict[str, Any] = _given(self._get_info(), "_get_info")
         if self._pool_tells:
-            info = info | {name: value.item(0) for name, value in pool_info(self._pool).items()}
+            info = info | {
+                name: value.item(0) for name, value in self._open_pool("info").info().items()
+            }
         return info
 
     @property
@@ -721,15 +725,6 @@ class FMI3CSEnv(FMUEnv):
     """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 3
-
-
-def _nothing() -> None:
-    """What is to be halted where all is simulated."""
-
-
-def pool_info(pool: Any) -> dict[str, npt.NDArray[Any]]:
-    """What a pool tells of each step, each of shape (N,); paced ones do, and those that retry."""
-    return pool.info() if hasattr(pool, "info") else {}
 
 
 def _given(value: Any, hook: str) -> Any:

@@ -21,7 +21,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
-from fmugym.vector.batch import BatchEngine
+from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.env import attribute
 
 try:

@@ -22,7 +22,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, ContractError
-from fmugym.vector.probe import CURE, find_difference
+from fmugym.vector.hooks.check import CURE, find_difference
 
 __all__ = ["check_fmu_env", "check_hooks"]
 

@@ -7,7 +7,7 @@ import tempfile
 import fmu_tools
 import pytest
 
-# Nearly every test makes an FMU that nobody has met; test_probing.py turns their trials on.
+# Nearly every test makes an FMU that nobody has met; test_trial.py turns their trials on.
 os.environ["FMUGYM_PROBE"] = "off"
 _cache = tempfile.TemporaryDirectory(prefix="fmugym-cache-")
 os.environ["FMUGYM_CACHE_DIR"] = _cache.name

@@ -31,10 +31,11 @@ from fmu_tools import library_name, probe_xml, read_fmu
 from lxml import etree
 
 from fmugym import FMU, EnvConfig, FMUGymError
-from fmugym.bundled import BUNDLED, bundled_fmu
-from fmugym.overview import as_text, overview
-from fmugym.skeleton import Skeleton
-from fmugym.spaces import action_space, observation_space
+from fmugym.archive.bundled import BUNDLED, bundled_fmu
+from fmugym.task.interface import resolve
+from fmugym.task.spaces import action_space, observation_space
+from fmugym.tools.overview import as_text, overview
+from fmugym.tools.skeleton import Skeleton
 
 SLOW, HANG = 5.0, 60.0
 XML = "modelDescription.xml"
@@ -299,7 +300,7 @@ def make_spaces(fmu, inputs, outputs):
     config = {"model_input_names": inputs, "model_output_names": outputs}
     config["time_step"] = fmu.description.step_size or 0.1
     with contextlib.suppress(FMUGymError):
-        interface = EnvConfig.from_dict(config).resolve(fmu.description)
+        interface = resolve(EnvConfig.from_dict(config), fmu.description)
         interface.pool_spec()
         observation_space(interface)
         action_space(interface)

@@ -9,7 +9,8 @@ import zipfile
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_fmu, write_fmu
 
-from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, safe_zip
+from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError
+from fmugym.archive import safe_zip
 
 
 @pytest.fixture

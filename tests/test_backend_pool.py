@@ -12,9 +12,10 @@ from gymnasium.wrappers import RecordVideo
 
 import fmugym
 from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, Paced, SimulationError, Status
-from fmugym.clock import ManualClock
-from fmugym.pool import BackendPool, PoolSpec, make_pool
-from fmugym.pool import backend as backend_module
+from fmugym.pool import BackendPool, PoolSpec
+from fmugym.pool.backend import pool as backend_module
+from fmugym.pool.backend.clock import ManualClock
+from fmugym.trial.opening import make_pool
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")
 OMEGA = 3.0  # rad/s

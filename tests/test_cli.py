@@ -11,8 +11,8 @@ import zlib
 import pytest
 
 import fmugym
-from fmugym.bundled import BUNDLED, FMI_VERSIONS
-from fmugym.cli import main
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.tools.cli import main
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{1}}" description="{description}">

@@ -13,9 +13,10 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import FMU, ConfigError, SimulationError
-from fmugym.adapters import Status
-from fmugym.pool import PoolSpec, has_native_pool, make_pool
+from fmugym.fmi.status import Status
+from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.leaks import LeakWatch, resident_bytes
+from fmugym.trial.opening import make_pool
 from fmugym.vector import FMUVectorEnv
 
 LOG = logging.getLogger("fmugym.test")

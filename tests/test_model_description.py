@@ -8,7 +8,7 @@ import pytest
 from fmu_tools import ITEMS, MAJOR_VERSIONS, edited_fmu, probe_fmu, read_fmu, write_fmu
 
 from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, bundled_fmu
-from fmugym.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 
 
 def describe(path):

@@ -24,14 +24,15 @@ from process_tools import FaultyEnv, faulty_fmu, start_values
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
-from fmugym.adapters import Status
+from fmugym.archive.temporary import make_folder, sweep
+from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.block_worker import BlockWorker
-from fmugym.pool.channel import Channel
-from fmugym.pool.launcher import _fork_server, _SpawnedProcess
-from fmugym.pool.process import ProcessPool
-from fmugym.pool.shared_memory import Memory
-from fmugym.temporary import make_folder, sweep
+from fmugym.pool.process.channel import Channel
+from fmugym.pool.process.launcher import _fork_server, _SpawnedProcess
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.shared_memory import Memory
+from fmugym.pool.process.worker import BlockWorker
+from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
 HERE = Path(__file__).parent
@@ -88,7 +89,7 @@ def fixture_make_pool(faulty, opened):
         outputs = tuple(map(fmu.variable, ["y", "fault"]))
         spec = PoolSpec((fmu.variable("u"),), outputs, time_step=0.5, num_observed=1)
         options = {"isolation": "process", "workers": 2, "call_timeout": 20.0} | options
-        return opened(pools.make_pool(fmu, spec, num_instances, LOG, **options))
+        return opened(opening.make_pool(fmu, spec, num_instances, LOG, **options))
 
     return make
 
@@ -373,7 +374,8 @@ class TestPool:
 
     def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
         monkeypatch.setattr(
-            "fmugym.pool.supervisor.launch", lambda end, memory, _: _SpawnedProcess(end, memory)
+            "fmugym.pool.process.supervisor.launch",
+            lambda end, memory, _: _SpawnedProcess(end, memory),
         )
         pool = make_pool()
         set_up(pool, faulty, ["crash"], at=2)
@@ -422,7 +424,7 @@ class WorkerThread:
 @pytest.mark.parametrize("backend", ["auto", "python"])
 def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, backend):
     here = make_pool(3, isolation="none")
-    monkeypatch.setattr("fmugym.pool.supervisor.launch", WorkerThread)
+    monkeypatch.setattr("fmugym.pool.process.supervisor.launch", WorkerThread)
     pool = make_pool(3, backend=backend)
     with pytest.raises(SimulationError):
         pool.save()  # before the first reset
@@ -470,7 +472,7 @@ class TestChoice:
 PROGRAM = """
 import os, signal, sys, time
 import process_tools
-from fmugym.pool.launcher import _fork_server
+from fmugym.pool.process.launcher import _fork_server
 
 env = process_tools.FaultyEnv(sys.argv[1])
 env.reset()

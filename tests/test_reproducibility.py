@@ -11,7 +11,7 @@ from pythonfmu.builder import FmuBuilder
 from test_foreign_fmu import TankEnv
 
 import fmugym
-from fmugym.bundled import FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.env import request_pool
 from fmugym.envs import CartPoleEnv, PendulumEnv
 

@@ -14,7 +14,7 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
 import fmugym
-from fmugym.bundled import BUNDLED, FMI_VERSIONS, MODELS, bundled_fmu
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, bundled_fmu
 
 ROOT = Path(__file__).parents[1]
 STATES = {

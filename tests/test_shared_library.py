@@ -10,8 +10,9 @@ import fmpy
 import pytest
 from fmu_tools import HERE, edited_fmu, library_name, probe_config, read_fmu
 
-from fmugym import FMU, FMULoadError, archive, bundled_fmu
-from fmugym.shared_library import check_library, missing_libraries
+from fmugym import FMU, FMULoadError, bundled_fmu
+from fmugym.archive import fmu as archive
+from fmugym.archive.shared_library import check_library, missing_libraries
 
 PENDULUM = read_fmu(bundled_fmu("Pendulum", "3.0"))
 FOLDERS = {

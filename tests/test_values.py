@@ -6,7 +6,7 @@ import pickle
 import pytest
 
 from fmugym import ConfigError
-from fmugym.values import EpisodeVariables, LateDict, NamedValues
+from fmugym.task.values import EpisodeVariables, LateDict, NamedValues
 
 
 class TestNamedValues:

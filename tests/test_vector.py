@@ -17,7 +17,7 @@ from fmugym import Choice, ConfigError, ContractError, Normal, SimulationError, 
 from fmugym.pool import has_native_pool
 from fmugym.testing import check_hooks
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.batch import BatchEngine
+from fmugym.vector.engines.batch import BatchEngine
 
 BACKENDS = ("python", "native") if has_native_pool() else ("python",)
 WAYS = [(backend, hooks) for backend in BACKENDS for hooks in ("array", "per_env")]

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import zoo_tools
 
-from fmugym.last_words import describe_exit
 from fmugym.pool import has_native_pool
+from fmugym.pool.process.last_words import describe_exit
 
 
 def main(folder, *modes):

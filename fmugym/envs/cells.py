@@ -12,10 +12,10 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from fmugym.adapters import Status
-from fmugym.clock import RealClock
 from fmugym.errors import ConfigError
+from fmugym.fmi.status import Status
 from fmugym.pool import Paced
+from fmugym.pool.backend.clock import RealClock
 
 __all__ = ["Cell", "Lease", "paced_cells"]
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.envs.cells import paced_cells

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMUEnv
 from fmugym.rendering import CartPoleFrame, CartPoleScene
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.rendering import PendulumFrame, PendulumScene

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive import FMU
+from fmugym.archive.fmu import FMU
 from fmugym.checks import flag, mapping, number, text, whole_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError, shown
@@ -179,7 +179,7 @@ def fit_parameters(
             of Human Resources 50 (2015).
         drop_repeats: Whether to drop stale samples first; see ``Trajectory.without_repeats``.
         max_evaluations: Largest number of evaluations of the optimization.
-        backend: See ``fmugym.pool.make_pool``.
+        backend: See ``fmugym.trial.opening.make_pool``.
 
     Returns:
         Values, standard errors, and the comparison of measurement and simulation.

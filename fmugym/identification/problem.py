@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive import FMU
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
 from fmugym.checks import as_float, number, text
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.identification._scipy import scipy_module
@@ -23,7 +24,6 @@ from fmugym.identification.results import Comparison
 from fmugym.identification.simulation import Simulator
 from fmugym.identification.statistics import information_inverse
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.model_description import Variable
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Experiment", "Limits", "Problem"]

@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fmugym.adapters import Status
-from fmugym.archive import FMU
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
 from fmugym.checks import number
-from fmugym.config import checked_value
 from fmugym.errors import ConfigError
+from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.model_description import Variable
-from fmugym.pool import make_pool
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
+from fmugym.task.interface import checked_value
+from fmugym.trial.opening import make_pool
 
 __all__ = ["Simulator"]
 
@@ -41,7 +41,7 @@ class Simulator:
         fixed: Values of further parameters.
         num_sets: Largest number of sets.
         time_step: In seconds; None for the trajectories' median sampling interval.
-        backend: See ``fmugym.pool.make_pool``.
+        backend: See ``fmugym.trial.opening.make_pool``.
 
     Attributes:
         description: The FMU's model description.

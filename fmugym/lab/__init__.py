@@ -15,13 +15,13 @@ To run a program for the real lab here, change its import::
 delay, and ``Lab(clock=ManualClock())`` has a clock that the program moves.
 """
 
-from fmugym.clock import Clock, ManualClock, RealClock
 from fmugym.lab.client import Client
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
 from fmugym.lab.errors import LabError
 from fmugym.lab.lab import Lab, current_lab
 from fmugym.lab.presets import HARDWARE, IDEAL, Options
 from fmugym.lab.users import User
+from fmugym.pool.backend.clock import Clock, ManualClock, RealClock
 
 __all__ = [
     "HARDWARE",

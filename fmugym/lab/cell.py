@@ -11,12 +11,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.adapters import Status
-from fmugym.archive import FMU
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.archive.fmu import FMU
 from fmugym.checks import mapping
-from fmugym.config import checked_value, start_variable
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.fmi.status import Status
 from fmugym.lab.acting import Acting
 from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance
@@ -26,7 +25,9 @@ from fmugym.lab.experiments import EXPERIMENTS, PLANTS
 from fmugym.lab.presets import Options
 from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
-from fmugym.pool import Pool, PoolSpec, make_pool
+from fmugym.pool import Pool, PoolSpec
+from fmugym.task.interface import checked_value, start_variable
+from fmugym.trial.opening import make_pool
 
 __all__ = ["Cell", "checked_parameters"]
 

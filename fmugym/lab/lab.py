@@ -10,7 +10,6 @@ from typing import Any, Final, cast
 import numpy as np
 
 from fmugym.checks import mapping, whole_number
-from fmugym.clock import Clock, RealClock
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.cell import Cell, checked_parameters
 from fmugym.lab.client import Client
@@ -19,6 +18,7 @@ from fmugym.lab.data import CellType
 from fmugym.lab.presets import Options, make_options
 from fmugym.lab.service import Service
 from fmugym.lab.users import User
+from fmugym.pool.backend.clock import Clock, RealClock
 
 __all__ = ["Lab", "current_lab"]
 

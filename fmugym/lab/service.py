@@ -15,7 +15,6 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.clock import Clock
 from fmugym.errors import unknown_name
 from fmugym.lab import controls
 from fmugym.lab.admission import check_lease, check_request
@@ -33,6 +32,7 @@ from fmugym.lab.sessions import Gym, Session
 from fmugym.lab.timekeeper import Timekeeper
 from fmugym.lab.users import Account, Accounts
 from fmugym.lab.videos import VideoFolder
+from fmugym.pool.backend.clock import Clock
 
 __all__ = ["Service"]
 

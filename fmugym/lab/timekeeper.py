@@ -6,9 +6,9 @@ import math
 from typing import Final
 
 from fmugym.checks import number
-from fmugym.clock import Clock
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.errors import LabError, as_lab_error
+from fmugym.pool.backend.clock import Clock
 
 __all__ = ["Timekeeper"]
 

@@ -8,14 +8,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.adapters import Status
-from fmugym.pool.base import PoolSpec
+from fmugym.fmi.status import Status
+from fmugym.pool.base import Pool
+from fmugym.pool.spec import PoolSpec
 
 __all__ = [
     "HEALTH",
     "HEALTH_COUNTS",
     "Column",
-    "Counted",
+    "CountedPool",
     "HealthArray",
     "fault_rates",
     "no_counts",
@@ -71,8 +72,11 @@ def note(counts: HealthArray, status: int) -> int:
     return status
 
 
-class Counted:
-    """The health of a pool, which has ``_spec`` and ``_counts`` of shape (N, HEALTH_COUNTS)."""
+class CountedPool(Pool):
+    """A pool that counts what its instances do.
+
+    A subclass has ``_spec``, and ``_counts`` of shape (N, HEALTH_COUNTS).
+    """
 
     _spec: PoolSpec
     _counts: HealthArray

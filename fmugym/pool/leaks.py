@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable
 from typing import Final, ParamSpec, TypeVar
 
-from fmugym.archive import FMU
-from fmugym.bundled import is_bundled
+from fmugym.archive.bundled import is_bundled
+from fmugym.archive.fmu import LoadableFMU
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.health import Column, HealthArray
 
@@ -142,7 +142,7 @@ class ProcessGrowth:
 
 
 def watch_leaks(
-    fmu: FMU,
+    fmu: LoadableFMU,
     spec: PoolSpec,
     counts: HealthArray,
     recycle: Callable[[], None],

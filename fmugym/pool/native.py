@@ -26,10 +26,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.adapters import Status
-from fmugym.archive import FMU
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.model_description import Variable
+from fmugym.fmi.status import Status
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -37,7 +37,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.health import Counted, HealthArray, no_counts
+from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 
 __all__ = ["NativePool"]
@@ -75,7 +75,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(Counted):
+class NativePool(CountedPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -87,7 +87,7 @@ class NativePool(Counted):
             processor that this process may use. Results do not depend on it.
         private_libraries: Whether each instance gets a copy of the FMU's library, and so of its
             global variables, of its own; by default only where the FMU says that it can be
-            instantiated only once per process. See ``fmugym.pool.isolation``.
+            instantiated only once per process. See ``fmugym.trial.shared_globals``.
         first_index: What messages number the first instance.
         counts: Where to count what is in ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
 
@@ -104,7 +104,7 @@ class NativePool(Counted):
 
     def __init__(
         self,
-        fmu: FMU,
+        fmu: LoadableFMU,
         spec: PoolSpec,
         num_instances: int,
         log: logging.Logger,
@@ -190,6 +190,11 @@ class NativePool(Counted):
             access = _native.Access(version, types, references.tobytes())
             self._accesses[variables] = access
         return access
+
+    @property
+    def can_play(self) -> bool:
+        """See ``Pool.can_play``."""
+        return True
 
     # The contract of Pool.
 
@@ -450,7 +455,7 @@ class NativePool(Counted):
 
 
 class PlayProgram(Protocol):
-    """See ``fmugym.vector.trace.Program``."""
+    """See ``fmugym.vector.hooks.trace.Program``."""
 
     @property
     def code(self) -> npt.NDArray[np.uint16]:
@@ -527,6 +532,6 @@ def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
     return paths
 
 
-def _close(pool: _native.Pool, fmu: FMU) -> None:
+def _close(pool: _native.Pool, fmu: LoadableFMU) -> None:
     pool.close()
     fmu.close()

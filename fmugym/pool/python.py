@@ -11,18 +11,21 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.adapters import Access, Instance, Library, Phase, SavedState, Status
-from fmugym.archive import FMU
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMUGymError, SimulationError
-from fmugym.model_description import Variable
+from fmugym.fmi.access import Access
+from fmugym.fmi.instance import Instance, SavedState
+from fmugym.fmi.library import Library
+from fmugym.fmi.status import Phase, Status
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
-from fmugym.pool.health import Column, Counted, HealthArray, no_counts, note
+from fmugym.pool.health import Column, CountedPool, HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
 
 __all__ = ["PythonPool"]
 
 
-class PythonPool(Counted):
+class PythonPool(CountedPool):
     """N instances stepped one after another; see ``Pool`` for the contract.
 
     Args:
@@ -38,7 +41,7 @@ class PythonPool(Counted):
 
     def __init__(
         self,
-        fmu: FMU,
+        fmu: LoadableFMU,
         spec: PoolSpec,
         num_instances: int,
         log: logging.Logger,
@@ -332,7 +335,7 @@ class _Slot:
 
     def _replace(self) -> None:
         self._counts[Column.REPLACEMENTS] += 1
-        self._instance.discard()
+        self._library.discard(self._instance)
         self._build()
 
     def _set_start_values(self) -> None:

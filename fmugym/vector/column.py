@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.adapters import Status
-from fmugym.model_description import Variable
+from fmugym.archive.description import Variable
+from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 
 __all__ = ["PoolColumn"]
 
 
-class PoolColumn:
+class PoolColumn(Pool):
     """See ``Pool``; steps and resets leave the other instances alone.
 
     Args:
@@ -93,11 +93,19 @@ class PoolColumn:
         """See ``Pool.forget_health``; the counts are those of all."""
         self._pool.forget_health()
 
+    @property
+    def is_real(self) -> bool:
+        """See ``Pool.is_real``."""
+        return self._pool.is_real
+
+    def halt(self) -> None:
+        """See ``Pool.halt``; the other instances stop, too."""
+        self._pool.halt()
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """What the pool tells of each step; see ``fmugym.env.pool_info``."""
-        pool: Any = self._pool
-        told = pool.info() if hasattr(pool, "info") else {}
-        return {name: row[self._index : self._index + 1] for name, row in told.items()}
+        """See ``Pool.info``."""
+        column = slice(self._index, self._index + 1)
+        return {name: row[column] for name, row in self._pool.info().items()}
 
     def close(self) -> None:
         """The pool is the vector environment's to close."""

@@ -12,14 +12,14 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from fmugym.config import checked_value
 from fmugym.env import FMUEnv, request_pool
 from fmugym.errors import ConfigError, SimulationError, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.vector.batch import BatchEngine, Engine, StepResult
-from fmugym.vector.compiled import CompiledEngine, find_programs
-from fmugym.vector.per_env import PerEnvEngine
-from fmugym.vector.probe import CURE, find_difference
+from fmugym.task.interface import checked_value
+from fmugym.vector.engines.batch import BatchEngine, Engine, StepResult
+from fmugym.vector.engines.compiled import CompiledEngine, find_programs
+from fmugym.vector.engines.per_env import PerEnvEngine
+from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.views import column
 
 __all__ = ["FMUVectorEnv", "attribute", "vectorized"]
@@ -48,7 +48,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             a single environment: compiled for the native pool where they are plain arithmetic, on
             arrays, or one environment at a time. ``"compiled"``, ``"array"`` and ``"per_env"`` ask
             for one of them; where it is not possible, that is an error.
-        pool_options: Passed to ``fmugym.pool.make_pool``: ``backend``, ``threads``,
+        pool_options: Passed to ``fmugym.trial.opening.make_pool``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
     Raises:

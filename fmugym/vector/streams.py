@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from fmugym.episode import EpisodePlan
 from fmugym.pool.base import FloatArray
+from fmugym.task.episode import EpisodePlan
 
 __all__ = ["EpisodeStreams"]
 

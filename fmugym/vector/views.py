@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive import FMU
-from fmugym.config import EnvConfig, Interface
+from fmugym.archive.fmu import FMU
+from fmugym.config import EnvConfig
 from fmugym.env import FMUEnv
-from fmugym.episode import EpisodePlan
 from fmugym.pool import PoolSpec
-from fmugym.values import EpisodeVariables, NamedValues
+from fmugym.task.episode import EpisodePlan
+from fmugym.task.interface import Interface
+from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.vector.column import PoolColumn
 
 __all__ = ["batched", "column", "copied_attributes", "envs_first", "light_copy", "take"]

@@ -1,0 +1,59 @@
+"""Where the FMUs that come with the package are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fmugym.errors import ConfigError, unknown_name
+
+__all__ = ["BUNDLED", "FMI_VERSIONS", "MODELS", "bundled_fmu", "is_bundled"]
+
+FMI_VERSIONS = ("1.0", "2.0", "3.0")
+"""The FMI versions of the bundled FMUs."""
+
+_VERSIONS = {
+    "CartPole": FMI_VERSIONS,
+    "Pendulum": FMI_VERSIONS,
+    "DoublePendulum": ("2.0", "3.0"),
+}
+
+MODELS = tuple(_VERSIONS)
+"""The names of the bundled models."""
+
+BUNDLED = tuple((model, version) for model, versions in _VERSIONS.items() for version in versions)
+"""Each bundled FMU's model and FMI version."""
+
+_PACKAGE = Path(__file__).parent.parent
+_FOLDERS = (_PACKAGE / "fmus", _PACKAGE.parent / "resources" / "fmus")
+"""In an installed package, and in a checkout of the repository."""
+
+
+def bundled_fmu(model: str, fmi_version: str | float = "2.0") -> Path:
+    """Find a bundled FMU.
+
+    Args:
+        model: One of ``MODELS``.
+        fmi_version: One of ``FMI_VERSIONS``, as text or number; "2.0" or "3.0" for the double
+            pendulum.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        ConfigError: If there is no such model or version, or the model not in this version.
+    """
+    version = str(float(fmi_version)) if isinstance(fmi_version, int | float) else fmi_version
+    if model not in MODELS:
+        raise unknown_name("bundled model", model, MODELS)
+    if version not in FMI_VERSIONS:
+        raise unknown_name("FMI version", version, FMI_VERSIONS)
+    if version not in _VERSIONS[model]:
+        there = " and ".join(_VERSIONS[model])
+        raise ConfigError(f"there is no bundled {model} for FMI {version}, only for {there}")
+    candidates = [folder / version / f"{model}.fmu" for folder in _FOLDERS]
+    return next((path for path in candidates if path.exists()), candidates[0])
+
+
+def is_bundled(path: Path) -> bool:
+    """Whether an FMU is one of those that come with the package."""
+    return any(path.is_relative_to(folder) for folder in _FOLDERS)

@@ -1,0 +1,87 @@
+"""Real time for pools: the schedule of the steps, and the order for one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.errors import ConfigError
+from fmugym.pool.backend.clock import Clock, RealClock
+from fmugym.pool.base import FloatArray, MaskArray
+
+__all__ = ["Paced", "Schedule"]
+
+_TOLERANCE: Final = 0.1
+"""Lateness that is no miss, in periods."""
+
+_PATIENCE: Final = 3
+"""Periods without a step after which a backend holds, if nothing else is asked for."""
+
+
+@dataclass(frozen=True)
+class Paced:
+    """A backend whose steps are paced: each waits for its tick, one time step after the last.
+
+    Pacing is elastic: what comes too late is not made up for, but shifts all ticks that follow.
+
+    Args:
+        backend: One, a sequence, or a function; see ``BackendPool``.
+        clock: What tells the time; by default the machine's.
+        hold_after: Time without a step after which a backend is asked to ``hold``, and again after
+            the same time, in s; by default three time steps.
+
+    Raises:
+        ConfigError: If ``hold_after`` is not positive.
+    """
+
+    backend: Any
+    clock: Clock = field(default_factory=RealClock)
+    hold_after: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.hold_after is not None and not self.hold_after > 0.0:
+            raise ConfigError(f"hold_after must be positive, not {self.hold_after!r}")
+
+    def patience(self, period: float) -> float:
+        """Return ``hold_after`` or its default for a period, in s."""
+        return _PATIENCE * period if self.hold_after is None else self.hold_after
+
+
+class Schedule:
+    """The ticks of N backends that are stepped together.
+
+    Args:
+        period: Time from one tick to the next, in s.
+        clock: What tells the time.
+        count: N.
+
+    Attributes:
+        misses: How many ticks of this episode came too late, by more than a tenth of the period,
+            shape (N,).
+        worst: The largest lateness in this episode, in s, shape (N,).
+    """
+
+    def __init__(self, period: float, clock: Clock, count: int) -> None:
+        self._period, self._clock = period, clock
+        self._due = np.zeros(count)
+        self.misses = np.zeros(count, np.int64)
+        self.worst: FloatArray = np.zeros(count)
+
+    def start(self, chosen: MaskArray) -> None:
+        """Begin an episode now, for some of them: the first tick is a period from now."""
+        self._due[chosen] = self._clock.time() + self._period
+        self.misses[chosen] = 0
+        self.worst[chosen] = 0.0
+
+    def wait(self, chosen: MaskArray) -> None:
+        """Wait for the next tick of some of them, at least one; not at all if it is over."""
+        tick = float(self._due[chosen].max())
+        self._clock.sleep(tick - self._clock.time())
+        now = self._clock.time()
+        tolerance = _TOLERANCE * self._period
+        late = np.where(chosen, now - self._due, 0.0)
+        self.misses += late > tolerance
+        np.maximum(self.worst, late, out=self.worst)
+        self._due[chosen] = (now if now > tick + tolerance else tick) + self._period

@@ -1,0 +1,246 @@
+"""What a user wants to know of an FMU at first sight, as plain data and as text.
+
+Nothing of the FMU is executed: all of it stands in the archive's listing and the XML.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+
+__all__ = ["as_text", "overview", "plain", "start_value"]
+
+SCHEMA: Final = 1
+"""Raised when a key of the overview goes or changes its meaning; new keys do not raise it."""
+
+SHOWN: Final = ("input", "output", "parameter")
+"""The causalities that are listed without being asked for."""
+
+_HEADINGS: Final = {
+    "input": "Inputs",
+    "output": "Outputs",
+    "parameter": "Parameters",
+    "structuralParameter": "Structural parameters",
+    "calculatedParameter": "Calculated parameters",
+    "local": "Locals",
+    "independent": "Independent variables",
+}
+_COLUMNS: Final = ("name", "type", "unit", "range", "start", "variability", "description")
+_WIDEST: Final = 44
+
+
+def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) -> dict[str, Any]:
+    """Gather what there is to say of an FMU.
+
+    Args:
+        fmu: The FMU.
+        everything: List variables of every causality, not only those of ``SHOWN``.
+        pattern: List only variables whose name matches, of every causality. ``*`` stands for any
+            text and ``?`` for one character; brackets stand for themselves, as FMI names have them.
+
+    Returns:
+        Dicts, lists, strings, finite numbers, Booleans and None; ``fmugym.tools.cli`` describes
+        the keys. Variables are in the order of the model description.
+    """
+    description = fmu.description
+    variables = description.variables.values()
+    return {
+        "schema": SCHEMA,
+        "path": str(fmu.path),
+        **{name: getattr(description, name) for name in _TEXTS},
+        "interfaces": list(description.interfaces),
+        "platforms": list(fmu.platforms),
+        "platform": fmu.platform,
+        "library": fmu.library,
+        "runs_here": fmu.runs_here,
+        "capabilities": asdict(description.capabilities),
+        "default_experiment": {name: getattr(description, name) for name in _TIMES},
+        "fixed_internal_step_size": description.fixed_internal_step_size,
+        "findings": list(description.findings),
+        "variable_counts": dict(Counter(variable.causality for variable in variables)),
+        "variables": [_row(v) for v in variables if _is_wanted(v, everything, pattern)],
+    }
+
+
+_TEXTS: Final = (
+    "fmi_version",
+    "model_name",
+    "model_identifier",
+    "instantiation_token",
+    "description",
+    "generation_tool",
+)
+_TIMES: Final = ("start_time", "stop_time", "step_size", "tolerance")
+
+
+def _is_wanted(variable: Variable, everything: bool, pattern: str | None) -> bool:
+    if pattern is None:
+        return everything or variable.causality in SHOWN
+    expression = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
+    return re.fullmatch(expression, variable.name, re.DOTALL) is not None
+
+
+def _row(variable: Variable) -> dict[str, Any]:
+    return {
+        "name": variable.name,
+        "causality": variable.causality,
+        "variability": variable.variability,
+        "initial": variable.initial,
+        "type": variable.type,
+        "shape": list(variable.shape),
+        "unit": variable.unit,
+        "min": _finite(variable.minimum),
+        "max": _finite(variable.maximum),
+        "nominal": variable.nominal,
+        "start": start_value(variable),
+        "items": [{"name": name, "value": value} for name, value in variable.items],
+        "description": variable.description,
+        "settable_at_start": variable.settable_at_start,
+        "settable_in_step": variable.settable_in_step,
+    }
+
+
+def _finite(number: float) -> float | None:
+    """JSON has no infinities."""
+    return number if math.isfinite(number) else None
+
+
+def start_value(variable: Variable) -> bool | int | float | str | None:
+    """Convert the start value, which the XML has as text, to the variable's type.
+
+    Returns:
+        The value; the text itself for strings, arrays and whatever is not finite or malformed.
+    """
+    text = variable.start
+    if text is None or variable.shape or variable.kind in {"string", "binary", "clock"}:
+        return text
+    if variable.kind == "boolean":
+        return {"true": True, "1": True, "false": False, "0": False}.get(text.lower(), text)
+    try:
+        number = float(text) if variable.kind == "real" else int(text)
+        return number if math.isfinite(number) else text
+    except (ValueError, OverflowError):
+        return text
+
+
+def plain(text: object) -> str:
+    """Bring a text of a foreign file into one line of printable ASCII.
+
+    The rest is escaped: an old console cannot show it, and a terminal may obey it.
+    """
+    line = " ".join(str(text).split())
+    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in line)
+
+
+def as_text(facts: Mapping[str, Any]) -> str:
+    """Lay an overview out for the reader of a terminal.
+
+    Args:
+        facts: What ``overview`` returned.
+
+    Returns:
+        Lines of printable ASCII.
+    """
+    return "\n".join([*_heading(facts), *_findings(facts), *_tables(facts), *_not_listed(facts)])
+
+
+def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
+    yield plain(f"{facts['model_name']} (FMI {facts['fmi_version']})")
+    if facts["description"]:
+        yield plain(facts["description"])
+    rows = {
+        "file": facts["path"],
+        "generated by": facts["generation_tool"] or "not given",
+        "interfaces": ", ".join(facts["interfaces"]),
+        "platforms": ", ".join(facts["platforms"]) or "none",
+        "this machine": _this_machine(facts),
+        "default experiment": _experiment(facts),
+        "capabilities": _capabilities(facts["capabilities"]),
+    }
+    for name, value in rows.items():
+        yield f"  {name:<20}{plain(value)}"
+
+
+def _this_machine(facts: Mapping[str, Any]) -> str:
+    if facts["runs_here"]:
+        return f"{facts['platform']}: runs here"
+    return f"{facts['platform']}: does NOT run here, there is no {facts['library']}"
+
+
+def _experiment(facts: Mapping[str, Any]) -> str:
+    times = dict(facts["default_experiment"])
+    if facts["fixed_internal_step_size"] is not None:
+        times["internal step"] = facts["fixed_internal_step_size"]
+    units = {"tolerance": ""}
+    return ", ".join(
+        f"{name.removesuffix('_time').removesuffix('_size')} "
+        + ("not given" if value is None else f"{value:g}{units.get(name, ' s')}")
+        for name, value in times.items()
+    )
+
+
+def _capabilities(flags: Mapping[str, bool]) -> str:
+    return ", ".join(name for name, flag in flags.items() if flag) or "none"
+
+
+def _findings(facts: Mapping[str, Any]) -> Iterator[str]:
+    if facts["findings"]:
+        yield f"\nFindings in the model description ({len(facts['findings'])})"
+    for finding in facts["findings"]:
+        yield f"  - {plain(finding)}"
+
+
+def _tables(facts: Mapping[str, Any]) -> Iterator[str]:
+    causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones come last
+    for causality in dict.fromkeys(causalities):
+        rows = [v for v in facts["variables"] if v["causality"] == causality]
+        if rows:
+            yield f"\n{_HEADINGS.get(causality, plain(causality))} ({len(rows)})"
+            yield from _table([_COLUMNS, *map(_cells, rows)])
+
+
+def _not_listed(facts: Mapping[str, Any]) -> Iterator[str]:
+    listed = Counter(variable["causality"] for variable in facts["variables"])
+    left_out = Counter(facts["variable_counts"]) - listed
+    if left_out:
+        counts = ", ".join(f"{count} {plain(name)}" for name, count in left_out.items())
+        yield f"\nNot listed: {counts}"
+
+
+def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    shape = f"[{','.join(map(str, row['shape']))}]" if row["shape"] else ""
+    start = row["start"]
+    cells = (
+        row["name"],
+        row["type"] + shape,
+        row["unit"] or "-",
+        _range(row),
+        "-" if start is None else f"{start:.10g}" if isinstance(start, float) else start,
+        row["variability"],
+        row["description"],
+    )
+    return tuple(map(plain, cells))
+
+
+def _range(row: Mapping[str, Any]) -> str:
+    if row["items"]:
+        return " ".join(f"{item['value']}={item['name']}" for item in row["items"])
+    low, high = row["min"], row["max"]
+    if low is None and high is None:
+        return "-"
+    return f"{-math.inf if low is None else low:g} .. {math.inf if high is None else high:g}"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Align the columns; a cell wider than ``_WIDEST`` pushes the rest of its line."""
+    widths = [min(_WIDEST, max(map(len, column))) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True))
+        yield ("  " + "  ".join(cells)).rstrip()

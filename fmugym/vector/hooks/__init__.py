@@ -1,0 +1,1 @@
+"""Whether hooks work on arrays, and hooks turned into programs."""
