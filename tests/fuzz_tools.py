@@ -1,6 +1,7 @@
 """Odd values, and the running of cases that use them; see ``fuzz_lab.py`` and its siblings."""
 
 import argparse
+import contextlib
 import datetime
 import decimal
 import faulthandler
@@ -151,7 +152,10 @@ def watch(case, rng, folder):
     try:
         with tempfile.TemporaryDirectory(dir=folder) as own, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy's, about odd values
-            outcome, trouble = case(rng, Path(own))
+            here = Path(own, "here")
+            here.mkdir()
+            with contextlib.chdir(here):  # odd texts may be names of folders
+                outcome, trouble = case(rng, Path(own))
     except Exception as error:
         return "failed", f"{type(error).__name__}: {error}"
     finally:
