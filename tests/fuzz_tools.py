@@ -71,7 +71,7 @@ NUMBERS = (
 TEXTS = (
     *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum", "None"),
     *("\0", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5", bytearray(b"5")),
-    *(OddText("5"), OddText("SimplePendulum"), "ideal", "hardware", "rgb_array", "../x", "/"),
+    *(OddText("5"), OddText("SimplePendulum"), "ideal", "hardware", "rgb_array", "../x"),
 )
 GROUPS = (
     *((), [], {}, set(), frozenset([1]), [1], [1.0, 2.0], (None,), [None, None], [[1]], [[]]),
