@@ -22,8 +22,11 @@ __all__ = [
     "FMUGymError",
     "FMULoadError",
     "SimulationError",
+    "shown",
     "unknown_name",
 ]
+
+_LONGEST_SHOWN = 120
 
 
 class FMUGymError(Exception):
@@ -46,20 +49,40 @@ class ContractError(FMUGymError):
     """An environment does not keep what every environment of this package promises."""
 
 
+def shown(value: object) -> str:
+    """Return the text that stands for a value in an error message.
+
+    Args:
+        value: Any object, even one whose ``repr`` fails.
+
+    Returns:
+        One printable line of at most 120 characters.
+    """
+    try:
+        text = repr(value)
+    except Exception:
+        text = f"<{type(value).__name__} without a text>"
+    if "\n" in text:  # an array
+        text = " ".join(text.split())
+    if not text.isprintable():
+        text = text.encode("unicode_escape").decode()
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     """Make the error for a name that does not exist.
 
     Args:
         kind: What the name should have named, for example ``"config key"``.
-        name: The name as it was given.
-        known: All the names that would have been right.
+        name: The name that was given.
+        known: All valid names.
 
     Returns:
-        The error, with the nearest known name or, where none is near, some of the known names.
+        The error. It suggests the nearest known name, or lists known names if none is near.
     """
     names = list(known)
-    near = difflib.get_close_matches(str(name), names, n=1)
+    near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
     if near:
-        return ConfigError(f"unknown {kind} {name!r}; did you mean {near[0]!r}?")
+        return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near[0]!r}?")
     listing = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
-    return ConfigError(f"unknown {kind} {name!r}; known are: {listing or 'none'}")
+    return ConfigError(f"unknown {kind} {shown(name)}; known are: {listing or 'none'}")
