@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.errors import printable
 
 __all__ = ["as_text", "overview", "plain", "start_value"]
 
@@ -133,10 +134,10 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
 def plain(text: object) -> str:
     """Bring a text of a foreign file into one line of printable ASCII.
 
-    The rest is escaped: an old console cannot show it, and a terminal may obey it.
+    Other characters are escaped: an old console cannot show them, and a terminal may obey them.
     """
-    line = " ".join(str(text).split())
-    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in line)
+    line = printable(" ".join(str(text).split()))
+    return line.encode("ascii", "backslashreplace").decode()
 
 
 def as_text(facts: Mapping[str, Any]) -> str:
