@@ -8,8 +8,10 @@ was tidied up is told in ``SafeZip.notes``.
 
 from __future__ import annotations
 
+import copy
 import io
 import os
+import posixpath
 import re
 import stat
 import struct
@@ -44,6 +46,9 @@ _SMALL: Final = 16 * 2**20
 _DIRECTORY_BYTES_PER_ENTRY: Final = 512
 _MOST_FOLDERS: Final = 64
 """Folders inside of each other. Windows and Linux refuse the paths of much deeper ones anyway."""
+_MOST_LINKS: Final = 8
+"""Symbolic links that may point to each other."""
+_LONGEST_TARGET: Final = 4096
 _LONGEST_QUOTE: Final = 120
 """Characters of a name that an error quotes."""
 _STANDARD_FOLDERS: Final = ("binaries", "documentation", "extra", "resources", "sources")
@@ -111,8 +116,12 @@ class SafeZip:
         except _ZIP_ERRORS as error:
             raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
         _check_sizes(path, entries, limits)
+        self._links: dict[str, zipfile.ZipInfo] = {}
         for entry in entries:
             self._add(entry)
+        if self._links:
+            self._follow_links()
+            _check_sizes(path, list(self.files.values()), limits)
         self._check_folders()
 
     # Reading the directory
@@ -125,7 +134,9 @@ class SafeZip:
             self.folders.add(place)
             return
         self._check_file(entry, place)
-        if self._prefers(place, entry):
+        if stat.S_ISLNK(entry.external_attr >> 16):
+            self._links[place] = entry
+        elif self._prefers(place, entry):
             self.files[place] = entry
 
     def _prefers(self, place: str, entry: zipfile.ZipInfo) -> bool:
@@ -166,8 +177,6 @@ class SafeZip:
             raise self._refusal(entry, "has the name of a device of Windows")
         if entry.header_offset < 0:
             raise self._refusal(entry, "is not all there; copy or export the FMU again")
-        if stat.S_ISLNK(entry.external_attr >> 16):
-            raise self._refusal(entry, "is a symbolic link; pack the file that it points to")
         if entry.flag_bits & _ENCRYPTED:
             raise self._refusal(entry, "is encrypted; pack the archive without a password")
         if entry.compress_type not in _METHODS:
@@ -176,6 +185,26 @@ class SafeZip:
                 f"is compressed by method {entry.compress_type}; FMI allows only stored (0) and "
                 "deflated (8) files, so pack the archive again",
             )
+
+    def _follow_links(self) -> None:
+        """Let each symbolic link stand for the file of the archive that it points to."""
+        targets = {place: self._link_target(place) for place in self._links}
+        for place, entry in self._links.items():
+            target = targets[place]
+            for _ in range(_MOST_LINKS):
+                target = targets.get(target, target)
+            if target not in self.files:
+                raise self._refusal(
+                    entry,
+                    f"is a symbolic link to {_quoted(targets[place])}, not a file of the archive",
+                )
+            self.files[place] = copy.copy(self.files[target])
+
+    def _link_target(self, place: str) -> str:
+        entry = self._links[place]
+        with self._opened() as archive, archive.open(entry) as file:
+            target = os.fsdecode(_read_at_most(cast(BinaryIO, file), _LONGEST_TARGET))
+        return posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
 
     def _check_folders(self) -> None:
         """Find files where a folder has to be, and places that are one place on this system.
@@ -340,10 +369,10 @@ def _folders_of(places: Iterable[str]) -> set[str]:
     """Find all folders above places; each is looked at once."""
     folders: set[str] = set()
     for place in places:
-        folder = os.path.dirname(place)
+        folder = posixpath.dirname(place)
         while folder and folder not in folders:
             folders.add(folder)
-            folder = os.path.dirname(folder)
+            folder = posixpath.dirname(folder)
     return folders
 
 

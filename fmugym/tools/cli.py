@@ -19,11 +19,15 @@ meaning, ``schema`` is raised. What the FMU does not give is null, or ``""`` for
 - ``interfaces``: of ``co-simulation``, ``model exchange``, ``scheduled execution``
 - ``platforms``: the folders under ``binaries/``
 - ``platform``, ``library``: the folder and the file that this machine needs
-- ``runs_here``: whether the FMU has that file
+- ``runs_here``: whether nothing is known that would keep the FMU from being loaded
+- ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
+- ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
+  with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``
+- ``execution_tool``: the tool that must be installed; null if the FMU needs none
 - ``capabilities``: flags by name, those of ``fmugym.archive.description.Capabilities``
 - ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
 - ``fixed_internal_step_size``: in s
-- ``findings``: texts, what is not valid in the model description
+- ``findings``: texts, what breaks rules in the archive and in the model description
 - ``variable_counts``: number of all variables by causality
 - ``variables``: those asked for, in the order of the XML, each with ``name``, ``causality``,
   ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``, ``nominal``,
