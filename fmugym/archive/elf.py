@@ -131,10 +131,17 @@ class ElfLibrary:
         """
         versions = {i: name for file, i, name in self._needed_versions() if file == library}
         found = {}
-        for name, index in zip(self._symbols(), self._versions_of_symbols(), strict=False):
+        for (name, _), index in zip(self._symbols(), self._versions_of_symbols(), strict=False):
             if index in versions:
                 found[name] = versions[index]
         return found
+
+    def unversioned_symbols(self) -> set[str]:
+        """The symbols that it takes from any library, without asking for a version."""
+        undefined = [name for name, is_defined in self._symbols() if name and not is_defined]
+        files = {file for file, _, _ in self._needed_versions()}
+        versioned = {symbol for file in files for symbol in self.needed_symbols(file)}
+        return set(undefined) - versioned
 
     def _sections(self, kind: int) -> Iterator[tuple[int, int]]:
         """Place and size of the sections of a kind."""
@@ -144,11 +151,12 @@ class ElfLibrary:
             if type_ == kind:
                 yield start, length
 
-    def _symbols(self) -> Iterator[str]:
+    def _symbols(self) -> Iterator[tuple[str, bool]]:
+        """The name of each symbol, and whether the library defines it itself."""
         for start, length in self._sections(_SYMBOL_TABLE):
             table = self._source.read(start, length)
             for row in _SYMBOL.iter_unpack(table[: len(table) // _SYMBOL.size * _SYMBOL.size]):
-                yield self._string(row[0])
+                yield self._string(row[0]), row[3] != 0
 
     def _versions_of_symbols(self) -> Iterator[int]:
         for start, length in self._sections(_VERSION_TABLE):

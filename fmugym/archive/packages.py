@@ -27,7 +27,7 @@ _STAND_IN: Final = "no current distribution has it; 'fmugym stand-in FMU' makes 
 
 _SOURCES: Final[tuple[tuple[str, Source], ...]] = (
     (r"libgfortran\.so\.3", Source("", "libgfortran=3", _STAND_IN)),
-    (r"libgfortran\.so\.4", Source("", "libgfortran4", _STAND_IN)),
+    (r"libgfortran\.so\.4", Source("", "libgfortran-ng=7", _STAND_IN)),
     (r"libgfortran\.so\.5", Source("libgfortran5", "libgfortran5")),
     (r"libquadmath\.so\.0", Source("libquadmath0", "libquadmath")),
     (r"libgomp\.so\.1", Source("libgomp1", "libgomp")),
