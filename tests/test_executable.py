@@ -186,6 +186,17 @@ except fmugym.FMULoadError as error:
         add = {beside: (needy / "libgave.so").read_bytes(), library_name(2): self.content(needy)}
         assert self.run(edited_fmu(fmu_path, tmp_path / "other", add=add)) == self.STEPPED
 
+    @pytest.mark.parametrize("backend", ["native", "python"])
+    def test_beside_the_library_where_the_loader_does_not_look(
+        self, fmu_path, needy, tmp_path, backend
+    ):
+        beside = library_name(2).replace("Probe.so", "libgave.so")
+        add = {beside: (needy / "libgave.so").read_bytes()}
+        path = edited_fmu(fmu_path, tmp_path / "other", add=add)
+        assert FMU(path).runs_here
+        assert self.run(path, backend) == self.STEPPED
+        assert self.run(path, backend, isolation="process") == self.STEPPED
+
     def test_those_of_libraries_that_the_fmu_brings(self, needy, tmp_path):
         """The FMU's library is fine, but not the one that it needs."""
         (tmp_path / "beside").mkdir()
@@ -206,7 +217,7 @@ except fmugym.FMULoadError as error:
 
     def test_a_preloaded_library_that_is_not_there(self, fmu_path):
         said = self.run(fmu_path, preload=["/nowhere/libgave.so"])
-        assert said.startswith("'/nowhere/libgave.so' of preload cannot be loaded")
+        assert said.startswith("the library '/nowhere/libgave.so' cannot be loaded")
 
 
 def test_paths_of_preload_are_relative_to_the_class(probe, tmp_path, monkeypatch):

@@ -162,8 +162,6 @@ class TestTransitively:
         self.compile(tmp_path, "use.c", "libbeside.so", "libgfortran.so.4")
         code = "int use(void), gone(void); int f(void) { return use() + gone(); }"
         (tmp_path / "model.c").write_text(code)
-            "int use(void), gone(void); int f() { return use() + gone(); }"
-        )
         (tmp_path / "blas.c").write_text("int gone(void) { return 1; }")
         self.compile(tmp_path, "blas.c", "libnone.so.0")
         self.compile(tmp_path, "model.c", "Model.so", "libnone.so.0", "libbeside.so")

@@ -7,11 +7,26 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from fmugym.archive.elf import opened
 from fmugym.errors import FMULoadError
 
-__all__ = ["libraries_of", "load_globally", "missing_libraries"]
+__all__ = ["libraries_of", "load_globally", "missing_libraries", "stray_libraries"]
+
+
+class _Needed(NamedTuple):
+    """A library that another one needs.
+
+    Attributes:
+        name: Its name.
+        path: Where it is among the files of the FMU, or None.
+        found: Whether the loader finds it there.
+    """
+
+    name: str
+    path: Path | None
+    found: bool
 
 
 def missing_libraries(library: Path, provided: Iterable[str] = ()) -> list[str]:
@@ -19,8 +34,9 @@ def missing_libraries(library: Path, provided: Iterable[str] = ()) -> list[str]:
 
     The search is the loader's own: libraries that are loaded already, the library's search path
     (``$ORIGIN`` is its folder), and, by asking the loader, ``LD_LIBRARY_PATH``, the cache of
-    ldconfig and the system's folders. What the libraries need that the FMU brings along is looked
-    for too. Nothing of the FMU is loaded.
+    ldconfig and the system's folders. Libraries beside the FMU's own count as found, since
+    ``stray_libraries`` are loaded before. What the libraries need that the FMU brings along is
+    looked for too. Nothing of the FMU is loaded.
 
     Args:
         library: The library, extracted.
@@ -36,19 +52,36 @@ def missing_libraries(library: Path, provided: Iterable[str] = ()) -> list[str]:
         return []
     known = set(_names_of(provided))
     missing: list[str] = []
-    for name, path in _needed(library):
-        if path is None and name not in known:
-            missing += [found for found in _not_found(name) if found not in {*missing, *known}]
+    for needed in _needed(library):
+        if needed.path is None and needed.name not in known:
+            absent = _not_found(needed.name)
+            missing += [name for name in absent if name not in {*missing, *known}]
     return missing
+
+
+def stray_libraries(library: Path) -> list[Path]:
+    """Find libraries that an FMU brings along in a folder where the loader does not look.
+
+    Args:
+        library: The FMU's library, extracted.
+
+    Returns:
+        Their paths, in the order in which they are to be loaded before the FMU's library. Empty on
+        systems other than Linux.
+    """
+    if sys.platform != "linux":
+        return []
+    stray = [needed for needed in _needed(library) if needed.path and not needed.found]
+    return [needed.path for needed in reversed(stray) if needed.path and _not_found(needed.name)]
 
 
 def libraries_of(library: Path) -> list[Path]:
     """The library, and those that it needs and finds among the files of its FMU."""
-    return [library, *(path for _, path in _needed(library) if path is not None)]
+    return [library, *(needed.path for needed in _needed(library) if needed.path)]
 
 
-def _needed(library: Path) -> Iterator[tuple[str, Path | None]]:
-    """Each library that is needed, once, and where it is if the FMU brings it along."""
+def _needed(library: Path) -> Iterator[_Needed]:
+    """Each library that is needed, once."""
     seen: set[str] = set()
     todo: list[tuple[Path, list[Path]]] = [(library, [])]
     while todo:
@@ -59,10 +92,15 @@ def _needed(library: Path) -> Iterator[tuple[str, Path | None]]:
             if name in seen:
                 continue
             seen.add(name)
-            beside = next((f / name for f in folders if (f / name).is_file()), None)
-            if beside is not None:
-                todo.append((beside, folders))
-            yield name, beside
+            found = _file_in(folders, name)
+            there = found or _file_in([library.parent], name)
+            if there is not None:
+                todo.append((there, folders))
+            yield _Needed(name, there, found is not None)
+
+
+def _file_in(folders: Iterable[Path], name: str) -> Path | None:
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def _names_of(libraries: Iterable[str]) -> Iterator[str]:
@@ -96,4 +134,4 @@ def load_globally(path: str) -> None:
     try:
         ctypes.CDLL(path, mode=getattr(os, "RTLD_GLOBAL", ctypes.DEFAULT_MODE))
     except OSError as error:
-        raise FMULoadError(f"{path!r} of preload cannot be loaded: {error}") from None
+        raise FMULoadError(f"the library {path!r} cannot be loaded: {error}") from None

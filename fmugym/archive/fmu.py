@@ -18,7 +18,7 @@ from typing import Final
 
 import fmpy
 
-from fmugym.archive.dependencies import load_globally, missing_libraries
+from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.executable import check_library
 from fmugym.archive.packages import describe_missing
@@ -78,14 +78,15 @@ class LoadableFMU(ABC):
     def prepare_library(self) -> Path:
         """Make the FMU's library ready to be loaded into this process.
 
-        Loads the libraries of ``preload`` and looks for those that the FMU's library needs.
+        Loads the libraries of ``preload`` and those that the FMU brings along where the loader
+        does not look, and finds out which others are missing.
 
         Returns:
             The path of the library, in the folder of ``extract``.
 
         Raises:
-            FMULoadError: As ``extract``; or if a library of ``preload`` cannot be loaded, or
-                others are missing.
+            FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
+                are missing.
         """
         library = self.extract() / self.library
         for path in self.preload:
@@ -93,6 +94,8 @@ class LoadableFMU(ABC):
         missing = missing_libraries(library)
         if missing:
             raise FMULoadError(f"{self.path.name} {describe_missing(missing)}")
+        for stray in stray_libraries(library):
+            load_globally(str(stray))
         return library
 
 
