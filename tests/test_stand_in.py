@@ -12,6 +12,7 @@ from fmu_tools import HERE, edited_fmu, library_name
 
 from fmugym import FMU, ConfigError
 from fmugym.archive.dependencies import missing_libraries
+from fmugym.archive.loader import ask, ask_in_a_child
 from fmugym.archive.packages import source_of
 from fmugym.tools import stand_in
 from fmugym.tools.cli import main
@@ -176,6 +177,20 @@ class TestTransitively:
 
     def test_all_are_named(self, library):
         assert sorted(missing_libraries(library)) == ["libgfortran.so.4", "libnone.so.0"]
+
+    def test_a_library_that_ends_its_process(self, library, tmp_path, monkeypatch):
+        """Nothing is known then; but this process lives."""
+        (tmp_path / "empty.c").write_text(
+            "#include <stdlib.h>\nint gone; __attribute__((constructor)) void f(void) { _Exit(3); }"
+        )
+        self.compile(tmp_path, "empty.c", "libnone.so.0")
+        (tmp_path / "libs").mkdir()
+        (tmp_path / "libnone.so.0").rename(tmp_path / "libs" / "libnone.so.0")
+        monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path / "libs"))
+        assert missing_libraries(library, ask=ask_in_a_child) == []
+
+    def test_a_path_is_never_loaded(self):
+        assert ask(["/nowhere/x.so", f"{HERE}/conftest.py"]) == ["/nowhere/x.so"]
 
     def test_those_that_are_preloaded_are_not(self, library, tmp_path):
         preloaded = tmp_path / "elsewhere.so"

@@ -5,11 +5,12 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from fmugym.archive.elf import opened
+from fmugym.archive.loader import ask
 from fmugym.errors import FMULoadError
 
 __all__ = ["libraries_of", "load_globally", "missing_libraries", "stray_libraries"]
@@ -29,7 +30,9 @@ class _Needed(NamedTuple):
     found: bool
 
 
-def missing_libraries(library: Path, provided: Iterable[str] = ()) -> list[str]:
+def missing_libraries(
+    library: Path, provided: Iterable[str] = (), ask: Callable[[Sequence[str]], list[str]] = ask
+) -> list[str]:
     """Find the shared libraries that a library needs and the system's loader would not find.
 
     The search is the loader's own: libraries that are loaded already, the library's search path
@@ -41,6 +44,7 @@ def missing_libraries(library: Path, provided: Iterable[str] = ()) -> list[str]:
     Args:
         library: The library, extracted.
         provided: Paths or names of libraries that will be loaded before.
+        ask: Asks the loader; see ``fmugym.archive.loader``.
 
     Returns:
         Their names. Empty on systems other than Linux, where the loader has to report them.
@@ -51,12 +55,8 @@ def missing_libraries(library: Path, provided: Iterable[str] = ()) -> list[str]:
     if sys.platform != "linux":
         return []
     known = set(_names_of(provided))
-    missing: list[str] = []
-    for needed in _needed(library):
-        if needed.path is None and needed.name not in known:
-            absent = _not_found(needed.name)
-            missing += [name for name in absent if name not in {*missing, *known}]
-    return missing
+    absent = ask([n.name for n in _needed(library) if n.path is None and n.name not in known])
+    return list(dict.fromkeys(name for name in absent if name not in known))
 
 
 def stray_libraries(library: Path) -> list[Path]:
@@ -72,7 +72,7 @@ def stray_libraries(library: Path) -> list[Path]:
     if sys.platform != "linux":
         return []
     stray = [needed for needed in _needed(library) if needed.path and not needed.found]
-    return [needed.path for needed in reversed(stray) if needed.path and _not_found(needed.name)]
+    return [needed.path for needed in reversed(stray) if needed.path and ask([needed.name])]
 
 
 def libraries_of(library: Path) -> list[Path]:
@@ -110,16 +110,6 @@ def _names_of(libraries: Iterable[str]) -> Iterator[str]:
         if os.path.isfile(library):
             with opened(Path(library)) as elf:
                 yield elf.soname or ""
-
-
-def _not_found(name: str) -> list[str]:
-    """Ask the loader for a library; returns what is missing: itself, or one that it needs."""
-    try:
-        ctypes.CDLL(name)
-    except OSError as error:
-        missing, _, reason = str(error).partition(": ")
-        return [missing if reason.startswith("cannot open shared object file") else name]
-    return []
 
 
 def load_globally(path: str) -> None:

@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -32,6 +33,9 @@ _VERSION_TABLE: Final = 0x6FFFFFFF
 _NEEDED_TABLE: Final = 0x6FFFFFFE
 _NEEDED, _STRINGS, _STRINGS_SIZE, _SONAME, _RPATH, _RUNPATH = 1, 5, 10, 14, 15, 29
 _MOST_VERSIONS: Final = 10_000
+_MOST_LIBRARIES: Final = 1_000
+_MOST_FOLDERS: Final = 100
+"""No library has more of these, but a damaged one may seem to."""
 
 
 class Segment(NamedTuple):
@@ -103,7 +107,7 @@ class ElfLibrary:
     @property
     def needed(self) -> list[str]:
         """The names of the libraries that it needs."""
-        return self._texts(_NEEDED)
+        return self._texts(_NEEDED)[:_MOST_LIBRARIES]
 
     @property
     def soname(self) -> str | None:
@@ -115,7 +119,7 @@ class ElfLibrary:
         origin = str(folder)
         entries = [f for text in self._texts(_RPATH, _RUNPATH) for f in text.split(":") if f]
         expanded = [f.replace("$ORIGIN", origin).replace("${ORIGIN}", origin) for f in entries]
-        return [Path(folder) for folder in expanded]
+        return [Path(folder) for folder in expanded[:_MOST_FOLDERS]]
 
     # Symbol versions
 
@@ -129,7 +133,7 @@ class ElfLibrary:
             Versions by symbol. Symbols without a version do not say from which library they come,
             and are left out.
         """
-        versions = {i: name for file, i, name in self._needed_versions() if file == library}
+        versions = {i: name for file, i, name in self._needed_versions if file == library}
         found = {}
         for (name, _), index in zip(self._symbols(), self._versions_of_symbols(), strict=False):
             if index in versions:
@@ -139,7 +143,7 @@ class ElfLibrary:
     def unversioned_symbols(self) -> set[str]:
         """The symbols that it takes from any library, without asking for a version."""
         undefined = [name for name, is_defined in self._symbols() if name and not is_defined]
-        files = {file for file, _, _ in self._needed_versions()}
+        files = {file for file, _, _ in self._needed_versions}
         versioned = {symbol for file in files for symbol in self.needed_symbols(file)}
         return set(undefined) - versioned
 
@@ -164,14 +168,17 @@ class ElfLibrary:
             for (index,) in struct.iter_unpack("<H", table[: len(table) // 2 * 2]):
                 yield index & 0x7FFF
 
-    def _needed_versions(self) -> Iterator[tuple[str, int, str]]:
+    @cached_property
+    def _needed_versions(self) -> list[tuple[str, int, str]]:
         """Library, number and name of each version that symbols refer to."""
+        return list(islice(self._versions(), _MOST_VERSIONS))
+
+    def _versions(self) -> Iterator[tuple[str, int, str]]:
         for place, _ in self._sections(_NEEDED_TABLE):
-            for _ in range(_MOST_VERSIONS):
+            next_need = 1
+            while next_need:
                 _, count, file, first, next_need = self._source.unpack(_NEED, place)
-                yield from self._versions_of(self._string(file), place + first, count)
-                if not next_need:
-                    break
+                yield from self._versions_of(self._string(file), place + first, max(count, 1))
                 place += next_need
 
     def _versions_of(self, file: str, place: int, count: int) -> Iterator[tuple[str, int, str]]:

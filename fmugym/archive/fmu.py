@@ -21,6 +21,7 @@ import fmpy
 from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.executable import check_library
+from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
 from fmugym.archive.reading import read_model_description
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
@@ -232,13 +233,16 @@ class FMU(LoadableFMU):
         if self._library_place is None:
             return ()
         if self._folder is not None:
-            return tuple(missing_libraries(self._folder / self.library, self.preload))
+            return self._missing_in(self._folder)
         folder = make_folder()
         try:
             self._extract_to(folder, only="binaries")
-            return tuple(missing_libraries(folder / self.library, self.preload))
+            return self._missing_in(folder)
         finally:
             remove_folder(folder, os.getpid())
+
+    def _missing_in(self, folder: Path) -> tuple[str, ...]:
+        return tuple(missing_libraries(folder / self.library, self.preload, ask_in_a_child))
 
     def extract(self) -> Path:
         """Extract what this machine needs, once, into a temporary folder.
