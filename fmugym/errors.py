@@ -8,7 +8,8 @@
     ├── SimulationError   an FMI call failed, or a call came out of its order
     └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
-Every error takes one argument, its text, and so survives pickling between processes.
+Every error takes one argument, its text, and so survives pickling between processes. The text is
+shown with ``printable``: it may quote an FMU.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ __all__ = [
     "FMUGymError",
     "FMULoadError",
     "SimulationError",
+    "printable",
     "shown",
     "unknown_name",
 ]
@@ -29,8 +31,31 @@ __all__ = [
 _LONGEST_SHOWN = 120
 
 
+def printable(text: object) -> str:
+    r"""Escape what a terminal may obey or a log may take for a line of its own.
+
+    Names, descriptions and messages of an FMU are foreign texts. Every exit uses this function:
+    errors, logs, infos and the command line.
+
+    Args:
+        text: A text, or an object that is turned into one.
+
+    Returns:
+        The text on one line. Letters of all languages stay. Control characters, line breaks,
+        marks that reverse the direction of writing and the like become ``\x1b``, ``\n`` and
+        so on.
+    """
+    line = str(text)
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
 class FMUGymError(Exception):
     """Base class of all errors of this package."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class ConfigError(FMUGymError):
@@ -64,8 +89,7 @@ def shown(value: object) -> str:
         text = f"<{type(value).__name__} without a text>"
     if "\n" in text:  # an array
         text = " ".join(text.split())
-    if not text.isprintable():
-        text = text.encode("unicode_escape").decode()
+    text = printable(text)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
 
 

@@ -21,6 +21,8 @@ from fmpy.fmi2 import fmi2CallbackFunctions
 from fmpy.fmi3 import fmi3LogMessageCallback
 from fmpy.logging import addLoggerProxy
 
+from fmugym.errors import printable
+
 __all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message"]
 
 logger = logging.getLogger(__name__)
@@ -76,8 +78,8 @@ class MessageLog:
 
 
 def _deliver(environment: int | None, status: int, category: bytes, message: bytes) -> None:
-    category_text = (category or b"").decode(errors="replace")
-    text = (message or b"").decode(errors="replace").rstrip()
+    category_text = printable((category or b"").decode(errors="replace"))
+    text = printable((message or b"").decode(errors="replace").rstrip())
     receiver = _receivers.get(environment or 0)
     if receiver is not None:
         receiver.receive(status, category_text, text)

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from fmugym import _native
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
-from fmugym.errors import FMULoadError, SimulationError
+from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.pool.base import (
     FloatArray,
@@ -253,7 +253,7 @@ class NativePool(CountedPool):
             variables = self._spec.inputs if "inputs" in doing else self._spec.outputs
             return f"{doing}: {_not_finite(variables, values)}"
         text = self._sentence(index, doing, status, time, string)
-        text += f"; the FMU said: {said}" if said else ""
+        text += f"; the FMU said: {printable(said)}" if said else ""
         return f"the warm-up failed: {text}" if in_warm_up else text
 
     def _sentence(self, index: int, doing: str, status: int, time: float, string: int) -> str:
@@ -488,12 +488,14 @@ class _Receiver:
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         number = self._first_index + index
-        self._log.log(level, "%s_%d: [%s] %s", self._model, number, category, message)
+        texts = printable(category), printable(message)
+        self._log.log(level, "%s_%d: [%s] %s", self._model, number, *texts)
 
 
 def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
     pairs = zip(variables, np.frombuffer(values).tolist(), strict=True)
-    return ", ".join(f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+    bad = (f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+    return printable(", ".join(bad))
 
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fmugym.archive.description import Variable
-from fmugym.errors import FMUGymError, SimulationError
+from fmugym.errors import FMUGymError, SimulationError, printable
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.library import Library
@@ -253,8 +253,8 @@ class Slot:
 
     def _not_finite(self, what: str, variables: Sequence[Variable], values: list[float]) -> int:
         pairs = zip(variables, values, strict=True)
-        bad = ", ".join(f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
-        self.failure = f"the {what} are not finite: {bad}"
+        bad = (f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+        self.failure = f"the {what} are not finite: {printable(', '.join(bad))}"
         return Status.NOT_FINITE
 
     def _failed_call(self, doing: str, status: int) -> int:

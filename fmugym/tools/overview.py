@@ -1,6 +1,6 @@
-"""What a user wants to know of an FMU at first sight, as plain data and as text.
+"""The facts about an FMU that a user asks for first, as plain data and as text.
 
-Nothing of the FMU is executed: all of it stands in the archive's listing and the XML.
+They come from the archive and the XML. Nothing of the FMU is executed.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from typing import Any, Final
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.packages import source_of
+from fmugym.errors import FMULoadError, printable
 
 __all__ = ["as_text", "overview", "plain", "start_value"]
 
@@ -34,10 +36,11 @@ _HEADINGS: Final = {
 }
 _COLUMNS: Final = ("name", "type", "unit", "range", "start", "variability", "description")
 _WIDEST: Final = 44
+_MOST_FINDINGS: Final = 100
 
 
 def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) -> dict[str, Any]:
-    """Gather what there is to say of an FMU.
+    """Gather the facts about an FMU.
 
     Args:
         fmu: The FMU.
@@ -60,13 +63,34 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         "platform": fmu.platform,
         "library": fmu.library,
         "runs_here": fmu.runs_here,
+        "obstacles": list(fmu.obstacles),
+        "missing_libraries": [_library_row(name) for name in _missing_libraries(fmu)],
+        "execution_tool": _execution_tool(fmu),
         "capabilities": asdict(description.capabilities),
         "default_experiment": {name: getattr(description, name) for name in _TIMES},
         "fixed_internal_step_size": description.fixed_internal_step_size,
-        "findings": list(description.findings),
+        "findings": list(fmu.findings),
         "variable_counts": dict(Counter(variable.causality for variable in variables)),
         "variables": [_row(v) for v in variables if _is_wanted(v, everything, pattern)],
     }
+
+
+def _missing_libraries(fmu: FMU) -> tuple[str, ...]:
+    try:
+        return fmu.missing_libraries
+    except FMULoadError:  # the obstacles tell why
+        return ()
+
+
+def _library_row(name: str) -> dict[str, str]:
+    return {"name": name, **source_of(name)._asdict()}
+
+
+def _execution_tool(fmu: FMU) -> str | None:
+    """Name the tool that must be installed; the generation tool is the only hint at it."""
+    if not fmu.description.capabilities.needs_execution_tool:
+        return None
+    return fmu.description.generation_tool or "the tool that exported it"
 
 
 _TEXTS: Final = (
@@ -133,10 +157,10 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
 def plain(text: object) -> str:
     """Bring a text of a foreign file into one line of printable ASCII.
 
-    The rest is escaped: an old console cannot show it, and a terminal may obey it.
+    Other characters are escaped: an old console cannot show them, and a terminal may obey them.
     """
-    line = " ".join(str(text).split())
-    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in line)
+    line = printable(" ".join(str(text).split()))
+    return line.encode("ascii", "backslashreplace").decode()
 
 
 def as_text(facts: Mapping[str, Any]) -> str:
@@ -169,9 +193,10 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _this_machine(facts: Mapping[str, Any]) -> str:
-    if facts["runs_here"]:
-        return f"{facts['platform']}: runs here"
-    return f"{facts['platform']}: does NOT run here, there is no {facts['library']}"
+    platform, tool = facts["platform"], facts["execution_tool"]
+    if not facts["runs_here"]:
+        return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
+    return f"{platform}: runs here" + (f" if it is installed: {tool}" if tool else "")
 
 
 def _experiment(facts: Mapping[str, Any]) -> str:
@@ -192,9 +217,11 @@ def _capabilities(flags: Mapping[str, bool]) -> str:
 
 def _findings(facts: Mapping[str, Any]) -> Iterator[str]:
     if facts["findings"]:
-        yield f"\nFindings in the model description ({len(facts['findings'])})"
-    for finding in facts["findings"]:
+        yield f"\nFindings ({len(facts['findings'])})"
+    for finding in facts["findings"][:_MOST_FINDINGS]:
         yield f"  - {plain(finding)}"
+    if len(facts["findings"]) > _MOST_FINDINGS:
+        yield "  - more are listed with --json"
 
 
 def _tables(facts: Mapping[str, Any]) -> Iterator[str]:

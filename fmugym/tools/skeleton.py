@@ -140,8 +140,8 @@ class Skeleton:
             yield "the FMU has no outputs; locals stand in for them"
         if self._description.step_size is None:
             yield "the FMU gives no step size; set 'time_step'"
-        if not self._fmu.runs_here:
-            yield f"the FMU does not run on this machine: it has no {self._fmu.library}"
+        for obstacle in self._fmu.obstacles:
+            yield f"the FMU does not run on this machine: {obstacle}"
 
     def text(self) -> str:
         """The Python file, ASCII."""
