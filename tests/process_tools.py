@@ -1,6 +1,7 @@
 """An FMU that harms its process (``faulty.c``), and an environment over it."""
 
 import functools
+import os
 import subprocess
 import sys
 import tempfile
@@ -71,3 +72,16 @@ class FaultyEnv(fmugym.FMI2CSEnv):
 
     def _is_done(self):
         return self.state[0] < -1e9
+
+
+def processes_with(folder):
+    """The numbers of the processes, other than this one, that have a file of a folder mapped."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and int(process.name) != os.getpid():
+            try:
+                maps = (process / "maps").read_text()
+            except OSError:  # it has ended, or is another user's
+                continue
+            found += [int(process.name)] if str(folder) in maps else []
+    return found

@@ -19,7 +19,8 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from process_tools import FaultyEnv, faulty_fmu, start_values
+from process_tools import FaultyEnv, faulty_fmu, processes_with, start_values
+from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
@@ -259,6 +260,88 @@ class TestVector:
         assert len(env.unwrapped._prototype._pool.processes()) == 3
 
 
+@linux_only
+class TestForks:
+    """An FMU that forks: the new process has all that the worker has, its connection too."""
+
+    @pytest.fixture(name="make")
+    def fixture_make(self, tmp_path, opened):
+        def make(fault, **config):
+            config = {"isolation": "process", "call_timeout": 60.0} | config
+            return opened(
+                ZooEnv(zoo_fmu(tmp_path, 2), model_parameters=parameters(fault), **config)
+            )
+
+        return make
+
+    def test_a_death_is_noticed_at_once(self, make, temp_root):
+        env = make("fork_and_crash")
+        env.reset()
+        env.step([1.0])
+        begin = time.monotonic()
+        truncated, info = env.step([1.0])[3:]
+        assert time.monotonic() - begin < 10.0
+        assert truncated
+        assert "ended with signal SIGSEGV in a step" in info["fault"]
+        env.reset()
+        assert len(processes_with(temp_root)) == 1
+        env.close()
+        assert processes_with(temp_root) == []
+
+    def test_a_death_between_two_calls(self, make):
+        env = make("fork")
+        env.reset()
+        for _ in range(2):
+            assert not env.step([1.0])[3]
+        os.kill(env._pool.processes()[0], signal.SIGKILL)
+        assert "SIGKILL" in env.step([1.0])[4]["fault"]
+
+    @pytest.mark.parametrize("fault", ["fork", "fork_and_loop"])
+    def test_no_process_is_left(self, make, temp_root, fault):
+        env = make(fault, call_timeout=0.7 if fault == "fork_and_loop" else 60.0)
+        env.reset()
+        fine = [not env.step([1.0])[3] for _ in range(2)]
+        assert fine == [True, fault == "fork"]
+        if fault == "fork":
+            assert len(processes_with(temp_root)) == 2
+        env.close()
+        assert processes_with(temp_root) == []
+
+    def test_a_twin_does_not_take_part(self, make, temp_root):
+        """Its function returns in both processes."""
+        env = make("fork_a_twin")
+        for _ in range(3):
+            env.reset()
+            assert [env.step([1.0])[0].item() for _ in range(4)] == [0.5, 1.0, 1.5, 2.0]
+        wait_until(lambda: len(processes_with(temp_root)) == 1)
+
+    def test_a_killed_parent_leaves_none(self, tmp_path, temp_root):
+        zoo_fmu(tmp_path, 2)
+        program = subprocess.Popen(
+            [sys.executable, "-c", FORKING_PROGRAM, tmp_path / "Zoo.fmu"],
+            env=os.environ | {"PYTHONPATH": str(HERE)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        with program:
+            assert program.stdout.readline() == "ready\n"
+            assert len(processes_with(temp_root)) == 2
+            program.kill()
+        wait_until(lambda: not processes_with(temp_root))
+
+
+FORKING_PROGRAM = """
+import sys, time, zoo_tools
+env = zoo_tools.ZooEnv(
+    sys.argv[1], model_parameters=zoo_tools.parameters("fork", at=1), isolation="process"
+)
+env.reset()
+env.step([1.0])
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
 class TestPool:
     def test_blocks_and_processes(self, make_pool):
         assert len(set(make_pool(5, workers=3).processes())) == 3
@@ -401,7 +484,7 @@ class TestPool:
 class WorkerThread:
     """A worker in this process, which shows what it does to those who look at this process only."""
 
-    pid = 0
+    pid, sentinel = 0, None
 
     def __init__(self, end, memory, folder):
         self._end, self._memory = end.dup(), Memory(memory.size, os.dup(memory.descriptor))
@@ -418,6 +501,9 @@ class WorkerThread:
         self._end.close()
         self._memory.close()
         return 0
+
+    def forget(self):
+        pass
 
 
 @posix_only

@@ -27,6 +27,7 @@ FAULTS = (
     *("close_standard", "close_others", "status", "not_a_number", "infinite"),
     *("print", "print_no_newline", "print_much", "log_from_thread", "round_up"),
     *("change_directory", "change_environment", "leak", "do_nothing"),
+    *("fork", "fork_and_crash", "fork_and_loop", "fork_a_twin"),
 )
 """In the order of the enumerations in ``zoo.h``."""
 
