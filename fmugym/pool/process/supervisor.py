@@ -81,8 +81,7 @@ class Supervisor:
         try:
             self._process, self._channel = self._launch()
         except (OSError, EOFError) as error:
-            self.reason = f"no worker process can be started: {error}"
-            raise LostError(self.reason) from None
+            raise LostError(f"no worker process can be started: {error}") from None
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
         self.growth, self.is_new = 0, True
@@ -112,12 +111,16 @@ class Supervisor:
             raise LostError(self.reason)
         if self._deaths > 1:
             time.sleep(_FIRST_PAUSE * 2 ** (self._deaths - 2))
-        self.start()
+        try:
+            self.start()
+        except LostError as error:
+            self.reason = str(error)
+            raise
 
     def start_ahead(self) -> None:
         """Start a process before it is needed, but not again and again."""
         if self._process is None and self._deaths == 1:
-            with contextlib.suppress(LostError):
+            with contextlib.suppress(LostError):  # there is time to try again
                 self.start()
 
     def bury(self, reason: str) -> None:
