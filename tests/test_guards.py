@@ -1,13 +1,17 @@
 """Guards in the process, in all pools: finite values, retries, health, recycling."""
 
+import ctypes
 import itertools
 import logging
+import platform
+import subprocess
 import sys
 
 import gymnasium as gym
 import lawful_tools
 import numpy as np
 import pytest
+import zoo_tools
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config
 from gymnasium import spaces
 
@@ -15,6 +19,7 @@ import fmugym
 from fmugym import FMU, ConfigError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.leaks import LeakWatch, resident_bytes
 from fmugym.trial.opening import make_pool
 from fmugym.vector import FMUVectorEnv
@@ -134,6 +139,68 @@ class TestFiniteInputs:
             envs.step(np.array([1, 0]))
         envs.reset(seed=0)
         assert envs.step(np.array([1, 1]))[0].tolist() == [[pytest.approx(0.8)]] * 2
+
+
+class RoundedUp(PlainEnv):
+    """Steps an FMU of the zoo in Python."""
+
+    def __init__(self, path, values):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "model_parameters": values,
+            "time_step": 0.5,
+            "bounds": {"u": (-1, 1)},
+        }
+        super().__init__(path, config, logging.CRITICAL, backend="python")
+
+
+class TestArithmetic:
+    """In Python's pool; what the native one does is in test_native_pool.py."""
+
+    @pytest.mark.parametrize("call", ["instantiate", "exit", "set", "step", "get", "reset"])
+    def test_the_rounding_mode_of_an_fmu_does_not_stay(self, tmp_path, opened, call):
+        token = "{zoo}"
+        if call == "instantiate":
+            token = f"{{zoo {zoo_tools.FAULTS.index('round_up')} {zoo_tools.CALLS.index(call)} 0}}"
+        values = zoo_tools.parameters("round_up", call, at=0)
+        path = zoo_tools.zoo_fmu(tmp_path, 2, token)
+        tiny = float("1e-30")
+        env = opened(RoundedUp(path, values))
+        assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
+        for _ in range(2):
+            env.reset()
+            assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
+            env.step([1.0])
+            assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
+
+    def test_other_instances_do_not_notice(self, tmp_path, opened):
+        def rollout(fault):
+            fmu = FMU(zoo_tools.zoo_fmu(tmp_path, 2))
+            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
+            pool = opened(make_pool(fmu, spec, 2, LOG, backend="python", private_libraries=False))
+            values = np.zeros((4, 2))
+            values[:, 0] = list(zoo_tools.parameters(fault).values())
+            pool.reset(tuple(map(fmu.variable, zoo_tools.PARAMETERS)), values)
+            return [pool.step(np.full((1, 2), 1 / n))[0][:, 1].tolist() for n in range(3, 50)]
+
+        expected = rollout("none")
+        assert rollout("round_up") == expected
+
+    @pytest.mark.skipif(
+        sys.platform != "linux" or platform.machine() != "x86_64", reason="sets MXCSR"
+    )
+    def test_subnormal_numbers(self, tmp_path):
+        """As the start-up code of -ffast-math turns them off."""
+        library = tmp_path / "fast.so"
+        code = "#include <xmmintrin.h>\nvoid off(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }"
+        command = [*zoo_tools.compiler(), "-shared", "-fPIC", "-x", "c", "-", "-o", library]
+        subprocess.run(command, input=code, text=True, check=True)
+        ctypes.CDLL(library).off()
+        off = 0.5 * sys.float_info.min == 0.0
+        restore_arithmetic()
+        assert off
+        assert 0.5 * sys.float_info.min > 0.0
 
 
 class TestRetries:
