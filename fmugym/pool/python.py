@@ -74,8 +74,10 @@ class PythonPool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        reset = self._reset if self._watch is None else self._watch.around(self._reset)
-        reset(variables, values, mask)
+        if self._watch is None:
+            self._reset(variables, values, mask)
+        else:
+            self._watch.call(self._reset, variables, values, mask)
         return self.outputs, self.statuses
 
     def _reset(
@@ -114,6 +116,8 @@ class PythonPool(CountedPool):
 
     def save(self) -> list[Snapshot]:
         """See ``Pool.save``."""
+        if self._watch is not None:
+            self._watch.has_snapshots = True
         try:
             return [slot.save() for slot in self._slots]
         finally:
