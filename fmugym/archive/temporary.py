@@ -11,15 +11,24 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
+from fmugym.errors import FMULoadError
+
 __all__ = ["make_folder", "remove_folder", "sweep"]
 
 _NAME: Final = re.compile(r"fmugym-(?P<pid>\d+)-(?P<namespace>\d+)-\w+")
 
 
 def make_folder() -> Path:
-    """Make a temporary folder of this process, after a first look for those of dead ones."""
-    sweep()
-    return Path(tempfile.mkdtemp(prefix=f"fmugym-{os.getpid()}-{_namespace()}-"))
+    """Make a temporary folder of this process, after a first look for those of dead ones.
+
+    Raises:
+        FMULoadError: If the system refuses, for example because the disk is full.
+    """
+    try:
+        sweep()
+        return Path(tempfile.mkdtemp(prefix=f"fmugym-{os.getpid()}-{_namespace()}-"))
+    except OSError as error:
+        raise FMULoadError(f"no temporary folder can be made: {error}") from None
 
 
 def remove_folder(folder: Path, owner: int) -> None:

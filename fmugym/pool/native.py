@@ -224,6 +224,8 @@ class NativePool(CountedPool):
         if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
             name = self._fmu.description.model_name
             raise SimulationError(f"{name} cannot get and set its state")
+        if self._watch is not None:
+            self._watch.has_snapshots = True
         snapshot = self._open_pool().save()
         if isinstance(snapshot, int):
             raise SimulationError(self.failure(snapshot))

@@ -14,6 +14,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import SimulationError
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
+from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import CountedPool, HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
@@ -63,6 +64,8 @@ class PythonPool(CountedPool):
         except BaseException:
             self._library.close()
             raise
+        finally:
+            restore_arithmetic()
         recycle = functools.partial(_recycle, self._slots)
         self._watch = watch_leaks(fmu, spec, self._counts, recycle, log)
 
@@ -70,8 +73,10 @@ class PythonPool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        reset = self._reset if self._watch is None else self._watch.around(self._reset)
-        reset(variables, values, mask)
+        if self._watch is None:
+            self._reset(variables, values, mask)
+        else:
+            self._watch.call(self._reset, variables, values, mask)
         return self.outputs, self.statuses
 
     def _reset(
@@ -98,6 +103,7 @@ class PythonPool(CountedPool):
         return self.outputs, self.statuses
 
     def _note(self, index: int, status: int) -> None:
+        restore_arithmetic()
         self.statuses[index] = status
         if status:
             note(self._counts[index], status)
@@ -109,7 +115,12 @@ class PythonPool(CountedPool):
 
     def save(self) -> list[Snapshot]:
         """See ``Pool.save``."""
-        return [slot.save() for slot in self._slots]
+        if self._watch is not None:
+            self._watch.has_snapshots = True
+        try:
+            return [slot.save() for slot in self._slots]
+        finally:
+            restore_arithmetic()
 
     def restore(
         self, snapshot: list[Snapshot], mask: MaskArray | None = None
@@ -130,7 +141,10 @@ class PythonPool(CountedPool):
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
-        return np.stack([slot.read(variables) for slot in self._slots], axis=1)
+        try:
+            return np.stack([slot.read(variables) for slot in self._slots], axis=1)
+        finally:
+            restore_arithmetic()
 
     def _count_steps(self) -> None:
         for slot in self._slots:
@@ -146,6 +160,7 @@ class PythonPool(CountedPool):
     def close(self) -> None:
         """See ``Pool.close``."""
         self._library.close()
+        restore_arithmetic()
 
 
 def _recycle(slots: Sequence[Slot]) -> None:
