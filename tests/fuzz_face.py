@@ -23,7 +23,6 @@ import math
 import pathlib
 import random
 import sys
-import tempfile
 import time
 import warnings
 from collections import Counter
