@@ -19,6 +19,7 @@ from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution
 from fmugym.errors import (
     ConfigError,
+    FMUGymError,
     SimulationError,
     shown,
     unknown_argument,
@@ -60,10 +61,12 @@ class FMUEnv(Pictured):
     the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
-    an observation that is not finite is a fault of the episode, like a failure of the FMU. An
-    exception of a hook reaches the caller of ``step`` unchanged. If the FMU has stepped already, the
-    episode is over then, and ``reset`` must follow; an exception of ``_get_inputs`` leaves the
-    episode as it was.
+    an observation that is not finite is a fault of the episode, like a failure of the FMU.
+
+    An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
+    already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
+    the episode as it was; if the action is not in the action space, it is a ``ConfigError`` that
+    says so, with the exception as its cause.
 
     Args:
         fmu_path: The FMU; a relative path is relative to the file of the class.
@@ -410,9 +413,24 @@ class FMUEnv(Pictured):
         self.previous_action, self.action, self.previous_state = self.action, action, self.state
         try:
             self._write_inputs(self._get_inputs())
-        except BaseException:  # the FMU was not touched: a better action may follow
+        except BaseException as error:  # the FMU was not touched: a better action may follow
             self.action, self.previous_action, self.previous_state = before
+            if self._is_to_blame(action, error):
+                raise ConfigError(
+                    f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
+                ) from error
             raise
+
+    def _is_to_blame(self, action: Any, error: BaseException) -> bool:
+        """Whether ``_get_inputs`` failed because of an action outside of the action space."""
+        if isinstance(error, FMUGymError) or not isinstance(error, Exception):
+            return False
+        if type(self).step is not FMUEnv.step:  # then its actions may be others
+            return False
+        try:
+            return not self.action_space.contains(action)
+        except Exception:  # an object whose own methods fail
+            return True
 
     def _write_inputs(self, values: Any) -> None:
         if self._takes_one_real and isinstance(values, float) and math.isfinite(values):
@@ -455,16 +473,14 @@ class FMUEnv(Pictured):
         reward = self._reward_policy()
         if type(reward) is not float:
             reward = as_reward(reward)
-        if not math.isfinite(reward):
-            return self._fault_of_hook(f"_reward_policy returned {reward}", before)
         if self._pool_observes:
             observation: Any = self._observation_row.copy()
             is_finite = math.hypot(*self.state) <= FLOAT32_LIMIT or self._is_finite(observation)
         else:
             observation = self._get_observation()
             is_finite = self._is_finite(observation)
-        if not is_finite:
-            return self._fault_of_hook(f"the observation is {shown(observation)}", before)
+        if not (is_finite and math.isfinite(reward)):
+            return self._fault_of_hooks(reward, observation, before)
         info = self._info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
@@ -487,11 +503,14 @@ class FMUEnv(Pictured):
         steps = self._spec.warm_up_steps + self.step_count
         return self._spec.communication_point(steps * self._spec.substeps)
 
-    def _fault_of_hook(
-        self, reason: str, before: tuple[Any, dict[str, Any]]
+    def _fault_of_hooks(
+        self, reward: float, observation: Any, before: tuple[Any, dict[str, Any]]
     ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """End the episode because of a number that is not finite, in the state before the step."""
-        reason = f"{reason} at t = {self.time:g} s"
+        if math.isfinite(reward):
+            reason = f"the observation is {shown(observation)} at t = {self.time:g} s"
+        else:
+            reason = f"_reward_policy returned {reward} at t = {self.time:g} s"
         self._values, variables = before
         self.state = self.previous_state
         self.variables.update(variables)

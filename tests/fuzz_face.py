@@ -32,7 +32,7 @@ import numpy as np
 from fuzz import temporary_folder
 
 import fmugym
-from fmugym import Choice, FMUGymError, FMUVectorEnv, LogUniform, Normal, Uniform
+from fmugym import Choice, FMUGymError, FMUVectorEnv, LogUniform, Normal, Uniform, testing
 from fmugym.config import EnvConfig
 
 SLOW, HANG = 5.0, 60.0
@@ -547,8 +547,8 @@ def of_functions(rng):
         "ArchiveLimits": lambda: fmugym.ArchiveLimits(max_ratio=value),
         "EnvConfig": lambda: EnvConfig.from_dict(value),
         "Paced": lambda: fmugym.Paced(other, hold_after=value),
-        "check_fmu_env": lambda: fmugym.testing.check_fmu_env(value),
-        "check_hooks": lambda: fmugym.testing.check_hooks(value),
+        "check_fmu_env": lambda: testing.check_fmu_env(value),
+        "check_hooks": lambda: testing.check_hooks(value),
         "register": lambda: register(rng.choice((value, "fuzz/Odd-v0")), other),
     }
     kind = rng.choice(list(calls))

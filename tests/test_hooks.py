@@ -43,7 +43,9 @@ def test_what_is_of_no_use_is_refused_with_the_name_of_the_hook(make_env, name, 
     method = f"_{name}"
     cls = type("Odd", (PlainEnv,), {method: lambda self, *options: value})
     env = make_env(cls=cls)
-    if isinstance(value, dict) and (name == "get_info" or name.endswith("parameters") and not value):
+    if isinstance(value, dict) and (
+        name == "get_info" or (name.endswith("parameters") and not value)
+    ):
         env.reset()
         env.step(0.0)
         return

@@ -1,7 +1,7 @@
 """Checks of what hooks return: of a kind that the environment can use, and finite.
 
-What is of the wrong kind is a mistake in the class: ``ConfigError`` names the hook. Numbers that are
-not finite are a fault of the episode, like a failure of the FMU.
+A result of the wrong kind is a mistake in the class, and ``ConfigError`` names the hook. Numbers
+that are not finite are a fault of the episode, like a failure of the FMU.
 """
 
 from __future__ import annotations
