@@ -111,6 +111,7 @@ class Normal:
         _take(self, "low", "high")
         if self.std < 0:
             raise ConfigError(f"{self}: std must not be negative")
+        object.__setattr__(self, "std", abs(self.std))  # numpy refuses -0.0
         if not self.low <= self.mean <= self.high:
             raise ConfigError(f"{self}: mean must lie between low and high")
         if self._probability_within() < 0.01:

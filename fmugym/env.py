@@ -29,7 +29,14 @@ from fmugym.fmi.status import Status
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.health import fault_rates
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.actions import elements_of, flat_inputs, has_nan, is_element, no_action
+from fmugym.task.actions import (
+    elements_of,
+    flat_inputs,
+    has_nan,
+    is_element,
+    is_misfit,
+    no_action,
+)
 from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import checked, output_variable, resolve, start_variable
 from fmugym.task.opening import open_fmu, open_pool
@@ -65,8 +72,8 @@ class FMUEnv(Pictured):
 
     An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
     already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
-    the episode as it was; if the action is not in the action space, it is a ``ConfigError`` that
-    says so, with the exception as its cause.
+    the episode as it was; it becomes a ``ConfigError`` if it comes from an action that is not in
+    the action space.
 
     Args:
         fmu_path: The FMU; a relative path is relative to the file of the class.
@@ -427,10 +434,7 @@ class FMUEnv(Pictured):
             return False
         if type(self).step is not FMUEnv.step:  # then its actions may be others
             return False
-        try:
-            return not self.action_space.contains(action)
-        except Exception:  # an object whose own methods fail
-            return True
+        return is_misfit(action, self.action_space, error)
 
     def _write_inputs(self, values: Any) -> None:
         if self._takes_one_real and isinstance(values, float) and math.isfinite(values):

@@ -271,6 +271,8 @@ def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
         paths = [] if isinstance(libraries, str) else [os.fsdecode(one) for one in libraries]
     except Exception:  # a TypeError; or an object whose own methods fail
         paths = []
+    if any("\0" in path for path in paths):
+        raise ConfigError(f"preload: no file can have the path {shown(libraries)}")
     if not paths and not (isinstance(libraries, list | tuple) and len(libraries) == 0):
         raise ConfigError(f"preload must be a list of paths, got {shown(libraries)}")
     return tuple(os.path.abspath(path) if os.path.dirname(path) else path for path in paths)
