@@ -285,7 +285,7 @@ def use(env, seed=0):
     space = getattr(env, "action_space", None)
     env.reset(seed=seed)
     space.seed(0)
-    for _ in range(2):
+    for _ in range(3):
         *_, terminated, truncated, _ = env.step(space.sample())
         if np.any(terminated) or np.any(truncated):
             env.reset()
@@ -560,6 +560,48 @@ def register(env_id, env):
         gymnasium.registry.pop("fuzz/Odd-v0", None)
 
 
+HOOK_NAMES = (
+    *("_get_inputs", "_update", "_is_done", "_is_truncated", "_reward_policy"),
+    *("_get_observation", "_get_info", "_goal_reward", "_get_episode_parameters"),
+    *("_get_action_space", "_get_observation_space"),
+)
+
+
+def odd_class(rng):
+    """A class of which one hook returns an odd value, in all steps or in some."""
+    name, value, late = rng.choice(HOOK_NAMES), odd(rng), rng.random() < 0.5
+    original = getattr(Tracking, name)
+
+    def hook(self, *arguments):
+        if late and not np.all(self.step_count == 2):
+            return original(self, *arguments)
+        return value
+
+    return (name, value, late), type("Odd", (Tracking,), {name: hook})
+
+
+def of_hook(rng):
+    values, cls = odd_class(rng)
+
+    def call():
+        with closing(cls()) as env:
+            use(env)
+            env.reset(options={"model_parameters": {}})
+
+    return values, call
+
+
+def of_vector_hook(rng):
+    values, cls = odd_class(rng)
+    way = rng.choice(HOOKS)
+
+    def call():
+        with closing(FMUVectorEnv(cls, 2, hooks=way)) as env:
+            use(env)
+
+    return (way, *values), call
+
+
 WHOLE = {
     in_config: 6,
     nested_in_config: 3,
@@ -569,6 +611,8 @@ WHOLE = {
     of_distribution: 3,
     as_vector_argument: 4,
     of_functions: 2,
+    of_hook: 4,
+    of_vector_hook: 3,
 }
 STAGED = {of_seed: 1, of_options: 2, of_action: 3, of_reading: 1, of_vector: 4, of_attribute: 1}
 KINDS = WHOLE | STAGED
