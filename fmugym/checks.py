@@ -1,176 +1,244 @@
-"""Checks of arguments, with errors that name the argument and the expected range."""
+"""Checks of single values that many arguments share.
+
+Each check takes the name of the value for the error, and any object at all, also one whose own
+methods fail. It returns the value in its plain Python type, or raises ``ConfigError``.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from numbers import Integral, Real
-from typing import Any, cast
+import operator
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from numbers import Real
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
-    "as_float",
+    "LARGEST_COUNT",
     "check_count",
+    "check_dict",
+    "check_flag",
+    "check_integer",
+    "check_mapping",
     "check_number",
-    "flag",
-    "mapping",
-    "number",
+    "check_option",
+    "check_path",
+    "check_seed",
+    "check_text",
+    "float_or_nan",
+    "has_method",
+    "integer_of",
     "number_of",
-    "text",
-    "whole_number",
 ]
 
-
-def as_float(value: Any) -> float:
-    """Return a real number as a float, and NaN for everything else.
-
-    Args:
-        value: Any object. Texts and arrays are not numbers; integers too large are infinite.
-    """
-    if not isinstance(value, Real):
-        return math.nan
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if cast(int, value) > 0 else -math.inf
-    except (TypeError, ValueError):  # numpy's time spans count as integers
-        return math.nan
-
-
-def number(
-    what: str,
-    value: Any,
-    low: float = -math.inf,
-    high: float = math.inf,
-    *,
-    may_be_infinite: bool = False,
-    positive: bool = False,
-) -> float:
-    """Return a number as a float.
-
-    Args:
-        what: What the number is, for the error.
-        value: A real number; texts and arrays are refused.
-        low: The lowest value allowed.
-        high: The highest value allowed.
-        may_be_infinite: Whether infinity is allowed.
-        positive: Whether 0 and negative numbers are refused.
-
-    Raises:
-        ConfigError: If the value is not a number, is NaN or is out of its range.
-    """
-    result = as_float(value)
-    is_allowed = may_be_infinite or math.isfinite(result)
-    if not (is_allowed and low <= result <= high) or (positive and result <= 0.0):
-        kind = "number" if may_be_infinite else "finite number"
-        wanted = _range(low, high, positive)
-        raise ConfigError(f"{what} must be a {kind}{wanted}, not {shown(value)}")
-    return result
-
-
-def whole_number(what: str, value: Any, low: int, high: int) -> int:
-    """Return an integer.
-
-    Args:
-        what: What the number is, for the error.
-        value: An integer of Python or numpy.
-        low: The lowest value allowed.
-        high: The highest value allowed.
-
-    Raises:
-        ConfigError: If the value is not an integer or is out of its range.
-    """
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool | np.timedelta64)
-    if not (is_integer and low <= int(value) <= high):
-        raise ConfigError(f"{what} must be an integer from {low} to {high}, not {shown(value)}")
-    return int(value)
-
-
-def flag(what: str, value: Any) -> bool:
-    """Return a truth value.
-
-    Raises:
-        ConfigError: If the value is neither True nor False.
-    """
-    if not isinstance(value, bool | np.bool_):
-        raise ConfigError(f"{what} must be True or False, not {shown(value)}")
-    return bool(value)
-
-
-def text(what: str, value: Any) -> str:
-    """Return a text.
-
-    Raises:
-        ConfigError: If the value is not a text.
-    """
-    if not isinstance(value, str):
-        raise ConfigError(f"{what} must be a text, not {shown(value)}")
-    return str.__str__(value)  # a subclass may compare in its own way
-
-
-def mapping(what: str, value: Any) -> dict[Any, Any]:
-    """Return a copy of a mapping.
-
-    Raises:
-        ConfigError: If the value is not a mapping.
-    """
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{what} must be a dict, not {shown(value)}")
-    return dict(value)
+LARGEST_COUNT: Final = 2**31 - 1
+"""The largest number of steps or threads that can be asked for."""
 
 
 def check_number(
-    what: str, value: Any, minimum: float = -math.inf, *, positive: bool = False
-) -> None:
-    """Check that a value is a finite number in its range.
+    what: str,
+    value: Any,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    *,
+    positive: bool = False,
+    may_be_infinite: bool = False,
+) -> float:
+    """Return a value as a float of a range.
 
     Args:
         what: The name of the value, for the error.
         value: Any object.
         minimum: The lowest number allowed.
+        maximum: The highest number allowed.
         positive: Whether 0 is refused too.
+        may_be_infinite: Whether infinity is allowed.
 
     Raises:
-        ConfigError: If it is not.
+        ConfigError: If it is no number, NaN, or out of its range.
     """
-    result = number_of(what, value)
-    if not math.isfinite(result) or result < minimum or (positive and result <= 0):
-        wanted = "positive and finite" if positive else "finite and not negative"
-        raise ConfigError(
-            f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {shown(value)}"
-        )
+    number = number_of(what, value)
+    in_range = minimum <= number <= maximum and (number > 0 or not positive)
+    if in_range and (may_be_infinite or math.isfinite(number)):
+        return number
+    kind = "a number" if may_be_infinite else "finite"
+    wanted = kind + _range(minimum, maximum, positive)
+    raise ConfigError(f"{what} must be {wanted}, got {shown(value)}")
+
+
+def _range(minimum: float, maximum: float, positive: bool) -> str:
+    if maximum < math.inf:
+        return f" and from {minimum:g} to {maximum:g}"
+    if positive or minimum == 0:
+        return " and positive" if positive else " and not negative"
+    return f" and at least {minimum:g}" if minimum > -math.inf else ""
 
 
 def number_of(what: str, value: Any) -> float:
-    """Turn a value into a float.
+    """Return a value as a float, finite or not.
 
     Raises:
-        ConfigError: If it is not a real number.
+        ConfigError: If it is no real number.
     """
-    if isinstance(value, Real) or (hasattr(value, "__float__") and np.shape(value) == ()):
-        try:
+    if type(value) is float:
+        return value
+    if _is_real(value):
+        with suppress(Exception):  # the number is too large, or the object's own method fails
             return float(value)
-        except (TypeError, ValueError, OverflowError):
-            pass
     raise ConfigError(f"{what} must be a number, got {shown(value)}")
 
 
-def check_count(what: str, value: Any) -> None:
-    """Check that a value is a positive integer.
+def float_or_nan(value: Any) -> float:
+    """Return a value as a float; NaN if it is no real number."""
+    try:
+        return number_of("", value)
+    except ConfigError:
+        return math.nan
+
+
+def _is_real(value: Any) -> bool:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.ndim == 0 and value.dtype.kind in "fiubO"
+    return isinstance(value, Real) or (
+        hasattr(type(value), "__float__") and not isinstance(value, str | bytes)
+    )
+
+
+def check_count(what: str, value: Any, largest: int = LARGEST_COUNT) -> int:
+    """Return a value as a positive integer.
 
     Raises:
-        ConfigError: If it is not.
+        ConfigError: With the name and the value.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ConfigError(f"{what} must be a positive integer, got {shown(value)}")
+    number = integer_of(value)
+    if number is None or not 0 < number <= largest:
+        bound = "" if number is None or number < 1 else f" of at most {largest}"
+        raise ConfigError(f"{what} must be a positive integer{bound}, got {shown(value)}")
+    return number
 
 
-def _range(low: float, high: float, positive: bool) -> str:
-    if math.isinf(low) and math.isinf(high):
-        return " above 0" if positive else ""
-    if math.isinf(high):
-        return f" of at least {low:g}"
-    return f" above 0 and up to {high:g}" if positive else f" from {low:g} to {high:g}"
+def check_integer(what: str, value: Any, minimum: int, maximum: int) -> int:
+    """Return a value as an integer of a range.
+
+    Raises:
+        ConfigError: With the name and the value.
+    """
+    number = integer_of(value)
+    if number is None or not minimum <= number <= maximum:
+        raise ConfigError(
+            f"{what} must be an integer from {minimum} to {maximum}, got {shown(value)}"
+        )
+    return number
+
+
+def check_seed(value: Any) -> int | None:
+    """Return a seed as Gymnasium takes it: an integer that is not negative, or None.
+
+    Raises:
+        ConfigError: With the value.
+    """
+    if value is None:
+        return None
+    number = integer_of(value)
+    if number is None or number < 0:
+        raise ConfigError(f"seed must be an integer of at least 0, or None, got {shown(value)}")
+    return number
+
+
+def integer_of(value: Any) -> int | None:
+    """Return a value as an int; None if it is no integer, or a Boolean."""
+    if type(value) is int:
+        return value
+    if isinstance(value, bool | np.bool_):
+        return None
+    try:
+        return int(operator.index(value))
+    except Exception:  # a TypeError; or the object's own method fails
+        return None
+
+
+def check_flag(what: str, value: Any) -> bool:
+    """Return a value as True or False; 0 and 1 will do.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    number = integer_of(value)
+    if number not in {0, 1}:
+        raise ConfigError(f"{what} must be True or False, got {shown(value)}")
+    return bool(number)
+
+
+def has_method(value: object, name: str) -> bool:
+    """Whether a value has a method of this name; one that answers no question has none."""
+    try:
+        return callable(getattr(value, name, None))
+    except Exception:  # the object's own method fails
+        return False
+
+
+def check_text(what: str, value: Any) -> str:
+    """Return a value as a plain text.
+
+    Raises:
+        ConfigError: If it is no text.
+    """
+    if not isinstance(value, str):
+        raise ConfigError(f"{what} must be a text, got {shown(value)}")
+    return str.__str__(value)  # a subclass may have odd methods
+
+
+def check_option(kind: str, value: Any, known: Iterable[str]) -> str:
+    """Return a value that is one of some texts.
+
+    Raises:
+        ConfigError: With the nearest of them.
+    """
+    known = list(known)
+    if not isinstance(value, str) or str.__str__(value) not in known:
+        raise unknown_name(kind, value, known)
+    return str.__str__(value)
+
+
+def check_mapping(what: str, value: Any) -> dict[str, Any]:
+    """Return a mapping with names as keys as a new dict.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    items = check_dict(what, value)
+    if all(isinstance(name, str) for name in items):
+        return {str.__str__(name): item for name, item in items.items()}
+    raise ConfigError(f"{what} must be a dict with names as keys, got {shown(value)}")
+
+
+def check_dict(what: str, value: Any) -> dict[Any, Any]:
+    """Return a mapping as a new dict.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if isinstance(value, Mapping):
+        with suppress(Exception):  # a mapping of the caller's whose methods fail
+            return dict(value)
+    raise ConfigError(f"{what} must be a dict, got {shown(value)}")
+
+
+def check_path(what: str, value: Any) -> Path:
+    """Return a value as a path; ``~`` stands for the home folder.
+
+    Raises:
+        ConfigError: If it is no path.
+    """
+    try:
+        return Path(os.fsdecode(value)).expanduser()
+    except Exception:  # a TypeError; or nobody has this home, or the object's own method fails
+        raise ConfigError(f"{what} must be a path, got {shown(value)}") from None

@@ -1,11 +1,12 @@
-"""The errors that fmugym raises for mistakes and faults it can name.
+"""The errors of fmugym.
 
 ::
 
     FMUGymError
     ├── ConfigError       a name, number or type that the user gave does not fit the FMU
+    │   └── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
     ├── FMULoadError      an archive, a model description or a library cannot be used
-    ├── SimulationError   an FMI call failed, or a call came out of its order
+    ├── SimulationError   an FMI call failed, or a method was called out of order
     └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
 Every error takes one argument, its text, and so survives pickling between processes. The text is
@@ -16,8 +17,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Final
 
 __all__ = [
+    "ArgumentError",
     "ConfigError",
     "ContractError",
     "FMUGymError",
@@ -25,10 +28,12 @@ __all__ = [
     "SimulationError",
     "printable",
     "shown",
+    "unknown_argument",
     "unknown_name",
 ]
 
-_LONGEST_SHOWN = 120
+_LONGEST: Final = 120
+"""Characters of a value that an error shows, at most."""
 
 
 def printable(text: object) -> str:
@@ -59,7 +64,14 @@ class FMUGymError(Exception):
 
 
 class ConfigError(FMUGymError):
-    """A configuration, an option or an action does not fit the FMU or the environment."""
+    """A config, an option or an action does not fit the FMU or the environment."""
+
+
+class ArgumentError(ConfigError, TypeError):
+    """A constructor does not have this argument.
+
+    It is a ``TypeError`` for callers that try arguments, as Stable-Baselines3 does.
+    """
 
 
 class FMULoadError(FMUGymError):
@@ -67,15 +79,15 @@ class FMULoadError(FMUGymError):
 
 
 class SimulationError(FMUGymError):
-    """An FMI function failed, or a method was called at a time when it has no meaning."""
+    """An FMI function failed, or a method was called out of order."""
 
 
 class ContractError(FMUGymError):
-    """An environment does not keep what every environment of this package promises."""
+    """An environment breaks the contract of all environments of this package."""
 
 
 def shown(value: object) -> str:
-    """Return the text that stands for a value in an error message.
+    """Return the text that stands for a value in an error.
 
     Args:
         value: Any object, even one whose ``repr`` fails.
@@ -85,12 +97,12 @@ def shown(value: object) -> str:
     """
     try:
         text = repr(value)
-    except Exception:
-        text = f"<{type(value).__name__} without a text>"
+    except Exception:  # an error is being reported already
+        text = f"<{type(value).__name__} without a repr>"
     if "\n" in text:  # an array
         text = " ".join(text.split())
     text = printable(text)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
@@ -104,9 +116,25 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     Returns:
         The error. It suggests the nearest known name, or lists known names if none is near.
     """
-    names = list(known)
-    near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
+    return ConfigError(f"unknown {kind} {shown(name)}; {_hint(name, list(known))}")
+
+
+def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentError:
+    """Make the error for a keyword argument that a constructor does not have.
+
+    Args:
+        owner: The class.
+        name: The argument as it was given.
+        known: All arguments that the class has.
+    """
+    hint = _hint(name, list(known))
+    return ArgumentError(f"{owner} got an unexpected keyword argument {shown(name)}; {hint}")
+
+
+def _hint(name: object, known: list[str]) -> str:
+    text = name if isinstance(name, str) else shown(name)
+    near = difflib.get_close_matches(text[:_LONGEST], known, n=1)
     if near:
-        return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near[0]!r}?")
-    listing = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
-    return ConfigError(f"unknown {kind} {shown(name)}; known are: {listing or 'none'}")
+        return f"did you mean {near[0]!r}?"
+    listing = ", ".join(map(repr, known[:12])) + (", ..." if len(known) > 12 else "")
+    return f"known are: {listing or 'none'}"

@@ -20,8 +20,9 @@ import gymnasium
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 
+from fmugym.checks import has_method
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, ContractError
+from fmugym.errors import ConfigError, ContractError, shown
 from fmugym.vector.hooks.check import CURE, find_difference
 
 __all__ = ["check_fmu_env", "check_hooks"]
@@ -71,18 +72,21 @@ def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any)
         ContractError: If a hook is different on arrays; the text names it and says what to do.
         ConfigError: If the environment is none of this package.
     """
+    if not callable(make_env):
+        raise ConfigError(f"expected a class or a function, got {shown(make_env)}")
     env = make_env(**kwargs)
     try:
         inner = _of_this_package(env)
         difference = find_difference(inner)
     finally:
-        env.close()
+        if has_method(env, "close"):
+            env.close()
     if difference is not None:
         raise ContractError(f"{type(inner).__name__}: {difference}. {CURE}")
 
 
 def _of_this_package(env: gymnasium.Env[Any, Any]) -> FMUEnv:
-    inner = env.unwrapped
+    inner = env.unwrapped if isinstance(env, gymnasium.Env) else env
     if not isinstance(inner, FMUEnv):
         raise ConfigError(f"expected an environment of fmugym, got {type(inner).__name__}")
     return inner

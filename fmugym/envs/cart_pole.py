@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_flag, check_mapping
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.rendering import CartPoleFrame, CartPoleScene
@@ -97,7 +98,8 @@ class CartPoleEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        self.sutton_barto_reward = sutton_barto_reward
+        self.sutton_barto_reward = check_flag("sutton_barto_reward", sutton_barto_reward)
+        given = {} if model_parameters is None else model_parameters
         self.force_mag = 10.0
         self.x_threshold = 2.4
         self.theta_threshold_radians = 12 * 2 * math.pi / 360
@@ -105,7 +107,11 @@ class CartPoleEnv(FMUEnv):
         config = {
             "model_input_names": "f",
             "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
-            "model_parameters": {**start, **_GYMNASIUM_PLANT, **(model_parameters or {})},
+            "model_parameters": {
+                **start,
+                **_GYMNASIUM_PLANT,
+                **check_mapping("model_parameters", given),
+            },
             "time_step": 0.02,
         }
         fmu_path = bundled_fmu("CartPole", fmi_version)

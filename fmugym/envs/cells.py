@@ -12,7 +12,8 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_number, check_text, has_method
+from fmugym.errors import ConfigError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool import Paced
 from fmugym.pool.backend.clock import RealClock
@@ -60,12 +61,12 @@ def paced_cells(
     Raises:
         ConfigError: If that is no client, or the tokens do not fit.
     """
-    if not _is_client(client) and callable(getattr(client, "client", None)):
+    if not _is_client(client) and has_method(client, "client"):
         client = client.client()
     if not _is_client(client):
         raise ConfigError(
             "backend must be 'fmu', or a client of the lab such as fmugym.lab.Client(), "
-            f"not {client!r}"
+            f"not {shown(client)}"
         )
     lab = _simulated_lab(client)
     if user_token is None and gym_token is None:
@@ -74,6 +75,12 @@ def paced_cells(
         user_token = _ANY_USER
     if gym_token is not None and (user_token is not None or gym_time is not None):
         raise ConfigError("a gym_token= stands for a lease: give no user_token and no gym_time")
+    for name, token in (("user_token", user_token), ("gym_token", gym_token)):
+        if token is not None:
+            check_text(name, token)
+    session_time = check_number("session_time", session_time, positive=True)
+    if gym_time is not None:
+        gym_time = check_number("gym_time", gym_time, positive=True)
     lease = Lease(client, user_token, gym_token, gym_time, session_time)
     return Paced(lease, RealClock() if lab is None else lab.clock)
 
@@ -206,7 +213,7 @@ class Cell:
 
 
 def _is_client(client: Any) -> bool:
-    return all(callable(getattr(client, method, None)) for method in _METHODS)
+    return all(has_method(client, method) for method in _METHODS)
 
 
 def _simulated_lab(client: Any) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_mapping, number_of
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.envs.cells import paced_cells
@@ -129,15 +130,16 @@ class CloudPendulumEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        if not 0.0 < torque_limit <= PLATFORM_TORQUE:
+        self.torque_limit = number_of("torque_limit", torque_limit)
+        if not 0.0 < self.torque_limit <= PLATFORM_TORQUE:
             raise ConfigError(
                 f"torque_limit must be more than 0 and at most {PLATFORM_TORQUE} N m, "
-                f"got {torque_limit!r}"
+                f"got {self.torque_limit}"
             )
-        self.torque_limit = torque_limit
         self.limit_penalty = 1000.0
         self._in_lab = not isinstance(backend, str) or backend == "lab"  # an error will say how
-        given = dict(model_parameters or {})
+        given = {} if model_parameters is None else model_parameters
+        given = check_mapping("model_parameters", given)
         self._require_settable(given)
         if self._in_lab:
             backend = paced_cells(backend, user_token, gym_token, gym_time, session_time)
@@ -153,7 +155,7 @@ class CloudPendulumEnv(FMUEnv):
             config,
             log_level,
             render_mode=render_mode,
-            backend=None if backend == "fmu" else backend,
+            backend=backend if self._in_lab or backend != "fmu" else None,
             **options,
         )
 

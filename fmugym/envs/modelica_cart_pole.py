@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_number
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMUEnv
 from fmugym.rendering import CartPoleFrame, CartPoleScene
 
@@ -92,7 +93,7 @@ class ModelicaCartPoleEnv(FMUEnv):
         **options: Any,
     ) -> None:
         names = self._variable_names(own_fmu=fmu_path is not None)
-        self.force = force
+        self.force = check_number("force", force)
         self.x_threshold = 2.4
         self.theta_threshold = math.radians(12)
         parameters = (m_cart, m_pole, theta_0, theta_dot_0)

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_mapping
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.rendering import PendulumFrame, PendulumScene
@@ -91,13 +92,19 @@ class PendulumEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
+        given = {} if model_parameters is None else model_parameters
         self.max_speed = 8.0
         self.max_torque = 2.0
         start = {"theta_0": Uniform(-np.pi, np.pi), "theta_dot_0": Uniform(-1.0, 1.0)}
         config = {
             "model_input_names": "tau",
             "model_output_names": ["theta", "theta_dot"],
-            "model_parameters": {**start, **_GYMNASIUM_PLANT, "g": g, **(model_parameters or {})},
+            "model_parameters": {
+                **start,
+                **_GYMNASIUM_PLANT,
+                "g": g,
+                **check_mapping("model_parameters", given),
+            },
             "time_step": 0.05,
         }
         fmu_path = bundled_fmu("Pendulum", fmi_version)

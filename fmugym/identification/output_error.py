@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.fmu import FMU
-from fmugym.checks import flag, mapping, number, text, whole_number
+from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError, shown
 from fmugym.identification.problem import Experiment, Limits, Problem
@@ -102,9 +102,9 @@ class FitResult:
             ConfigError: If an argument has a wrong type or range.
             SimulationError: If the FMU fails.
         """
-        refit_initial_states = flag("refit_initial_states", refit_initial_states)
+        refit_initial_states = check_flag("refit_initial_states", refit_initial_states)
         if lead_in is not None:
-            lead_in = number("lead_in", lead_in, positive=True, may_be_infinite=True)
+            lead_in = check_number("lead_in", lead_in, positive=True, may_be_infinite=True)
         common_names(trajectories)
         experiment, shifted = self._for_prediction(trajectories)
         if lead_in is None or not refit_initial_states:
@@ -190,7 +190,7 @@ def fit_parameters(
         SimulationError: If the FMU fails with the start values or near a tried point.
         ImportError: If SciPy is not installed.
     """
-    wanted = mapping("parameters", parameters)
+    wanted = check_mapping("parameters", parameters)
     if not wanted:
         raise ConfigError("there is no parameter to fit")
     experiment = Experiment(
@@ -199,12 +199,12 @@ def fit_parameters(
         _mapping("fixed", fixed),
         _mapping("scales", scales),
         time_step,
-        flag("drop_repeats", drop_repeats),
-        text("backend", backend),
+        check_flag("drop_repeats", drop_repeats),
+        check_text("backend", backend),
     )
-    clustered = flag("clustered", clustered)
-    max_evaluations = whole_number("max_evaluations", max_evaluations, 1, 10**9)
-    fit_states = flag("fit_initial_states", fit_initial_states)
+    clustered = check_flag("clustered", clustered)
+    max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
+    fit_states = check_flag("fit_initial_states", fit_initial_states)
     with closing(Problem(experiment, wanted, trajectories, fit_states)) as problem:
         return _result(experiment, problem, problem.solve(max_evaluations), clustered)
 
@@ -212,14 +212,14 @@ def fit_parameters(
 def _opened(fmu: Any) -> FMU:
     if not isinstance(fmu, FMU):
         try:
-            fmu = text("fmu", os.fspath(fmu))
+            fmu = check_text("fmu", os.fspath(fmu))
         except Exception:  # a path may be any object
             raise ConfigError(f"fmu must be a path or an FMU, not {shown(fmu)}") from None
     return FMU.of(fmu)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
-    return {} if value is None else mapping(what, value)
+    return {} if value is None else check_mapping(what, value)
 
 
 def _result(experiment: Experiment, problem: Problem, solution: Any, clustered: bool) -> FitResult:

@@ -17,7 +17,7 @@ import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
-from fmugym.checks import as_float, number, text
+from fmugym.checks import check_number, check_text, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.identification._scipy import scipy_module
 from fmugym.identification.results import Comparison
@@ -318,7 +318,7 @@ def _levenberg_marquardt(
 def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
     """Return start value, lower and upper bound of a parameter."""
     entries = limits if isinstance(limits, tuple | list | np.ndarray) else (limits,)
-    numbers = tuple(as_float(entry) for entry in entries)
+    numbers = tuple(float_or_nan(entry) for entry in entries)
     if len(numbers) == 1:
         numbers = (*numbers, variable.minimum, variable.maximum)
     elif len(numbers) == 2:
@@ -345,12 +345,12 @@ def _measured_states(
     states = np.empty((len(initial_states), len(trajectories)))
     for k, (name, source) in enumerate(initial_states.items()):
         if isinstance(source, str):
-            source = text("initial_states", source)
+            source = check_text("initial_states", source)
             if source not in trajectories[0].outputs:
                 raise unknown_name("measured output", source, trajectories[0].outputs)
             states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
         else:
-            states[k] = number(f"the initial state {shown(name)}", source)
+            states[k] = check_number(f"the initial state {shown(name)}", source)
     return states
 
 
@@ -359,9 +359,9 @@ def _scales(
 ) -> FloatArray:
     """Return the scale of each output, shape (outputs,)."""
     for name, scale in given.items():
-        if text("scales", name) not in outputs:
+        if check_text("scales", name) not in outputs:
             raise unknown_name("measured output", name, outputs)
-        number(f"the scale of {name!r}", scale, positive=True)
+        check_number(f"the scale of {name!r}", scale, positive=True)
     spread = {
         n: float(np.std(np.concatenate([t.outputs[n] for t in trajectories]))) for n in outputs
     }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fmugym.checks import mapping, number, text, whole_number
+from fmugym.checks import check_integer, check_mapping, check_number, check_text
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
@@ -43,7 +43,7 @@ class Comparison:
         Raises:
             ConfigError: If the output was not measured.
         """
-        known, output = self.trajectories[0].outputs, text("output", output)
+        known, output = self.trajectories[0].outputs, check_text("output", output)
         if output not in known:
             raise unknown_name("measured output", output, known)
         pairs = zip(self.simulated, self.trajectories, strict=True)
@@ -71,8 +71,8 @@ class Comparison:
         Raises:
             ConfigError: If the output was not measured, or an argument is out of its range.
         """
-        level = number("level", level, 0.0, 1.0)
-        seed = whole_number("seed", seed, 0, 2**128 - 1)
+        level = check_number("level", level, 0.0, 1.0)
+        seed = check_integer("seed", seed, 0, 2**128 - 1)
         residuals = self.residuals(output)
         squares = np.array([np.sum(residual**2) for residual in residuals])
         counts = np.array([len(residual) for residual in residuals])
@@ -106,12 +106,12 @@ def plot_comparison(
     if not isinstance(comparison, Comparison):
         raise ConfigError(f"expected a Comparison, not {shown(comparison)}")
     outputs = _chosen(comparison, outputs)
-    texts = {} if labels is None else mapping("labels", labels)
+    texts = {} if labels is None else check_mapping("labels", labels)
     figure = Figure(figsize=(8, 1 + 2 * len(outputs)), layout="constrained")
     axes = figure.subplots(len(outputs), sharex=True, squeeze=False)[:, 0]
     for ax, output in zip(axes, outputs, strict=True):
         _draw_output(ax, comparison, output)
-        ax.set_ylabel(text("labels", texts.get(output, output)))
+        ax.set_ylabel(check_text("labels", texts.get(output, output)))
     axes[0].legend(loc="upper right")
     axes[-1].set_xlabel("time [s]")
     return figure
@@ -122,7 +122,7 @@ def _chosen(comparison: Comparison, outputs: Sequence[str] | None) -> list[str]:
         return list(comparison.trajectories[0].outputs)
     if not isinstance(outputs, list | tuple) or not outputs:
         raise ConfigError(f"outputs must be a list of names, not {shown(outputs)}")
-    names = [text("outputs", output) for output in outputs]
+    names = [check_text("outputs", output) for output in outputs]
     for name in names:
         comparison.residuals(name)  # refuses an unknown name
     return names

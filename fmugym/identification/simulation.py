@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
-from fmugym.checks import number
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
@@ -60,7 +60,7 @@ class Simulator:
         backend: str = "auto",
     ) -> None:
         if time_step is not None:
-            time_step = number("time_step", time_step, positive=True)
+            time_step = check_number("time_step", time_step, positive=True)
         fmu = FMU.of(fmu)
         self.failure = ""
         self.description = fmu.description

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmugym.checks import number
+from fmugym.checks import check_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
 from fmugym.identification._scipy import scipy_module
@@ -89,7 +89,7 @@ def confidence_intervals(
     Raises:
         ConfigError: If the level is not between 0 and 1.
     """
-    level = number("level", level, positive=True)
+    level = check_number("level", level, positive=True)
     if level >= 1.0:
         raise ConfigError(f"level must be less than 1, not {level:g}")
     factor = float(scipy_module("stats").t.ppf(0.5 + level / 2, freedom))

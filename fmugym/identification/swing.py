@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import as_float, flag, number
+from fmugym.checks import check_flag, check_number, float_or_nan
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError, shown
 from fmugym.identification.statistics import (
@@ -74,7 +74,7 @@ class SwingFit:
         Raises:
             ConfigError: If the mass is not positive and finite.
         """
-        mass = number("mass", mass, positive=True)
+        mass = check_number("mass", mass, positive=True)
         inertia = mass * self.l**2
         found = {"m": mass, "l": self.l, "b": self.values["p1"] * inertia}
         return found | ({"c": self.values["p3"] * inertia} if "p3" in self.values else {})
@@ -145,9 +145,9 @@ def fit_swing(
             or if the swings do not determine the values.
         ImportError: From the confidence intervals, if SciPy is not installed.
     """
-    coulomb, g = flag("coulomb", coulomb), number("g", g, positive=True)
-    v_c = number("v_c", v_c, positive=True)
-    correlation_time = number("correlation_time", correlation_time, 0.0)
+    coulomb, g = check_flag("coulomb", coulomb), check_number("g", g, positive=True)
+    v_c = check_number("v_c", v_c, positive=True)
+    correlation_time = check_number("correlation_time", correlation_time, 0.0)
     swings = [_regression(*swing, coulomb, v_c) for swing in _swings(time, q, q_dot)]
     regressors = np.concatenate([x for x, _, _ in swings])
     inverse = information_inverse(regressors)
@@ -181,10 +181,10 @@ def _swings(
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     """Return time, angles and velocities of each swing, without stale samples."""
     angles, velocities = _rows("q", q), _rows("q_dot", q_dot)
-    if np.isnan(interval := as_float(time)):
+    if np.isnan(interval := float_or_nan(time)):
         times = _rows("time", time)
     else:
-        period = number("time", interval, positive=True)
+        period = check_number("time", interval, positive=True)
         times = [np.arange(len(angle), dtype=np.float64) * period for angle in angles]
     if len(times) == 1:
         times *= len(angles)

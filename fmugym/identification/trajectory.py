@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import mapping, number
+from fmugym.checks import check_mapping, check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 
@@ -78,8 +78,8 @@ class Trajectory:
         Raises:
             ConfigError: If there are fewer than two such samples.
         """
-        start = number("start", start, may_be_infinite=True)
-        end = number("end", end, may_be_infinite=True)
+        start = check_number("start", start, may_be_infinite=True)
+        end = check_number("end", end, may_be_infinite=True)
         chosen = (self.time >= start) & (self.time < end)
         if chosen.sum() < 2:
             raise ConfigError(
@@ -97,7 +97,7 @@ class Trajectory:
         Raises:
             ConfigError: If a window would have fewer than two samples.
         """
-        length = number("length", length, positive=True)
+        length = check_number("length", length, positive=True)
         start, period = self.time[0], (self.time[-1] - self.time[0]) / (len(self) - 1)
         if length < period:
             raise ConfigError(f"windows of {length:g} s are shorter than the period {period:g} s")
@@ -172,7 +172,7 @@ def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[st
 
 
 def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:
-    checked = mapping(f"{what} of a trajectory", signals)
+    checked = check_mapping(f"{what} of a trajectory", signals)
     for name in checked:
         if not isinstance(name, str):
             raise ConfigError(f"{what} of a trajectory: {shown(name)} is not a name")

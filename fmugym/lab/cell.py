@@ -13,7 +13,7 @@ import numpy as np
 
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU
-from fmugym.checks import mapping
+from fmugym.checks import check_mapping
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.lab.acting import Acting
@@ -247,7 +247,7 @@ def checked_parameters(cell_type: CellType, parameters: Mapping[str, Any]) -> di
         ConfigError: If a parameter does not exist, cannot be set, or has a wrong value.
     """
     plant = PLANTS[cell_type]
-    values = mapping(f"parameters of {cell_type.name} cells", parameters)
+    values = check_mapping(f"parameters of {cell_type.name} cells", parameters)
     checked = {}
     with closing(FMU(bundled_fmu(plant.model))) as fmu:
         for name, value in values.items():

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final, Protocol
 
-from fmugym.checks import number
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
@@ -195,7 +195,7 @@ def _check_fields(disturbance: Any) -> None:
         value = getattr(disturbance, field.name)
         if field.name not in _VECTORS:
             low = 0.0 if field.name in ("duration", "tolerance") else -_LARGEST
-            checked: Any = number(what, value, low, _LARGEST)
+            checked: Any = check_number(what, value, low, _LARGEST)
         elif value is None and field.default is None:
             checked = None
         else:
@@ -210,7 +210,7 @@ def _vector(what: str, entries: Any) -> tuple[float, ...]:
         values = tuple(entries)
     except Exception:
         raise ConfigError(f"{what} must be a list of numbers, not {shown(entries)}") from None
-    return tuple(number(what, entry, -_LARGEST, _LARGEST) for entry in values)
+    return tuple(check_number(what, entry, -_LARGEST, _LARGEST) for entry in values)
 
 
 PRESETS: Final[dict[str, tuple[Disturbance, ...]]] = {
@@ -268,7 +268,7 @@ def _check(disturbance: Any, joints: int) -> None:
     missing = [a for a in ("duration", "torque", "position") if not hasattr(disturbance, a)]
     if missing:
         raise ConfigError(f"{name} is not a disturbance: it has no {missing[0]}")
-    number(f"{name}: duration", disturbance.duration, 0.0, _LARGEST)
+    check_number(f"{name}: duration", disturbance.duration, 0.0, _LARGEST)
     for attribute in _VECTORS:
         entries = getattr(disturbance, attribute, None)
         if entries is not None and len(_vector(f"{name}: {attribute}", entries)) != joints:

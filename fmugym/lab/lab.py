@@ -9,7 +9,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from fmugym.checks import mapping, whole_number
+from fmugym.checks import check_dict, check_integer
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.cell import Cell, checked_parameters
 from fmugym.lab.client import Client
@@ -70,7 +70,7 @@ class Lab(Service):
     ) -> None:
         options = make_options(preset, **changes)
         if seed is not None:
-            seed = whole_number("seed", seed, 0, _LARGEST_SEED)
+            seed = check_integer("seed", seed, 0, _LARGEST_SEED)
         seeds = np.random.SeedSequence(seed)
         rng = _rng(seeds)
         super().__init__(
@@ -132,7 +132,7 @@ def _make_cells(
 def _numbers(cells: Any) -> Mapping[CellType, int]:
     numbers = _by_type("cells", _CELLS if cells is None else cells)
     return {
-        kind: whole_number(f"cells: the number of {kind.name} cells", count, 0, _MOST_CELLS)
+        kind: check_integer(f"cells: the number of {kind.name} cells", count, 0, _MOST_CELLS)
         for kind, count in numbers.items()
     }
 
@@ -143,7 +143,7 @@ def _parameters(parameters: Any) -> dict[CellType, dict[str, float]]:
 
 
 def _by_type(what: str, value: Any) -> dict[CellType, Any]:
-    entries = mapping(what, value)
+    entries = check_dict(what, value)
     for kind in entries:
         if not isinstance(kind, CellType):
             raise ConfigError(f"{what}: expected a CellType as a key, not {shown(kind)}")

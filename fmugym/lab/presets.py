@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.checks import flag, number, whole_number
+from fmugym.checks import check_flag, check_integer, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["HARDWARE", "IDEAL", "PRESETS", "Options", "make_options"]
@@ -113,20 +113,20 @@ def _checked(name: str, value: Any) -> Any:
     if name in _PAIRS:
         return _pair(name, value)
     if name in _FLAGS:
-        return flag(name, value)
+        return check_flag(name, value)
     if name == "starts_per_window":
-        return None if value is None else whole_number(name, value, 0, 10**9)
+        return None if value is None else check_integer(name, value, 0, 10**9)
     if name == "drive_step":
-        return number(name, value, 1e-5, 2e-3)
+        return check_number(name, value, 1e-5, 2e-3)
     if name in _LIMITS:
-        return number(name, value, 0.0, may_be_infinite=True)
-    return number(name, value, 0.0, 1.0 if name in _SHARES else _HIGHEST)
+        return check_number(name, value, 0.0, may_be_infinite=True)
+    return check_number(name, value, 0.0, 1.0 if name in _SHARES else _HIGHEST)
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise ConfigError(f"{name} must be a pair of numbers, not {shown(value)}")
-    first, second = (number(name, entry, 0.0, _HIGHEST) for entry in value)
+    first, second = (check_number(name, entry, 0.0, _HIGHEST) for entry in value)
     return first, second
 
 

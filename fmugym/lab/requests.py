@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.checks import as_float, flag, number
+from fmugym.checks import check_flag, check_number, float_or_nan
 from fmugym.errors import shown, unknown_name
 from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance, resolve
@@ -52,9 +52,9 @@ class Request:
             raise LabError(str(unknown_name("experiment type", kind, EXPERIMENTS)))
         object.__setattr__(self, "experiment_type", str.__str__(kind))
         with as_lab_error():
-            object.__setattr__(self, "record", flag("record", self.record))
+            object.__setattr__(self, "record", check_flag("record", self.record))
             if self.cell_id is not None:
-                object.__setattr__(self, "cell_id", number("cell_id", self.cell_id))
+                object.__setattr__(self, "cell_id", check_number("cell_id", self.cell_id))
 
     @property
     def cell_type(self) -> CellType:
@@ -133,7 +133,7 @@ def check_range(name: str, value: Any, highest: float, lowest: float | None = No
     """
     if not isinstance(value, Real):
         raise LabError(f"{name} must be a number, not {shown(value)}")
-    checked = as_float(value)
+    checked = float_or_nan(value)
     is_inside = checked > 0.0 if lowest is None else checked >= lowest
     if not (is_inside and checked <= highest and math.isfinite(checked)):
         wanted = (

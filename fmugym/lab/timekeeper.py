@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from fmugym.checks import number
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.errors import LabError, as_lab_error
 from fmugym.pool.backend.clock import Clock
@@ -51,7 +51,7 @@ class Timekeeper:
         if type(now) is float and math.isfinite(now):  # the full check takes a while
             return now
         with as_lab_error():
-            return number("the time of the lab's clock", now)
+            return check_number("the time of the lab's clock", now)
 
     def sleep(self, seconds: float) -> None:
         """Wait for some time, in s; a negative time is no wait.

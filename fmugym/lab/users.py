@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from fmugym.checks import flag, number, whole_number
+from fmugym.checks import check_flag, check_integer, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.lab.data import UserInfo
 from fmugym.lab.errors import LabError
@@ -60,15 +60,15 @@ class User:
 def _checked(name: str, value: Any) -> Any:
     what = f"{name} of a user"
     if name == "gym":
-        return flag(what, value)
+        return check_flag(what, value)
     if name == "experiment_types":
         return _known_types(value)
     if name in _COUNTS:
-        return whole_number(what, value, 0, 10**9)
+        return check_integer(what, value, 0, 10**9)
     if name == "refil_interval":
-        return number(what, value, 1e-3, 1e9)
+        return check_number(what, value, 1e-3, 1e9)
     if name != "name":
-        return number(what, value, 0.0, may_be_infinite=True)
+        return check_number(what, value, 0.0, may_be_infinite=True)
     if not isinstance(value, str):
         raise ConfigError(f"{what} must be a text, not {shown(value)}")
     return str.__str__(value)

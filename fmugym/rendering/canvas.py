@@ -9,7 +9,7 @@ from typing import Any, Final, TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fmugym.checks import number, whole_number
+from fmugym.checks import check_integer, check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering._pygame import pygame
 
@@ -64,7 +64,7 @@ class World:
 
     def __post_init__(self) -> None:
         for name in ("left", "bottom", "right", "top"):
-            object.__setattr__(self, name, number(f"bounds: {name}", getattr(self, name)))
+            object.__setattr__(self, name, check_number(f"bounds: {name}", getattr(self, name)))
         spans = (self.right - self.left, self.top - self.bottom)
         if not all(math.isfinite(span) and span > 0.0 for span in spans):
             raise ConfigError(f"bounds must be finite, with left < right, bottom < top: {self}")
@@ -90,7 +90,7 @@ class Canvas:
     def __init__(self, size: tuple[int, int], world: World, supersampling: int = 4) -> None:
         if not isinstance(world, World):
             raise ConfigError(f"expected a World, not {shown(world)}")
-        supersampling = whole_number("supersampling", supersampling, 1, 16)
+        supersampling = check_integer("supersampling", supersampling, 1, 16)
         width, height = self.size = size = checked_size(size, supersampling)
         self._supersampling = supersampling
         self._drawn = pygame.Surface((width * supersampling, height * supersampling), 0, 32)
@@ -299,7 +299,7 @@ def checked_size(size: Any, supersampling: int = 4) -> tuple[int, int]:
     """
     if not isinstance(size, tuple | list) or len(size) != 2:
         raise ConfigError(f"size must be a width and a height, not {shown(size)}")
-    width, height = (whole_number("width and height", side, 1, 2**15) for side in size)
+    width, height = (check_integer("width and height", side, 1, 2**15) for side in size)
     if width * height * supersampling**2 > _MOST_PIXELS:
         raise ConfigError(f"a picture of {width} x {height} pixels is too large")
     return width, height

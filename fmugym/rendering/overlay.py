@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Final
 
-from fmugym.checks import as_float
+from fmugym.checks import float_or_nan
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas
@@ -60,5 +60,5 @@ def _number(value: float | None) -> str:
     """Return two decimals, or a power of ten for a number too long for its column."""
     if value is None:
         return _NONE
-    number = as_float(value)
+    number = float_or_nan(value)
     return f"{number:.3e}" if abs(number) >= 1e7 else f"{number:.2f}"

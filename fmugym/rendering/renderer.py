@@ -5,7 +5,7 @@ from typing import Final, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fmugym.checks import number, text
+from fmugym.checks import check_number, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering._pygame import pygame
@@ -61,15 +61,15 @@ class Renderer(Generic[FrameT]):
         render_mode: str = "rgb_array",
         title: str = "fmugym",
     ) -> None:
-        self.render_mode = text("render_mode", render_mode)
+        self.render_mode = check_text("render_mode", render_mode)
         if self.render_mode not in _RENDER_MODES:
             raise ConfigError(f"render_mode must be one of {_RENDER_MODES}: {shown(render_mode)}")
         if not callable(getattr(scene, "draw", None)) or not hasattr(scene, "world"):
             raise ConfigError(f"a scene needs a method draw and a world: {shown(scene)}")
         self.scene = scene
         self.size = checked_size(size)
-        self.fps = number("fps", fps, positive=True, may_be_infinite=True)
-        self.title = text("title", title)
+        self.fps = check_number("fps", fps, positive=True, may_be_infinite=True)
+        self.title = check_text("title", title)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
 

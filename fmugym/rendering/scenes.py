@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from fmugym.checks import number
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas, Point, World, direction
@@ -65,11 +65,11 @@ class CartPoleScene:
     force_scale: float = 10.0
 
     def __post_init__(self) -> None:
-        number("x_threshold", self.x_threshold, positive=True)
-        number("pole_length", self.pole_length, positive=True)
-        number("force_scale", self.force_scale, positive=True)
+        check_number("x_threshold", self.x_threshold, positive=True)
+        check_number("pole_length", self.pole_length, positive=True)
+        check_number("force_scale", self.force_scale, positive=True)
         if self.angle_threshold is not None:
-            number("angle_threshold", self.angle_threshold, positive=True)
+            check_number("angle_threshold", self.angle_threshold, positive=True)
 
     @property
     def world(self) -> World:
@@ -166,7 +166,7 @@ class PendulumScene:
     torque_limit: float
 
     def __post_init__(self) -> None:
-        number("torque_limit", self.torque_limit, positive=True)
+        check_number("torque_limit", self.torque_limit, positive=True)
 
     @property
     def world(self) -> World:

@@ -12,10 +12,11 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from fmugym.env import FMUEnv, request_pool
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.interface import checked_value
+from fmugym.task.opening import request_pool
 from fmugym.vector.engines.batch import BatchEngine, Engine, StepResult
 from fmugym.vector.engines.compiled import CompiledEngine, find_programs
 from fmugym.vector.engines.per_env import PerEnvEngine

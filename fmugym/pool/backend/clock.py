@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final, Protocol
 
-from fmugym.checks import number
+from fmugym.checks import check_number
 
 __all__ = ["Clock", "ManualClock", "RealClock"]
 
@@ -47,7 +47,7 @@ class RealClock:
     """
 
     def __init__(self, speed: float = 1.0) -> None:
-        self.speed = number("speed", speed, positive=True)
+        self.speed = check_number("speed", speed, positive=True)
         self._start = time.perf_counter()
 
     def time(self) -> float:
@@ -76,7 +76,7 @@ class ManualClock:
     """
 
     def __init__(self, start: float = 0.0) -> None:
-        self._now = number("start", start)
+        self._now = check_number("start", start)
         self._changed = threading.Condition()
         self._crew: set[threading.Thread] = set()
         self._working_for: dict[threading.Thread, set[threading.Thread]] = {}
@@ -92,7 +92,7 @@ class ManualClock:
         Raises:
             ConfigError: If the time would go backwards, or is not a finite number.
         """
-        step = number("the seconds to advance by", seconds, 0.0)
+        step = check_number("the seconds to advance by", seconds, 0.0)
         with self._changed:
             self._now += step
             self._changed.notify_all()
@@ -103,7 +103,7 @@ class ManualClock:
         Raises:
             ConfigError: If the time is not a finite number.
         """
-        if number("the seconds to sleep", seconds) <= 0.0:
+        if check_number("the seconds to sleep", seconds) <= 0.0:
             return
         thread = threading.current_thread()
         with self._changed:
