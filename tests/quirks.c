@@ -2,7 +2,8 @@
 
    x' = gain u - x / tau, y = x, by explicit Euler with internal steps of 1 ms.
    Reals: 0 "u" (input), 1 "y" (output), 2 "gain" and 3 "tau" (parameters), 4 "clock" (output: what
-   the FMU itself takes for the time since the start), 5 "calls" (output). */
+   the FMU itself takes for the time since the start), 5 "calls" (output), 6 "returns" (output:
+   whether states of earlier times may be restored, as the last step was told). */
 
 #include <stdio.h>
 #include <stdlib.h>
@@ -12,7 +13,7 @@
 #define OWN_BOOLEAN_STATUS
 #include "fmi2_stubs.h"
 
-enum { U, Y, GAIN, TAU, CLOCK, CALLS, VALUES };
+enum { U, Y, GAIN, TAU, CLOCK, CALLS, RETURNS, VALUES };
 
 typedef struct {
     void *logger;
@@ -119,6 +120,7 @@ static void advance(Model *me, double step_size) {
 }
 
 int fmi2DoStep(Model *me, double time, double step_size, int no_set_state) {
+    me->values[RETURNS] = !no_set_state;
     if (me->stopped) {
         return 2;
     }

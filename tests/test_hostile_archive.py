@@ -13,8 +13,8 @@ import pytest
 from fmu_tools import PlainEnv, edited_fmu, probe_config, probe_fmu, probe_xml, write_fmu
 
 from fmugym import FMU, FMULoadError, SimulationError
-from fmugym.env import request_pool
 from fmugym.errors import printable
+from fmugym.task.opening import request_pool
 from fmugym.tools.cli import main
 
 XML = "modelDescription.xml"

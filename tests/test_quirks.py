@@ -37,6 +37,7 @@ XML = """<fmiModelDescription fmiVersion="2.0" modelName="Quirks" guid="{token}"
 <Real start="0.5"/></ScalarVariable>
 <ScalarVariable name="clock" valueReference="4" causality="output"><Real/></ScalarVariable>
 <ScalarVariable name="calls" valueReference="5" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="returns" valueReference="6" causality="output"><Real/></ScalarVariable>
 </ModelVariables><ModelStructure/></fmiModelDescription>"""
 STEP = 0.05
 LENGTHS = (3, 12, 12, 5)
@@ -62,7 +63,7 @@ METHODS = {
 class QuirkEnv(fmugym.FMI2CSEnv):
     """Reads all outputs; the gain differs from episode to episode."""
 
-    def __init__(self, path, gain=None, **config):
+    def __init__(self, path, gain=None, way=None, **config):
         gain = fmugym.Uniform(0.5, 2.0) if gain is None else gain
         config = {
             "model_input_names": "u",
@@ -70,7 +71,7 @@ class QuirkEnv(fmugym.FMI2CSEnv):
             "model_parameters": {"gain": gain, "tau": 0.3},
             "time_step": STEP,
         } | config
-        super().__init__(path, config)
+        super().__init__(path, config, backend=way)
 
     def _is_done(self):
         return self.out["y"] > 1e9
@@ -274,6 +275,33 @@ class TestConfig:
     def test_refuses_others(self, make_fmu):
         with pytest.raises(fmugym.ConfigError, match="did you mean 'restore'"):
             QuirkEnv(make_fmu("well behaved"), reset_method="restoer")
+
+
+@pytest.mark.parametrize("backend", ["python", "native"])
+class TestPromiseAboutStates:
+    """FMI 2.0 tells an FMU in each step whether a state of an earlier time may be restored."""
+
+    def returns(self, env):
+        env.step(np.zeros(1, np.float32))
+        return env.read_variables(["returns"])["returns"]
+
+    def test_follows_the_reset_method(self, make_fmu, backend):
+        for method, expected in (("reset", 0.0), ("restore", 1.0)):
+            env = QuirkEnv(make_fmu("well behaved"), gain=1.0, reset_method=method, way=backend)
+            for _ in range(3):
+                env.reset()
+                told = self.returns(env)
+            assert told == expected
+            env.close()
+
+    def test_holds_from_the_first_snapshot_on(self, make_fmu, backend):
+        env = QuirkEnv(make_fmu("well behaved"), reset_method="reset", way=backend)
+        env.reset()
+        assert self.returns(env) == 0.0
+        snapshot = env._pool.save()
+        assert self.returns(env) == 1.0
+        env._pool.restore(snapshot)
+        env.close()
 
 
 class TestVerdict:

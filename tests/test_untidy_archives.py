@@ -18,7 +18,7 @@ from fmu_tools import (
 )
 
 from fmugym import FMU, FMULoadError
-from fmugym.env import request_pool
+from fmugym.task.opening import request_pool
 from fmugym.tools.cli import main
 
 XML = "modelDescription.xml"
