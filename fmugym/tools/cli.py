@@ -31,9 +31,9 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``findings``: texts, what breaks rules in the archive and in the model description
 - ``variable_counts``: number of all variables by causality
 - ``variables``: those that were asked for, in the order of the XML, each with ``name``,
-  ``causality``, ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``, ``nominal``,
-  ``start`` (in the variable's type; a text for arrays and for what is malformed or not finite),
-  ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
+  ``causality``, ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``,
+  ``nominal``, ``start`` (in the variable's type; a text for arrays and for what is malformed or not
+  finite), ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
   ``settable_in_step``
 """
 
