@@ -18,6 +18,7 @@ from fmugym.tools import stand_in
 from fmugym.tools.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
+DOCUMENT = HERE.parent / "docs" / "archives.md"
 ZIG = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0", "-w"]
 SYMBOLS = sorted(set(re.findall(r"_gfortran_\w+", (HERE / "old_fortran.c").read_text())))
 OLD = {"_gfortran_pow_i4_i4": "GFORTRAN_1.4"}
@@ -92,7 +93,9 @@ def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path,
     (name,) = stand_in.replaceable(FMU(fmu_path))
     for backend in ("native", "python"):
         assert f"not found here: {name} (conda-forge" in play(fmu_path, backend)
-    assert main(["stand-in", str(fmu_path), "--folder", str(tmp_path)]) == 0
+    (command,) = re.findall(r"^fmugym (stand-in model.fmu .*)$", DOCUMENT.read_text(), re.MULTILINE)
+    replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
+    assert main([replaced.get(word, word) for word in command.split()]) == 0
     said = capsys.readouterr().out
     assert "without _gfortran_matmul_r8" in said
     preload = [str(tmp_path / name)]

@@ -1,4 +1,4 @@
-"""An FMU file: opened once, checked, extracted to a folder of its own and cleaned up.
+"""An FMU file: it is opened once, checked, extracted to its own folder and cleaned up.
 
 Reading the description never executes the FMU. Loading it (``fmugym.fmi``, ``fmugym.pool``) does:
 an FMU is native code that runs with all the rights of the process.
@@ -75,7 +75,7 @@ class LoadableFMU(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Remove what ``extract`` has made; calling it again is fine."""
+        """Remove what ``extract`` has made; more than one call is fine."""
 
     def prepare_library(self) -> Path:
         """Make the FMU's library ready to be loaded into this process.
@@ -95,14 +95,14 @@ class LoadableFMU(ABC):
             load_globally(path)
         missing = missing_libraries(library)
         if missing:
-            raise FMULoadError(f"{self.path.name} {describe_missing(missing)}")
+            raise FMULoadError(describe_missing(self.path.name, missing))
         for stray in stray_libraries(library):
             load_globally(str(stray))
         return library
 
 
 class ExtractedFMU(LoadableFMU):
-    """An FMU in a folder that belongs to somebody else and stays when this object is closed.
+    """An FMU in a folder that somebody else owns, and that stays when this object is closed.
 
     Args:
         path: The ``.fmu`` file.
@@ -219,8 +219,7 @@ class FMU(LoadableFMU):
             missing = self.missing_libraries
         except FMULoadError as error:
             return (str(error),)
-        text = f"{self.path.name} {describe_missing(missing)}"
-        return (printable(text),) if missing else ()
+        return (printable(describe_missing(self.path.name, missing)),) if missing else ()
 
     @cached_property
     def missing_libraries(self) -> tuple[str, ...]:
@@ -273,7 +272,7 @@ class FMU(LoadableFMU):
         """Look at the library inside the archive: nothing is written if it cannot be loaded."""
         place = self._library_place
         if place is None:
-            raise FMULoadError(f"{self.path.name} {self._no_library()}")
+            raise FMULoadError(self._no_library())
         with self._archive.open(place) as file:
             size = self._archive.files[place].file_size
             check_library(file, size, f"{self.path.name}: {place}")
@@ -284,12 +283,12 @@ class FMU(LoadableFMU):
         there = [p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), folder)]
         if there:
             return (
-                f"has {len(there)} libraries for this platform in {folder} ({', '.join(there)}), "
-                f"but none is named {name}; give the right one that name"
+                f"{self.path.name} has {len(there)} libraries for this platform in {folder} "
+                f"({', '.join(there)}), but none is named {name}; give the right one that name"
             )
         return (
-            f"has no library for this platform ({self.library}); it was built for: "
-            f"{', '.join(self.platforms) or 'no platform at all'}"
+            f"{self.path.name} has no library for this platform ({self.library}); it was built "
+            f"for: {', '.join(self.platforms) or 'no platform at all'}"
         )
 
     def _extract_to(self, folder: Path, only: str = "") -> None:

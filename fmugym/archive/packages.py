@@ -82,12 +82,12 @@ def source_of(library: str) -> Source:
     return next(rows, Source())
 
 
-def describe_missing(libraries: Sequence[str]) -> str:
-    """Say which libraries are missing and what to do about it; the sentence lacks its subject."""
+def describe_missing(fmu: str, libraries: Sequence[str]) -> str:
+    """Say which libraries an FMU of this name misses, and what to do about it."""
     listing = "; ".join(f"{name}{_remark(source_of(name))}" for name in libraries)
     return (
-        f"needs shared libraries that are not found here: {listing}. Install them, or name their "
-        "files in preload=[...]"
+        f"{fmu} needs shared libraries that are not found here: {listing}. Install them, or name "
+        "their files in preload=[...]"
     )
 
 

@@ -10,8 +10,8 @@ None of them executes anything of the FMU. Output is printable ASCII. The exit c
 FMU or a file cannot be used (one line on the error stream says why), or 2 if the arguments are
 wrong.
 
-The JSON of ``info --json`` is one object. Keys are added at times; when one goes or changes its
-meaning, ``schema`` is raised. What the FMU does not give is null, or ``""`` for a text.
+``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
+or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
 
 - ``schema``: 1
 - ``path``: absolute path of the FMU
@@ -30,10 +30,10 @@ meaning, ``schema`` is raised. What the FMU does not give is null, or ``""`` for
 - ``fixed_internal_step_size``: in s
 - ``findings``: texts, what breaks rules in the archive and in the model description
 - ``variable_counts``: number of all variables by causality
-- ``variables``: those asked for, in the order of the XML, each with ``name``, ``causality``,
-  ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``, ``nominal``,
-  ``start`` (in the variable's type; a text for arrays and what is malformed or not finite),
-  ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
+- ``variables``: those that were asked for, in the order of the XML, each with ``name``,
+  ``causality``, ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``,
+  ``nominal``, ``start`` (in the variable's type; a text for arrays and for what is malformed or not
+  finite), ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
   ``settable_in_step``
 """
 
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments.run(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader, ``head`` say, has seen enough
+    except BrokenPipeError:  # the reader, for example ``head``, has ended
         _drop_output()
     except (FMUGymError, OSError) as error:
         print(f"fmugym: error: {plain(error)}", file=sys.stderr)
@@ -155,5 +155,5 @@ def _stand_in(arguments: argparse.Namespace) -> None:
 
 
 def _drop_output() -> None:
-    """Let what is still buffered go nowhere; the interpreter would complain at its end."""
+    """Discard what is still buffered, which the interpreter would complain about at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -20,10 +20,10 @@ from fmugym.errors import FMULoadError, printable
 __all__ = ["as_text", "overview", "plain", "start_value"]
 
 SCHEMA: Final = 1
-"""Raised when a key of the overview goes or changes its meaning; new keys do not raise it."""
+"""Raised when a key goes or changes its meaning; new keys do not raise it."""
 
 SHOWN: Final = ("input", "output", "parameter")
-"""The causalities that are listed without being asked for."""
+"""The causalities that are listed by default."""
 
 _HEADINGS: Final = {
     "input": "Inputs",
@@ -44,9 +44,9 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
 
     Args:
         fmu: The FMU.
-        everything: List variables of every causality, not only those of ``SHOWN``.
-        pattern: List only variables whose name matches, of every causality. ``*`` stands for any
-            text and ``?`` for one character; brackets stand for themselves, as FMI names have them.
+        everything: List variables of all causalities, not only those in ``SHOWN``.
+        pattern: List the variables of all causalities whose name matches. ``*`` matches any text
+            and ``?`` one character; brackets match themselves, since names of arrays have them.
 
     Returns:
         Dicts, lists, strings, finite numbers, Booleans and None; ``fmugym.tools.cli`` describes
@@ -140,7 +140,7 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
     """Convert the start value, which the XML has as text, to the variable's type.
 
     Returns:
-        The value; the text itself for strings, arrays and whatever is not finite or malformed.
+        The value; the text itself for strings, arrays and what is not finite or malformed.
     """
     text = variable.start
     if text is None or variable.shape or variable.kind in {"string", "binary", "clock"}:
@@ -164,7 +164,7 @@ def plain(text: object) -> str:
 
 
 def as_text(facts: Mapping[str, Any]) -> str:
-    """Lay an overview out for the reader of a terminal.
+    """Format an overview for a terminal.
 
     Args:
         facts: What ``overview`` returned.
@@ -225,7 +225,7 @@ def _findings(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _tables(facts: Mapping[str, Any]) -> Iterator[str]:
-    causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones come last
+    causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones last
     for causality in dict.fromkeys(causalities):
         rows = [v for v in facts["variables"] if v["causality"] == causality]
         if rows:
