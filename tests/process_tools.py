@@ -25,6 +25,13 @@ VARIABLES = {
 }
 
 
+INTERRUPTIBLE = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+"""
+"""The begin of a program that obeys Ctrl-C although its parent ignores it, as in the background."""
+
+
 @functools.cache
 def _library():
     with tempfile.TemporaryDirectory() as folder:
