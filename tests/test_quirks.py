@@ -17,6 +17,7 @@ from fmu_tools import HERE, library_name, write_fmu
 
 import fmugym
 from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.tools.cli import main
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
 from fmugym.trial.trial import Candidate, examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
@@ -283,7 +284,7 @@ class TestPromiseAboutStates:
 
     def returns(self, env):
         env.step(np.zeros(1, np.float32))
-        return env.read_variables(["returns"])["returns"]
+        return env.read_variables("returns")["returns"]
 
     def test_follows_the_reset_method(self, make_fmu, backend):
         for method, expected in (("reset", 0.0), ("restore", 1.0)):
@@ -345,3 +346,12 @@ class TestVerdict:
             env = QuirkEnv(path)
             assert env.reset_method == "instance"
             env.close()
+
+
+def test_info_tells_what_the_trial_has_shown(make_fmu, capsys):
+    path = make_fmu("reset does nothing")
+    QuirkEnv(path).close()
+    assert main(["info", str(path)]) in (0, None)
+    shown = capsys.readouterr().out
+    assert "reset is wrong, instance is right to the last bit" in shown
+    assert "episodes begin by 'instance'" in shown

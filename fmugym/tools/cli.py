@@ -25,6 +25,9 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
   with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``
 - ``execution_tool``: the tool that must be installed; null if the FMU needs none
+- ``trial``: what the first meeting on this machine has shown: ``deterministic``, the grades of
+  ``resets`` by method, the ``reset_method``, what ``several_instances`` need, ``isolate``, and the
+  ``deaths`` of workers; null before
 - ``capabilities``: flags by name, those of ``fmugym.archive.description.Capabilities``
 - ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
 - ``fixed_internal_step_size``: in s

@@ -16,6 +16,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.archive.packages import source_of
 from fmugym.errors import FMULoadError, printable
+from fmugym.trial.trial import known_verdict
 
 __all__ = ["as_text", "overview", "plain", "start_value"]
 
@@ -69,9 +70,25 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         "capabilities": asdict(description.capabilities),
         "default_experiment": {name: getattr(description, name) for name in _TIMES},
         "fixed_internal_step_size": description.fixed_internal_step_size,
+        "trial": _trial(fmu),
         "findings": list(fmu.findings),
         "variable_counts": dict(Counter(variable.causality for variable in variables)),
         "variables": [_row(v) for v in variables if _is_wanted(v, everything, pattern)],
+    }
+
+
+def _trial(fmu: FMU) -> dict[str, Any] | None:
+    """What the first meeting has shown on this machine; None if there was none yet."""
+    verdict = known_verdict(fmu)
+    if verdict is None:
+        return None
+    return {
+        "deterministic": verdict.deterministic,
+        "resets": {str(method): str(grade) for method, grade in verdict.resets.items()},
+        "reset_method": str(verdict.reset_method) if verdict.resets else None,
+        "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
+        "isolate": verdict.isolate,
+        "deaths": list(verdict.reasons),
     }
 
 
@@ -185,6 +202,7 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
         "interfaces": ", ".join(facts["interfaces"]),
         "platforms": ", ".join(facts["platforms"]) or "none",
         "this machine": _this_machine(facts),
+        "first meeting": _first_meeting(facts["trial"]),
         "default experiment": _experiment(facts),
         "capabilities": _capabilities(facts["capabilities"]),
     }
@@ -197,6 +215,37 @@ def _this_machine(facts: Mapping[str, Any]) -> str:
     if not facts["runs_here"]:
         return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
     return f"{platform}: runs here" + (f" if it is installed: {tool}" if tool else "")
+
+
+def _first_meeting(trial: Mapping[str, Any] | None) -> str:
+    if trial is None:
+        return "not yet, or exempt"
+    grades = ", ".join(f"{method} is {_GRADES[g]}" for method, g in trial["resets"].items())
+    parts = [grades] if grades else []
+    if trial["reset_method"]:
+        parts.append(f"episodes begin by {trial['reset_method']!r}")
+    if not trial["deterministic"]:
+        parts.append("fresh instances differ")
+    if trial["several_instances"]:
+        parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
+    if trial["isolate"]:
+        parts.append("it harms its process and is isolated")
+    return "; ".join([*parts, *trial["deaths"]]) or "it survived"
+
+
+_GRADES: Final = {
+    "bitwise": "right to the last bit",
+    "tolerance": "right within the solver's tolerance",
+    "wrong": "wrong",
+    "fails": "failing",
+    "absent": "not offered",
+}
+_NEEDS: Final = {
+    "independent": "independent",
+    "one thread": "one thread for all",
+    "libraries": "a copy of the library each",
+    "processes": "a process each",
+}
 
 
 def _experiment(facts: Mapping[str, Any]) -> str:

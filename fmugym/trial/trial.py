@@ -44,6 +44,7 @@ __all__ = [
     "Request",
     "Stage",
     "examine",
+    "known_verdict",
     "meet",
 ]
 
@@ -163,8 +164,13 @@ def meet(fmu: FMU) -> None:
         FMULoadError: If the process did not survive; with the reason and the last lines.
     """
     candidate = Candidate.of(fmu)
-    if not candidate.exempt and recall(_content_key(candidate.path)) is None:
+    if not candidate.exempt and known_verdict(fmu) is None:
         _examine(Request(candidate), must_survive=True)
+
+
+def known_verdict(fmu: FMU) -> Verdict | None:
+    """The verdict of the last trial of an FMU on this machine; None if there was none."""
+    return Verdict.from_text(recall(_content_key(fmu.path)))
 
 
 def examine(
@@ -222,9 +228,10 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
             break
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
-    if notes.verdict.complete:
-        remember(_content_key(request.candidate.path), "")
-    return notes.verdict
+    verdict = notes.verdict
+    if verdict.complete:
+        remember(_content_key(request.candidate.path), verdict.to_text())
+    return verdict
 
 
 class _Notes:
