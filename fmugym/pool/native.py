@@ -142,40 +142,51 @@ class NativePool(CountedPool):
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
+        method = spec.reset_method
         paths = [fmu.prepare_library()]
         folder = fmu.extract()
         if private_libraries:
             paths = _copy_library(folder, Path(fmu.library), self.num_instances)
         try:
             return _native.Pool(
-                description.fmi_major_version,
-                description.model_identifier.encode(),
-                description.instantiation_token.encode(),
-                _resources(folder, description.fmi_major_version),
-                tuple(os.fsencode(path) for path in paths),
-                private_libraries,
-                log.isEnabledFor(logging.INFO),
-                description.capabilities.can_get_and_set_fmu_state,
-                list(ResetMethod).index(spec.reset_method),
-                spec.start_time,
-                spec.stop_time,
-                spec.tolerance,
-                spec.time_step,
-                spec.substeps,
-                spec.warm_up_steps,
-                spec.fault_retries,
-                tuple((v.value_reference, text.encode()) for v, text in spec.strings),
-                self._access(spec.inputs),
-                self._access(spec.outputs),
-                spec.num_observed,
-                self.num_instances,
-                self.threads,
-                self.inputs,
-                self.outputs,
-                self.statuses,
-                self.observations,
-                self._counts,
-                _Receiver(log, description.model_identifier, self._first_index),
+                library={
+                    "version": description.fmi_major_version,
+                    "model": description.model_identifier.encode(),
+                    "token": description.instantiation_token.encode(),
+                    "resources": _resources(folder, description.fmi_major_version),
+                    "paths": tuple(os.fsencode(path) for path in paths),
+                    "private": private_libraries,
+                    "logging": log.isEnabledFor(logging.INFO),
+                    "states": description.capabilities.can_get_and_set_fmu_state,
+                },
+                experiment={
+                    "start_time": spec.start_time,
+                    "stop_time": spec.stop_time,
+                    "tolerance": spec.tolerance,
+                    "time_step": spec.time_step,
+                    "substeps": spec.substeps,
+                    "warm_up_steps": spec.warm_up_steps,
+                    "retries": spec.fault_retries,
+                    "restores": method is ResetMethod.RESTORE,
+                    "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
+                    "reloads": method is ResetMethod.LIBRARY,
+                },
+                variables={
+                    "inputs": self._access(spec.inputs),
+                    "outputs": self._access(spec.outputs),
+                    "num_observed": spec.num_observed,
+                    "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                },
+                arrays={
+                    "inputs": self.inputs,
+                    "outputs": self.outputs,
+                    "statuses": self.statuses,
+                    "observations": self.observations,
+                    "health": self._counts,
+                },
+                count=self.num_instances,
+                threads=self.threads,
+                callback=_Receiver(log, description.model_identifier, self._first_index),
             )
         except OSError as error:
             raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
@@ -425,22 +436,13 @@ class NativePool(CountedPool):
         block, used, low, width, rows = draws
         count, ended, limit = episodes
         self._pool.prepare_play(
-            self._access(variables),
-            _program_bytes(programs[0]),
-            _program_bytes(programs[1]),
-            actions[0],
-            actions[1],
-            limit,
-            block.shape[2],
-            block.shape[1],
-            start_values,
-            block.reshape(-1),
-            used,
-            low,
-            width,
-            rows,
-            count,
-            ended,
+            start=self._access(variables),
+            start_values=start_values,
+            inputs=_program_bytes(programs[0]),
+            judgement=_program_bytes(programs[1]),
+            actions=actions,
+            draws={"block": block, "used": used, "low": low, "width": width, "rows": rows},
+            episodes={"step_counts": count, "ended": ended, "limit": limit},
         )
         return self._pool.play
 
