@@ -68,7 +68,7 @@ class Slot:
         self._spec = spec
         self._input_row, self._output_row = input_row, output_row
         self._step_size = spec.communication_step_size
-        self._restores = library.can_save_state and spec.reset_method is ResetMethod.RESTORE
+        self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
         self._build()
 
     def _build(self) -> None:

@@ -111,7 +111,7 @@ class ProcessPool(CountedPool):
         mask = self._as_mask(mask)
         with self._lock:
             concerned = self._crew.of_any(mask)
-            if self._spec.reset_method is ResetMethod.PROCESS:
+            if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
             self._retire_grown(concerned, mask)
             for _ in range(2):
