@@ -7,7 +7,11 @@ import pytest
 import fmugym
 from fmugym.pool import has_native_pool
 
-HOOKS = ("array", "per_env", "auto") + (("compiled",) if has_native_pool() else ())
+SETTINGS = [
+    (hooks, isolation)
+    for hooks in ("array", "per_env", "auto")
+    for isolation in ("none", "process")
+] + ([("compiled", "none")] if has_native_pool() else [])
 
 
 class FallingEnv(fmugym.FMI2CSEnv):
@@ -32,11 +36,8 @@ class FallingEnv(fmugym.FMI2CSEnv):
         return abs(self.out["q"]) > 2.0
 
 
-@pytest.mark.parametrize("isolation", ["none", "process"])
-@pytest.mark.parametrize("hooks", HOOKS)
+@pytest.mark.parametrize(("hooks", "isolation"), SETTINGS)
 def test_vector_equals_single(hooks, isolation):
-    if hooks == "compiled" and isolation == "process":
-        pytest.skip("hooks are compiled for pools in the caller's process only")
     envs = fmugym.FMUVectorEnv(FallingEnv, 3, hooks=hooks, isolation=isolation)
     singles = [FallingEnv(isolation=isolation) for _ in range(3)]
     observations, _ = envs.reset(seed=1)
