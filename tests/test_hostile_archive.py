@@ -84,6 +84,15 @@ class TestMemory:
         assert megabytes < 100
         assert "its encoding is 'UTF-7', expected 'UTF-8'" in text
 
+    def test_two_declarations_of_encodings(self, tmp_path):
+        """Parsers that take the second one would find elements that were not counted."""
+        hidden = "+ADw-a/+AD4-" * 1_000_000
+        head = '<?xml version="1.0"?><?xml version="1.0" encoding="UTF-7"?>'
+        xml = probe_xml(2).replace("<ModelVariables>", f"{hidden}<ModelVariables>")
+        text, megabytes = opened(with_xml(tmp_path, head + xml))
+        assert megabytes < 100
+        assert "is not valid XML" in text
+
     def test_markup_in_two_bytes_a_character(self, tmp_path):
         elements = "<a/>" * 1_600_000
         xml = f'<?xml version="1.0" encoding="UTF-16"?><r>{elements}</r>'
