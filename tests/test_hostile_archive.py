@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import stat
 import subprocess
 import sys
 import time
@@ -130,6 +131,18 @@ class TestTime:
         begin = time.process_time()
         FMU(path)
         assert time.process_time() - begin < 5.0
+
+    def test_many_links(self, tmp_path):
+        """Each of them must not read the directory of the archive again."""
+        path = probe_fmu(tmp_path)
+        with zipfile.ZipFile(path, "a") as archive:
+            for number in range(3_000):
+                link = zipfile.ZipInfo(f"resources/{number}")
+                link.create_system, link.external_attr = 3, (stat.S_IFLNK | 0o777) << 16
+                archive.writestr(link, f"../{XML}")
+        begin = time.process_time()
+        FMU(path)
+        assert time.process_time() - begin < 3.0
 
 
 class TestNumbers:
