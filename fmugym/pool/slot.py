@@ -1,4 +1,4 @@
-"""One place of a pool in Python: an instance with its buffers, replaced when it is past mending."""
+"""One place of a pool in Python: an instance with its buffers, replaced if a reset cannot help."""
 
 from __future__ import annotations
 
@@ -34,10 +34,11 @@ class Snapshot:
 
 
 class States:
-    """What the instances of a pool know of FMU states.
+    """What the instances of a pool know about FMU states.
 
     Attributes:
-        complete: Whether steps from a restored state were found to be the same; None before.
+        complete: Whether steps from a restored state gave the same results; None before this is
+            known.
     """
 
     complete: bool | None = None
@@ -59,7 +60,20 @@ def _is_fine(status: int) -> bool:
 
 
 class Slot:
-    """One place of the pool: its instance, which is replaced when it is past mending."""
+    """One place of the pool: its instance, which is replaced if a reset cannot help.
+
+    Args:
+        library: The FMU's library.
+        spec: What to do at each reset and step.
+        input_row: The inputs of the instance, shape (k_in,).
+        output_row: Its outputs, shape (k,).
+        counts: Its counts, shape (HEALTH_COUNTS,).
+        states: What the pool's instances know about FMU states.
+
+    Attributes:
+        failure: Why the last status was worse than a warning.
+        is_due: Whether the next reset replaces the instance.
+    """
 
     def __init__(
         self,
@@ -92,11 +106,18 @@ class Slot:
         self._good_outputs = self._output_row.tolist()
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
-        """Start anew by the cheapest way that gives the same as a fresh instance.
+        """Start anew in the cheapest way that gives the same results as a fresh instance.
 
-        The state after initialization is kept once the same start values come a second time, after
-        an episode with steps, and restored from then on; other start values take a reset and an
-        initialization.
+        When the same start values come a second time, after an episode with steps, the state after
+        the initialization is kept. From then on it is restored. Other start values take a reset and
+        an initialization.
+
+        Args:
+            variables: The variables to set before initialization, P of them.
+            values: Their values, shape (P,).
+
+        Returns:
+            The status.
         """
         key = (variables, values.tobytes())
         stepped = self._count > self._spec.warm_up_steps * self._spec.substeps
@@ -115,7 +136,7 @@ class Slot:
         return self._read_outputs(Status.OK)
 
     def count_steps(self) -> None:
-        """Let the counts have all steps until now."""
+        """Add the steps until now to the counts."""
         self._counts[Column.STEPS] += self._count - self._counted
         self._counted = self._count
 
@@ -123,7 +144,7 @@ class Slot:
         self._count = self._counted = count
 
     def _recycle_if_due(self) -> None:
-        """Memory that an instance has leaked may go with it."""
+        """Replace the instance if this was asked for, as that may free what it has leaked."""
         is_due, self.is_due = self.is_due, False
         if is_due and self._instance.phase not in (Phase.DEAD, Phase.INSTANTIATED):
             self._counts[Column.RECYCLINGS] += 1
@@ -134,12 +155,12 @@ class Slot:
             return False
         try:
             self._instance.restore_state(self._saved)
-        except SimulationError:  # a reset and an initialization may still do
+        except SimulationError:  # a reset and an initialization may still work
             self._saved = None
         return self._saved is not None
 
     def _keeps_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> bool:
-        """Keep the state if it will be of use; returns whether the instance may go on."""
+        """Keep the state if it will be used again; returns whether the instance may go on."""
         again = stepped and key == self._start_key
         self._start_key, self._saved = key, None
         if not again or not self._library.can_save_state or self._states.complete is False:
@@ -153,9 +174,9 @@ class Slot:
         return True
 
     def _rehearse(self, start: SavedState) -> bool:
-        """Step twice from the kept state, with the inputs that were written last.
+        """Step twice from the kept state, with the last inputs, and compare the results.
 
-        An FMU may have left a part of its state out.
+        They differ if the FMU leaves a part of its state out.
         """
         results = []
         if not _all_finite(self._input_row.tolist()):
@@ -194,7 +215,7 @@ class Slot:
         self._warm_up()
 
     def _return_to_instantiated(self) -> None:
-        """Reset the instance, or replace it where it refuses or is past any reset."""
+        """Reset the instance, or replace it if it refuses or must not be reset."""
         if self._instance.phase is Phase.INSTANTIATED:
             return
         try:
@@ -221,9 +242,9 @@ class Slot:
                 raise SimulationError(f"the warm-up failed: {self.failure}")
 
     def step(self) -> int:
-        """Set the inputs, step, get the outputs."""
+        """Set the inputs, step, and get the outputs; returns the status."""
         if self._instance.phase is not _STEPPING:
-            return self._failed("a step was asked for before a reset has mended the instance")
+            return self._failed("the instance needs a reset before it can be stepped")
         inputs = self._input_row.tolist()
         if not _all_finite(inputs):
             return self._not_finite("inputs", self._spec.inputs, inputs)
@@ -236,7 +257,7 @@ class Slot:
         if status and not _is_fine(status) and status != Status.TERMINATED:
             return status
         result = self._read_outputs(status)
-        if result > _WARNING and result != Status.NOT_FINITE:  # the step may have been the last
+        if result > _WARNING and result != Status.NOT_FINITE:  # this may have been the last step
             self._instance.forbid_steps()
         return result
 
@@ -254,7 +275,10 @@ class Slot:
         return status
 
     def _step_with_retries(self, time: float, step_size: float) -> int:
-        """Each try begins at the state before the first: from a discarded step none may go on."""
+        """Repeat a discarded step as smaller ones.
+
+        Each attempt begins at the state before the first one: no step may follow a discarded one.
+        """
         instance = self._instance
         try:
             before = instance.save_state()
@@ -280,7 +304,7 @@ class Slot:
         return status
 
     def _read_outputs(self, status: int) -> int:
-        """Read into the row; what is not finite is replaced by what was there before."""
+        """Read the outputs into the row; if any is not finite, keep the last good ones."""
         got = self._outputs.get()
         if got and not _is_fine(got):
             return self._failed_call("reading the outputs", got)
@@ -312,7 +336,7 @@ class Slot:
         return Snapshot(self._instance, self._instance.save_state(), self._count)
 
     def require_own(self, snapshot: Snapshot) -> None:
-        """Refuse a state of another instance, which FMUs accept silently."""
+        """Refuse a state of another instance, since FMUs accept it silently."""
         if snapshot.instance is not self._instance:
             raise SimulationError("the snapshot is of another instance than this one")
 
@@ -329,7 +353,7 @@ class Slot:
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""
         if not self._instance.can_read:
-            raise SimulationError("nothing can be read before a reset has mended the instance")
+            raise SimulationError("the instance needs a reset before anything can be read")
         access = Access(self._instance, variables)
         self._instance.check("reading variables", access.get())
         return access.values
