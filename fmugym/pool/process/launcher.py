@@ -17,17 +17,13 @@ import threading
 import weakref
 from multiprocessing.reduction import DupFd
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 from fmugym.pool.process.fork_server import ANSWER
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
 __all__ = ["Process", "launch"]
-
-
-_PATIENCE: Final = 0.05
-"""How long a worker that has closed its channel may take to end, in seconds."""
 
 
 class Process(Protocol):
@@ -46,8 +42,8 @@ class Process(Protocol):
         """End the process at once, whatever it does."""
         ...
 
-    def exit_status(self) -> int | None:
-        """Return the exit status, negative for a signal; None if it still runs after a moment."""
+    def exit_status(self, patience: float) -> int | None:
+        """Return the exit status, negative for a signal; None if it runs longer than ``patience``."""
         ...
 
     def forget(self) -> None:
@@ -198,10 +194,10 @@ class _ForkedProcess:
         with contextlib.suppress(OSError):  # the fork server has ended, and it has with it
             self._lifeline.shutdown(socket.SHUT_WR)
 
-    def exit_status(self) -> int | None:
+    def exit_status(self, patience: float) -> int | None:
         poll = select.poll()
         poll.register(self._lifeline, select.POLLIN)
-        if not poll.poll(1e3 * _PATIENCE):
+        if not poll.poll(1e3 * patience):
             return None
         status = self._answer()
         self.forget()
@@ -227,8 +223,8 @@ class _SpawnedProcess:
     def kill(self) -> None:
         self._process.kill()
 
-    def exit_status(self) -> int | None:
-        self._process.join(_PATIENCE)
+    def exit_status(self, patience: float) -> int | None:
+        self._process.join(patience)
         return self._process.exitcode
 
     def forget(self) -> None:

@@ -25,6 +25,12 @@ _MOST_DEATHS: Final = 5
 _FIRST_PAUSE: Final = 0.05
 """Seconds before a worker is started after its second death in a row; doubled for each more."""
 
+_LAST_MOMENT: Final = 0.05
+"""Seconds that a worker that has closed its channel may take to end."""
+
+_LONGEST_KILL: Final = 2.0
+"""Seconds that a killed process may take to end; a system call may hold it for longer."""
+
 _TAIL: Final = 10
 """How many of the FMU's last messages the cause of a death quotes."""
 
@@ -128,7 +134,7 @@ class Supervisor:
         if self._process is None:
             return
         self._process.kill()
-        self._process.exit_status()
+        self._process.exit_status(_LONGEST_KILL)
         self._forget_process(reason)
 
     def _forget_process(self, reason: str) -> None:
@@ -264,10 +270,10 @@ class Supervisor:
 
     def _explain_death(self, doing: str) -> None:
         assert self._process is not None
-        pid, status = self._process.pid, self._process.exit_status()
+        pid, status = self._process.pid, self._process.exit_status(_LAST_MOMENT)
         if status is None:
             self._process.kill()
-            self._process.exit_status()
+            self._process.exit_status(_LONGEST_KILL)
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
         raise LostError(self.reason)
