@@ -43,7 +43,7 @@ class Process(Protocol):
         ...
 
     def exit_status(self, patience: float) -> int | None:
-        """Return the exit status, negative for a signal; None if it runs longer than ``patience``."""
+        """Return the exit status, negative for a signal; None if it has not ended in time."""
         ...
 
     def forget(self) -> None:
