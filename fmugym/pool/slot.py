@@ -34,11 +34,10 @@ class Snapshot:
 
 
 class States:
-    """What the instances of a pool know about FMU states.
+    """What the instances of a pool know of FMU states.
 
     Attributes:
-        complete: Whether steps from a restored state gave the same results; None before this is
-            known.
+        complete: Whether steps from a restored state were found to be the same; None before.
     """
 
     complete: bool | None = None
@@ -106,18 +105,11 @@ class Slot:
         self._good_outputs = self._output_row.tolist()
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
-        """Start anew in the cheapest way that gives the same results as a fresh instance.
+        """Start anew by the cheapest way that gives the same as a fresh instance.
 
-        When the same start values come a second time, after an episode with steps, the state after
-        the initialization is kept. From then on it is restored. Other start values take a reset and
-        an initialization.
-
-        Args:
-            variables: The variables to set before initialization, P of them.
-            values: Their values, shape (P,).
-
-        Returns:
-            The status.
+        The state after initialization is kept once the same start values come a second time, after
+        an episode with steps, and restored from then on; other start values take a reset and an
+        initialization.
         """
         key = (variables, values.tobytes())
         stepped = self._count > self._spec.warm_up_steps * self._spec.substeps
@@ -144,7 +136,7 @@ class Slot:
         self._count = self._counted = count
 
     def _recycle_if_due(self) -> None:
-        """Replace the instance if this was asked for, as that may free what it has leaked."""
+        """Memory that an instance has leaked may go with it."""
         is_due, self.is_due = self.is_due, False
         if is_due and self._instance.phase not in (Phase.DEAD, Phase.INSTANTIATED):
             self._counts[Column.RECYCLINGS] += 1
@@ -160,7 +152,7 @@ class Slot:
         return self._saved is not None
 
     def _keeps_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> bool:
-        """Keep the state if it will be used again; returns whether the instance may go on."""
+        """Keep the state if it will be of use; returns whether the instance may go on."""
         again = stepped and key == self._start_key
         self._start_key, self._saved = key, None
         if not again or not self._library.can_save_state or self._states.complete is False:
@@ -174,9 +166,9 @@ class Slot:
         return True
 
     def _rehearse(self, start: SavedState) -> bool:
-        """Step twice from the kept state, with the last inputs, and compare the results.
+        """Step twice from the kept state, with the inputs that were written last.
 
-        They differ if the FMU leaves a part of its state out.
+        An FMU may have left a part of its state out.
         """
         results = []
         if not _all_finite(self._input_row.tolist()):

@@ -54,7 +54,7 @@ class OutputTail:
                     self._lines.append(line)
 
     def lines(self, timeout: float = 1.0) -> list[str]:
-        """Return the last lines after the end of the pipe.
+        """The last lines, once the pipe has ended.
 
         Args:
             timeout: Seconds to wait for the end. A process that the dead one has started may keep
