@@ -33,6 +33,7 @@ from fuzz import temporary_folder
 
 import fmugym
 from fmugym import Choice, FMUGymError, FMUVectorEnv, LogUniform, Normal, Uniform, testing
+from fmugym.checks import integer_of
 from fmugym.config import EnvConfig
 
 SLOW, HANG = 5.0, 60.0
@@ -474,7 +475,7 @@ VECTOR_ARGUMENTS = (
 def is_costly(name, value):
     """Whether a sound value would take too much of the machine."""
     if name == "num_envs":
-        return isinstance(value, int | np.integer) and 100 < int(value) < 2**62
+        return 100 < (integer_of(value) or 0) < 2**62
     return is_text(value, "process", "human")
 
 

@@ -55,10 +55,10 @@ def as_flag(hook: str, value: Any) -> bool:
         ConfigError: If it is something else.
     """
     flag = _single(given(value, hook))
-    if isinstance(flag, bool | np.bool_):
-        return bool(flag)
-    if isinstance(flag, int | float | np.number) and flag in (0, 1):
-        return bool(flag)
+    if isinstance(flag, int | float | np.bool_ | np.number):
+        number = number_of(f"what {hook} returned", flag)
+        if number in (0.0, 1.0):
+            return bool(number)
     raise ConfigError(f"{hook} returned {shown(value)}, expected True or False")
 
 
