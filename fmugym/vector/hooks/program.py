@@ -6,6 +6,7 @@ FMU's step; ``evaluate`` runs it with numpy, so that the two can be compared.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -16,7 +17,14 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray
 
-__all__ = ["MOST_INSTRUCTIONS", "OPERATIONS", "Program", "UntraceableError", "evaluate"]
+__all__ = [
+    "MOST_INSTRUCTIONS",
+    "OPERATIONS",
+    "Program",
+    "UntraceableError",
+    "evaluate",
+    "is_always_finite",
+]
 
 OPERATIONS: Final = (
     "output",
@@ -68,6 +76,31 @@ class Program:
     code: npt.NDArray[np.uint16]
     constants: npt.NDArray[np.float64]
     results: npt.NDArray[np.uint16]
+
+
+def is_always_finite(program: Program, result: int) -> bool:
+    """Whether a result can be neither infinite nor NaN, whatever the program loads.
+
+    What a program loads is finite: the pool does not step with inputs that are not, and an FMU
+    whose outputs are not has failed. Only arithmetic may overflow, or divide by zero.
+    """
+    finite: list[bool] = []
+    for number, *operands in program.code.tolist():
+        operation = OPERATIONS[number]
+        if operation == "constant":
+            finite.append(math.isfinite(program.constants[operands[0]]))
+        elif operation in _CHOICES:
+            used = operands[1:] if operation == "where" else operands[:2]
+            finite.append(all(finite[operand] for operand in used))
+        else:
+            finite.append(operation not in _MAY_OVERFLOW)
+    return finite[int(program.results[result])]
+
+
+_CHOICES: Final = frozenset({"absolute", "maximum", "minimum", "negative", "where"})
+"""Operations whose result is finite if their operands are."""
+
+_MAY_OVERFLOW: Final = frozenset({"add", "subtract", "multiply", "divide", "square_root"})
 
 
 def evaluate(program: Program, batch: FMUEnv) -> list[FloatArray]:
