@@ -1,4 +1,4 @@
-"""What it costs to start an episode."""
+"""Measure the cost of starting an episode."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _add(table: Table, name: str, own: list[Sample], base: list[Sample]) -> None
 
 
 def _pool(stack: ExitStack) -> Run:
-    """One thread; the instances do a step between two resets."""
+    """Reset with one thread; the instances do a step between two resets."""
     cart_poles.require_native_pool()
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     outputs = tuple(map(fmu.variable, ("x", "x_dot", "phi", "phi_dot")))
