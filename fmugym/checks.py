@@ -1,22 +1,45 @@
-"""Checks of single values that many arguments share."""
+"""Checks of single values that many arguments share.
+
+Each check takes the name of the value for the error, and any object at all, also one whose own
+methods fail. It returns the value in its plain Python type, or raises ``ConfigError``.
+"""
 
 from __future__ import annotations
 
 import math
+import operator
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from numbers import Real
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["check_count", "check_number", "number_of"]
+__all__ = [
+    "LARGEST_COUNT",
+    "check_count",
+    "check_mapping",
+    "check_name",
+    "check_number",
+    "check_option",
+    "check_path",
+    "check_seed",
+    "integer_of",
+    "number_of",
+]
+
+LARGEST_COUNT: Final = 2**31 - 1
+"""The largest number of steps or threads that can be asked for."""
 
 
 def check_number(
     what: str, value: Any, minimum: float = -math.inf, *, positive: bool = False
-) -> None:
-    """Refuse what is no finite number in its range.
+) -> float:
+    """Return a value as a finite float of a range.
 
     Args:
         what: The name of the value, for the error.
@@ -28,32 +51,121 @@ def check_number(
         ConfigError: With the name and the value.
     """
     number = number_of(what, value)
-    if not math.isfinite(number) or number < minimum or (positive and number <= 0):
-        wanted = "positive and finite" if positive else "finite and not negative"
-        raise ConfigError(
-            f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {value!r}"
-        )
+    if math.isfinite(number) and number >= minimum and (number > 0 or not positive):
+        return number
+    wanted = "positive and finite" if positive else "finite and not negative"
+    raise ConfigError(
+        f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {shown(value)}"
+    )
 
 
 def number_of(what: str, value: Any) -> float:
-    """Turn a value into a float.
+    """Return a value as a float, finite or not.
 
     Raises:
         ConfigError: If it is no real number.
     """
-    if isinstance(value, Real) or (hasattr(value, "__float__") and np.shape(value) == ()):
-        try:
+    if type(value) is float:
+        return value
+    if _is_real(value):
+        with suppress(Exception):  # the number is too large, or the object's own method fails
             return float(value)
-        except (TypeError, ValueError, OverflowError):
-            pass
-    raise ConfigError(f"{what} must be a number, got {value!r}")
+    raise ConfigError(f"{what} must be a number, got {shown(value)}")
 
 
-def check_count(what: str, value: Any) -> None:
-    """Refuse what is no positive integer.
+def _is_real(value: Any) -> bool:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.ndim == 0 and value.dtype.kind in "fiubO"
+    return isinstance(value, Real) or (
+        hasattr(type(value), "__float__") and not isinstance(value, str | bytes)
+    )
+
+
+def check_count(what: str, value: Any, largest: int = LARGEST_COUNT) -> int:
+    """Return a value as a positive integer.
 
     Raises:
         ConfigError: With the name and the value.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ConfigError(f"{what} must be a positive integer, got {value!r}")
+    number = integer_of(value)
+    if number is None or not 0 < number <= largest:
+        bound = "" if number is None or number < 1 else f" of at most {largest}"
+        raise ConfigError(f"{what} must be a positive integer{bound}, got {shown(value)}")
+    return number
+
+
+def check_seed(value: Any) -> int | None:
+    """Return a seed as Gymnasium takes it: an integer that is not negative, or None.
+
+    Raises:
+        ConfigError: With the value.
+    """
+    if value is None:
+        return None
+    number = integer_of(value)
+    if number is None or number < 0:
+        raise ConfigError(f"seed must be an integer of at least 0, or None, got {shown(value)}")
+    return number
+
+
+def integer_of(value: Any) -> int | None:
+    """Return a value as an int; None if it is no integer, or a Boolean."""
+    if type(value) is int:
+        return value
+    if isinstance(value, bool | np.bool_):
+        return None
+    try:
+        return int(operator.index(value))
+    except Exception:  # a TypeError; or the object's own method fails
+        return None
+
+
+def check_name(what: str, value: Any) -> str:
+    """Return a value as a plain text.
+
+    Raises:
+        ConfigError: If it is no text.
+    """
+    if not isinstance(value, str):
+        raise ConfigError(f"{what} must be a name, got {shown(value)}")
+    return str.__str__(value)  # a subclass may have odd methods
+
+
+def check_option(kind: str, value: Any, known: Iterable[str]) -> str:
+    """Return a value that is one of some texts.
+
+    Raises:
+        ConfigError: With the nearest of them.
+    """
+    known = list(known)
+    if not isinstance(value, str) or str.__str__(value) not in known:
+        raise unknown_name(kind, value, known)
+    return str.__str__(value)
+
+
+def check_mapping(what: str, value: Any) -> dict[str, Any]:
+    """Return a mapping with names as keys as a new dict.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if isinstance(value, Mapping):
+        try:
+            items = dict(value)
+        except Exception:  # a mapping of the caller's whose methods fail
+            items = {None: None}
+        if all(isinstance(name, str) for name in items):
+            return {str.__str__(name): item for name, item in items.items()}
+    raise ConfigError(f"{what} must be a dict with names as keys, got {shown(value)}")
+
+
+def check_path(what: str, value: Any) -> Path:
+    """Return a value as a path; ``~`` stands for the home folder.
+
+    Raises:
+        ConfigError: If it is no path.
+    """
+    try:
+        return Path(os.fsdecode(value)).expanduser()
+    except Exception:  # a TypeError; or nobody has this home, or the object's own method fails
+        raise ConfigError(f"{what} must be a path, got {shown(value)}") from None

@@ -1,4 +1,4 @@
-"""What is drawn at the start of an episode: parameters of the FMU and variables of the task."""
+"""The draws at the start of an episode: parameters of the FMU and variables of the task."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmugym.archive.description import Variable
+from fmugym.checks import check_number
 from fmugym.distributions import Uniform, draw, is_distribution
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import checked_value
@@ -20,10 +21,10 @@ class Episode(NamedTuple):
     """The values of one episode.
 
     Attributes:
-        start_values: Of the parameters in the order of the plan, shape (P, 1).
-        parameters: The same by name.
+        start_values: The parameters in the order of the plan, shape (P, 1).
+        parameters: The parameters by name.
         variables: The episode variables by name.
-        drawn: What of both was drawn or overridden, by name.
+        drawn: The parameters and variables that were drawn or overridden, by name.
     """
 
     start_values: FloatArray
@@ -33,20 +34,20 @@ class Episode(NamedTuple):
 
 
 class EpisodePlan:
-    """Prepared once, so that a reset only draws.
+    """The draws of an episode, prepared once, so that a reset only draws.
 
-    The order of the draws is that of the parameters, then that of the episode variables.
+    The parameters are drawn first, then the episode variables, each in the order of their dict.
 
     Args:
         model_variables: The FMU's variables for the parameters.
         parameters: Constants (checked) or distributions by name, in the same order.
         episode_variables: Constants or distributions by name.
-        overridden: The parameters that are told as drawn although they may be constants.
+        overridden: The parameters that infos report as drawn, although they may be constants.
 
     Attributes:
         model_variables: As given.
         constants: The parameters' values, 0 where they are drawn, shape (P,).
-        told: The overridden parameters and their values.
+        told: The overridden parameters and their values, which infos report.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class EpisodePlan:
 
     @property
     def drawn_names(self) -> list[str]:
-        """The names of what is drawn, in the order of the draws."""
+        """The names of the drawn parameters and variables, in the order of the draws."""
         return [name for _, name, _ in self._random_parameters] + self._random_variables
 
     @property
@@ -107,7 +108,7 @@ class EpisodePlan:
 
     @property
     def num_uniform(self) -> int | None:
-        """The number of draws where all are uniform ones of Reals, None otherwise."""
+        """The number of draws if all are uniform draws of Reals, None otherwise."""
         if any(may_not_fit for *_, may_not_fit in self._random_parameters):
             return None
         return len(self._sampler.limits) if self._sampler.all_uniform else None
@@ -128,6 +129,8 @@ class EpisodePlan:
         parameters, drawn = self._draw_parameters(values)
         variables = self._variables.copy()
         for name, value in zip(self._random_variables, values, strict=True):
+            if type(value) is not float:
+                value = check_number(f"episode variable {name!r}", value)
             drawn[name] = variables[name] = value
         return self._episode(parameters, variables, drawn)
 
@@ -156,12 +159,12 @@ def _always_fits(distribution: Any, variable: Variable) -> bool:
 class Sampler:
     """Draws from a fixed list of distributions in their order.
 
-    Successive uniform draws are made in one call, with the result of single ones:
+    One call makes successive uniform draws. The results are those of single draws, because
     ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
 
     Attributes:
-        limits: Lower end and width of the uniform distributions.
-        all_uniform: Whether there are no others.
+        limits: Lower end and width of each uniform distribution.
+        all_uniform: Whether all distributions are uniform.
     """
 
     def __init__(self, distributions: Sequence[Any]) -> None:

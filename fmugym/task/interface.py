@@ -1,8 +1,7 @@
-"""A config whose names were looked up in one FMU."""
+"""A config with its names looked up in one FMU."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.checks import check_number
+from fmugym.checks import LARGEST_COUNT, check_number
 from fmugym.config import EnvConfig
 from fmugym.distributions import is_distribution
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import PoolSpec, whole_number_of_steps
 
 __all__ = [
@@ -74,12 +73,6 @@ class Interface:
         """
         config, description = self.config, self.description
         self._require_retries()
-        warm_up_steps = whole_number_of_steps(config.warm_up, self.time_step)
-        if warm_up_steps is None:
-            raise ConfigError(
-                f"warm_up must be a multiple of the time step of {self.time_step} s, "
-                f"got {config.warm_up}"
-            )
         start = config.start_time
         return PoolSpec(
             inputs=self.inputs,
@@ -90,11 +83,24 @@ class Interface:
             start_time=description.start_time if start is None else start,
             stop_time=config.stop_time,
             tolerance=config.tolerance,
-            warm_up_steps=warm_up_steps,
+            warm_up_steps=self._warm_up_steps(),
             strings=self.strings,
             fault_retries=config.fault_retries,
             leak_limit=config.leak_limit,
         )
+
+    def _warm_up_steps(self) -> int:
+        duration, step = self.config.warm_up, self.time_step
+        if duration / step > LARGEST_COUNT:
+            raise ConfigError(
+                f"warm_up must be at most {LARGEST_COUNT} steps of {step} s, got {duration}"
+            )
+        count = whole_number_of_steps(duration, step)
+        if count is None:
+            raise ConfigError(
+                f"warm_up must be a multiple of the time step of {step} s, got {duration}"
+            )
+        return count
 
     def _require_retries(self) -> None:
         able = self.description.capabilities
@@ -123,7 +129,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         outputs=tuple(output_variable(description, n) for n in config.model_output_names),
         monitors=tuple(output_variable(description, n) for n in config.monitor_names),
         parameters={v.name: checked(v, value) for v, value in given if v.numeric},
-        strings=tuple((v, value) for v, value in given if not v.numeric),
+        strings=tuple((v, str.__str__(value)) for v, value in given if not v.numeric),
         config=config,
         description=description,
     )
@@ -186,11 +192,21 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
             f"with initial={variable.initial!r}"
         )
     if variable.kind == "string" and not variable.shape:
-        if not isinstance(value, str):
-            raise ConfigError(f"{name!r} is a String, got {value!r}")
+        _require_text(name, value)
         return variable
     _require_numeric(variable, "given a start value")
     return variable
+
+
+def _require_text(name: str, value: Any) -> None:
+    if not isinstance(value, str):
+        raise ConfigError(f"{name!r} is a String, got {shown(value)}")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{name!r} cannot be {shown(value)}: UTF-8 cannot encode it") from None
+    if "\0" in value:
+        raise ConfigError(f"{name!r} cannot be {shown(value)}: it holds a NUL character")
 
 
 def checked(variable: Variable, value: Any) -> Any:
@@ -205,16 +221,13 @@ def checked_value(variable: Variable, value: Any) -> float:
         ConfigError: If the value is not finite, not of the variable's kind, or out of its type's
             range.
     """
-    if variable.type in {"Real", "Float64"} and isinstance(value, float) and math.isfinite(value):
-        return value
     if isinstance(value, str) and variable.items:
-        return _item_value(variable, value)
-    check_number(repr(variable.name), value)
-    number = float(value)
+        return _item_value(variable, str.__str__(value))
+    number = check_number(repr(variable.name), value)
     if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
-        raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {value!r}")
+        raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {number}")
     if variable.kind == "boolean" and number not in {0.0, 1.0}:
-        raise ConfigError(f"{variable.name!r} is a Boolean, got {value!r}")
+        raise ConfigError(f"{variable.name!r} is a Boolean, got {number}")
     if variable.kind in {"integer", "enumeration"}:
         _check_integer(variable, number)
     return number

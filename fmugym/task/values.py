@@ -1,22 +1,26 @@
-"""The two small mappings through which hooks read values by name."""
+"""The mappings through which hooks and infos read values by name."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from fmugym.errors import ConfigError, unknown_name
 
 __all__ = ["EpisodeVariables", "LateDict", "NamedValues"]
 
 
-class NamedValues:
-    """A read-only view by name of values that are kept in a fixed order.
+class NamedValues(Mapping[str, Any]):
+    """A read-only mapping from names to values that are kept in a fixed order.
 
     Args:
         kind: What the names name, for error texts.
         names: The names, in the order of the values.
         get_values: Returns the present values.
+
+    Raises:
+        ConfigError: By ``[]``, for an unknown name; the text has the nearest one.
     """
 
     def __init__(
@@ -27,10 +31,18 @@ class NamedValues:
         self._get_values = get_values
 
     def __getitem__(self, name: str) -> Any:
-        index = self._index.get(name)
-        if index is None:
-            raise unknown_name(self._kind, name, self._index)
+        try:
+            index = self._index[name]
+        except Exception:  # a KeyError; or something that is no key at all
+            raise unknown_name(self._kind, name, self._index) from None
         return self._get_values()[index]
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and str.__str__(name) in self._index
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a value, or the default if there is none of this name."""
+        return self[name] if name in self else default
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._index)
@@ -38,16 +50,12 @@ class NamedValues:
     def __len__(self) -> int:
         return len(self._index)
 
-    def keys(self) -> Iterator[str]:
-        """The names, so that ``dict(env.out)`` works."""
-        return iter(self._index)
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}({dict(self)})"
 
 
 class EpisodeVariables(dict[str, Any]):
-    """The episode variables: a dict whose set of names is that of the config.
+    """The episode variables: a dict whose names are those of the config.
 
     Args:
         names: The names; their values are None until the first reset.
@@ -60,35 +68,41 @@ class EpisodeVariables(dict[str, Any]):
         raise unknown_name("episode variable", name, self)
 
     def __setitem__(self, name: str, value: Any) -> None:
-        if name not in self:
+        if not isinstance(name, str) or name not in self:
             raise unknown_name("episode variable", name, self)
         super().__setitem__(name, value)
 
     def update(self, *args: Any, **kwargs: Any) -> None:
-        """Write several; as in a dict."""
-        for name, value in dict(*args, **kwargs).items():
-            self[name] = value
+        """Write several variables, as in a dict; none is written if a name is unknown."""
+        new = dict(*args, **kwargs)
+        for name in new:
+            if name not in self:
+                raise unknown_name("episode variable", name, self)
+        super().update(new)
 
     def __ior__(self, other: Any) -> EpisodeVariables:  # type: ignore[misc, override]
         self.update(other)
         return self
 
     def setdefault(self, name: str, default: Any = None) -> Any:
-        """Read one: all are there from the start."""
+        """Read a variable; the default is not used, as all variables are there."""
         return self[name]
 
     def _keep(self, *_: Any) -> Any:
-        raise ConfigError("episode variables are those of the config: none can be removed")
+        raise ConfigError("episode variables are those of the config; none can be removed")
 
     __delitem__ = pop = popitem = clear = _keep
 
     def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
-        """A copy is a dict like any other."""
+        """A copy is a plain dict."""
         return dict, (dict(self),)
 
 
 class LateDict(dict[str, Any]):
-    """A dict that is filled when it is first looked at, for what is rarely looked at.
+    """A dict that is filled when it is first read or written, for values that are rarely read.
+
+    Every method of ``dict`` fills it first. Functions in C that look into a dict without calling
+    its methods (none of the standard library's does) would find ``_UNFILLED``.
 
     Args:
         fill: Returns the items.
@@ -104,59 +118,45 @@ class LateDict(dict[str, Any]):
         """Make one in a third of the time that a constructor in Python takes."""
         late: LateDict = dict.__new__(cls)
         late._fill = fill, arguments
+        dict.__setitem__(late, _UNFILLED, None)  # json.dumps writes {} for a dict of no items
         return late
 
     def _filled(self) -> dict[str, Any]:
         if self._fill is not None:
             (fill, arguments), self._fill = self._fill, None
-            super().update(fill(*arguments))
+            dict.clear(self)
+            dict.update(self, fill(*arguments))
         return self
-
-    def __getitem__(self, key: str) -> Any:
-        return dict.__getitem__(self._filled(), key)
-
-    def __setitem__(self, key: str, value: Any) -> None:
-        dict.__setitem__(self._filled(), key, value)
-
-    def __delitem__(self, key: str) -> None:
-        dict.__delitem__(self._filled(), key)
-
-    def __contains__(self, key: object) -> bool:
-        return dict.__contains__(self._filled(), key)
-
-    def __iter__(self) -> Iterator[str]:
-        return dict.__iter__(self._filled())
-
-    def __len__(self) -> int:
-        return dict.__len__(self._filled())
-
-    def __eq__(self, other: object) -> bool:
-        return dict.__eq__(self._filled(), other)
 
     __hash__ = None
 
-    def __repr__(self) -> str:
-        return dict.__repr__(self._filled())
-
     def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is a plain dict."""
         return dict, (dict(self.items()),)
 
-    def keys(self) -> Any:
-        """See ``dict``."""
-        return dict.keys(self._filled())
 
-    def values(self) -> Any:
-        """See ``dict``."""
-        return dict.values(self._filled())
+_UNFILLED: Final = "fmugym: not filled yet"
 
-    def items(self) -> Any:
-        """See ``dict``."""
-        return dict.items(self._filled())
+_NOT_OF_THE_ITEMS: Final = {
+    *("__class_getitem__", "__getattribute__", "__hash__", "__init__", "__new__", "fromkeys"),
+    "__reduce__",
+}
+"""The methods of ``dict`` that do not depend on its items, or that ``LateDict`` has itself."""
 
-    def get(self, key: str, default: Any = None) -> Any:
-        """See ``dict``."""
-        return dict.get(self._filled(), key, default)
 
-    def copy(self) -> dict[str, Any]:
-        """See ``dict``; the copy is a plain one."""
-        return dict(self.items())
+def _filling(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a method of ``dict`` fill every ``LateDict`` that it is called with."""
+
+    @functools.wraps(method)
+    def call(*values: Any, **items: Any) -> Any:
+        for value in values:
+            if isinstance(value, LateDict):
+                value._filled()
+        return method(*values, **items)
+
+    return call
+
+
+for _name, _method in vars(dict).items():
+    if callable(_method) and _name not in _NOT_OF_THE_ITEMS:
+        setattr(LateDict, _name, _filling(_method))
