@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.errors import ConfigError
-from fmugym.vector.arguments import shown
+from fmugym.errors import ConfigError, shown
 
 __all__ = ["checked_actions", "is_array_space"]
 

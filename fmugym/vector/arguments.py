@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import operator
 import os
-import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from fmugym.checks import check_number
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.checks import (
+    check_count,
+    check_mapping,
+    check_number,
+    check_option,
+    check_seed,
+    integer_of,
+)
+from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
 
 __all__ = [
     "HOOKS",
     "POOL_OPTIONS",
     "UnknownAttributeError",
-    "UnknownOptionError",
     "autoreset_mode_of",
     "checked_hooks",
     "checked_mask",
@@ -28,8 +32,6 @@ __all__ = [
     "checked_pool_options",
     "checked_seeds",
     "checked_step_limit",
-    "integer_of",
-    "shown",
 ]
 
 HOOKS: Final = ("auto", "compiled", "array", "per_env")
@@ -38,34 +40,14 @@ HOOKS: Final = ("auto", "compiled", "array", "per_env")
 POOL_OPTIONS: Final = ("threads", "private_libraries", "isolation", "workers", "call_timeout")
 """The arguments that are meant for the pool."""
 
+_ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode", "hooks")
+
 _LEAST_BYTES_PER_ENV: Final = 1024
 """An FMU instance and its columns of the arrays take more than this."""
 
 
-class UnknownOptionError(ConfigError, TypeError):
-    """An argument that does not exist: callers that try arguments expect a ``TypeError``."""
-
-
 class UnknownAttributeError(ConfigError, AttributeError):
     """An attribute that does not exist: ``hasattr`` and its like expect an ``AttributeError``."""
-
-
-def shown(value: object) -> str:
-    """Show any value in an error: short, and also if its ``__repr__`` fails."""
-    try:
-        return reprlib.repr(value)
-    except Exception:  # the value is the user's, and so is its __repr__
-        return f"an object of type {type(value).__name__}"
-
-
-def integer_of(value: Any) -> int | None:
-    """Turn an integer of any type into Python's; None if the value is no integer, or a Boolean."""
-    if isinstance(value, bool | np.bool_ | np.ndarray):
-        return None
-    try:
-        return operator.index(value)
-    except Exception:  # the value is the user's, and so is its __index__
-        return None
 
 
 def checked_num_envs(value: Any) -> int:
@@ -101,14 +83,7 @@ def checked_step_limit(value: Any) -> int | None:
     """
     if value is None:
         return None
-    return _count("max_episode_steps", value)
-
-
-def _count(what: str, value: Any) -> int:
-    count = integer_of(value)
-    if count is None or count < 1:
-        raise ConfigError(f"{what} must be a positive integer or None, got {shown(value)}")
-    return count
+    return check_count("max_episode_steps", value)
 
 
 def checked_hooks(way: Any) -> str:
@@ -117,13 +92,7 @@ def checked_hooks(way: Any) -> str:
     Raises:
         ConfigError: If there is none of this name.
     """
-    if not isinstance(way, str) or way not in HOOKS:
-        raise unknown_name("way of calling hooks", _name(way), HOOKS)
-    return way
-
-
-def _name(value: Any) -> Any:
-    return value if isinstance(value, str) else shown(value)
+    return check_option("way of calling hooks", way, HOOKS)
 
 
 def autoreset_mode_of(mode: Any) -> AutoresetMode:
@@ -140,7 +109,7 @@ def autoreset_mode_of(mode: Any) -> AutoresetMode:
         known = by_value.get(mode) or by_name.get(mode.lower().replace("-", "_"))
         if known is not None:
             return known
-    raise unknown_name("autoreset mode", _name(mode), by_name)
+    raise unknown_name("autoreset mode", mode, by_name)
 
 
 def checked_pool_options(options: Mapping[str, Any], num_envs: int) -> dict[str, Any]:
@@ -158,11 +127,10 @@ def checked_pool_options(options: Mapping[str, Any], num_envs: int) -> dict[str,
     """
     for name in options:
         if name not in (*POOL_OPTIONS, "backend"):
-            error = unknown_name("argument of FMUVectorEnv", name, (*POOL_OPTIONS, "backend"))
-            raise UnknownOptionError(str(error))
+            raise unknown_argument("FMUVectorEnv", name, (*_ARGUMENTS, *POOL_OPTIONS, "backend"))
     checked = {name: value for name, value in options.items() if value is not None}
     for name in checked.keys() & {"threads", "workers"}:
-        checked[name] = min(_count(name, checked[name]), num_envs)
+        checked[name] = min(check_count(name, checked[name]), num_envs)
     if "call_timeout" in options:
         checked["call_timeout"] = _checked_timeout(options["call_timeout"])
     apart = checked.get("private_libraries", False)
@@ -179,8 +147,7 @@ def _checked_timeout(value: Any) -> float | None:
         return None
     if isinstance(value, bool | np.bool_ | np.ndarray):
         raise ConfigError(f"call_timeout must be a number of seconds or None, got {shown(value)}")
-    check_number("call_timeout", value, positive=True)
-    return float(value)
+    return check_number("call_timeout", value, positive=True)
 
 
 def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
@@ -194,14 +161,14 @@ def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
         return [None] * num_envs
     first = integer_of(seed)
     if first is not None:
-        _require_not_negative(first)
+        check_seed(first)
         return list(range(first, first + num_envs))
     given = _elements(seed)
     if given is None:
         raise ConfigError(f"seed must be an integer or a list of them, got {shown(seed)}")
     if len(given) != num_envs:
         raise ConfigError(f"there are {len(given)} seeds, expected {num_envs}")
-    return [None if one is None else _seed(one) for one in given]
+    return list(map(check_seed, given))
 
 
 def _elements(values: Any) -> list[Any] | None:
@@ -216,19 +183,6 @@ def _elements(values: Any) -> list[Any] | None:
         return None
 
 
-def _seed(value: Any) -> int:
-    seed = integer_of(value)
-    if seed is None:
-        raise ConfigError(f"a seed must be an integer or None, got {shown(value)}")
-    _require_not_negative(seed)
-    return seed
-
-
-def _require_not_negative(seed: int) -> None:
-    if seed < 0:
-        raise ConfigError(f"a seed must not be negative, got {shown(seed)}")
-
-
 def checked_options(options: Any) -> dict[str, Any]:
     """Copy the argument ``options`` of ``reset``.
 
@@ -237,9 +191,7 @@ def checked_options(options: Any) -> dict[str, Any]:
     """
     if options is None:
         return {}
-    if not isinstance(options, Mapping):
-        raise ConfigError(f"the options of reset must be a dict, got {shown(options)}")
-    return dict(options)
+    return check_mapping("the options of reset", options)
 
 
 def checked_mask(mask: Any, num_envs: int) -> MaskArray:

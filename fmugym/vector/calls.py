@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
-from fmugym.vector.arguments import UnknownAttributeError, shown
+from fmugym.errors import ConfigError, shown
+from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.views import copied_attributes, differs
 
 __all__ = ["TOGETHER", "MethodCall", "attribute", "require_settable"]

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
 from fmugym.env import FMUEnv, request_pool
-from fmugym.errors import ConfigError, SimulationError, unknown_name
+from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.task.interface import checked_value
 from fmugym.vector.arguments import (
@@ -28,7 +28,6 @@ from fmugym.vector.arguments import (
     checked_pool_options,
     checked_seeds,
     checked_step_limit,
-    shown,
 )
 from fmugym.vector.calls import TOGETHER, attribute, require_settable
 from fmugym.vector.engines.base import Engine, StepResult

@@ -12,14 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, SimulationError
+from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import fault_rates
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.vector.actions import checked_actions
-from fmugym.vector.arguments import shown
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results

@@ -11,11 +11,10 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, FMUGymError
+from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.task.values import EpisodeVariables
 from fmugym.vector.actions import checked_actions, is_array_space
-from fmugym.vector.arguments import shown
 from fmugym.vector.calls import attribute
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.vector.arguments import shown
 
 __all__ = ["flags", "info_arrays", "input_rows", "keep", "observations", "rewards", "variable"]
 
