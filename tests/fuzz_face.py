@@ -3,11 +3,11 @@
     python tests/fuzz_face.py --count 20000 --seed 0
 
 Each case is a call of the public face with one to three odd values: in the config, as arguments of
-constructors, as seeds, options and actions, in distributions, as attributes, and as what hooks
-return. A value is accepted, and then the environment works; or it is refused with an error of
-``FMUGymError``. A case fails with any other exception, if it leaves a folder, if an environment that
-refused a value does not work afterwards, or if it takes more than ``SLOW`` seconds of processor
-time. A crash, or a hang after ``HANG`` seconds, ends the program with the Python stack.
+constructors, as seeds, options and actions, in distributions, as attributes, and as results of
+hooks. Either the value is accepted and the environment works with it, or it is refused with an error
+of ``FMUGymError``. A case fails if it raises anything else, if it leaves a folder, if an environment
+does not work after it has refused a value, or if it takes more than ``SLOW`` seconds of processor
+time. A crash, or a hang of ``HANG`` seconds, ends the program with the Python stack.
 
 Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
 """

@@ -193,6 +193,10 @@ class Pool(ABC):
         """Stop at once what goes on without being stepped; the next reset starts it again."""
         return
 
+    def note_fault(self, index: int) -> None:
+        """Count a fault that the caller found: numbers made of the outputs are not finite."""
+        return
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """Return what is known of the last step by name, each of shape (N,)."""
         return {}

@@ -100,6 +100,10 @@ class CountedPool(Pool):
         self._count_steps()
         self._counts[:] = 0
 
+    def note_fault(self, index: int) -> None:
+        """See ``Pool.note_fault``."""
+        self._counts[index, Column.NOT_FINITE] += 1
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """What is told of each step, of shape (N,): how often it was repeated, if it may be."""
         if not self._spec.fault_retries:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ __all__ = [
     "default_observation",
     "discrete_values",
     "observation_space",
+    "outputs_observation",
     "to_input_types",
 ]
 
@@ -61,7 +63,7 @@ def observation_space(interface: Interface) -> spaces.Space[Any]:
 
 
 def discrete_values(interface: Interface, variables: Sequence[Variable]) -> Sequence[int] | None:
-    """The values that the elements of a ``Discrete`` made here stand for.
+    """The values that the elements of a ``Discrete`` stand for.
 
     Returns:
         The values in rising order, or None if the variables do not make a ``Discrete``.
@@ -116,14 +118,14 @@ def _countable(interface: Interface, variable: Variable) -> bool:
 def to_input_types(
     variables: Sequence[Variable], values: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Make values fit their inputs' types: Booleans from 0.5 on, others to the nearest value.
+    """Round values to their inputs' types: Booleans from 0.5 up, others to the nearest value.
 
     Args:
         variables: The inputs.
         values: One number for each, finite or not.
 
     Returns:
-        The values as the FMU is to get them, still as float64.
+        The values for the FMU, still as float64.
 
     Raises:
         ConfigError: If a value is out of its type's range.
@@ -157,7 +159,7 @@ def default_observation(
             for a single one.
 
     Returns:
-        The function; its arrays are new ones.
+        The function; it returns a new array each time.
 
     Raises:
         ConfigError: If the space does not fit the outputs.
@@ -171,6 +173,30 @@ def default_observation(
         )
     dtype = space.dtype
     return lambda state: np.array(state, dtype=dtype)
+
+
+def outputs_observation(
+    interface: Interface, space: spaces.Space[Any]
+) -> Callable[[Sequence[float]], Any]:
+    """Make what ``super()._get_observation()`` returns to a class with an own hook.
+
+    Args:
+        interface: Names the outputs.
+        space: The environment's observation space, which the outputs alone may not fit.
+
+    Returns:
+        The function to elements of the space, or else of the default space of the outputs. It
+        raises ``ConfigError`` when it is called if there is neither.
+    """
+
+    @cache
+    def make() -> Callable[[Sequence[float]], Any]:
+        try:
+            return default_observation(interface, space)
+        except ConfigError:
+            return default_observation(interface, observation_space(interface))
+
+    return lambda state: make()(state)
 
 
 def _discrete_observation(
@@ -191,7 +217,7 @@ def _discrete_observation(
             return np.int64(values.index(int(state[0])) + int(space.start))
         except ValueError:
             raise SimulationError(
-                f"output {variable.name!r} is {state[0]:g}, which is none of its declared values"
+                f"output {variable.name!r} is {state[0]:g}, which is not one of its declared values"
             ) from None
 
     return observe

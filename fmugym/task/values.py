@@ -42,7 +42,9 @@ class NamedValues(Mapping[str, Any]):
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return a value, or the default if there is none of this name."""
-        return self[name] if name in self else default
+        if name not in self:
+            return default
+        return self._get_values()[self._index[name]]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._index)

@@ -102,6 +102,10 @@ class PoolColumn(Pool):
         """See ``Pool.halt``; the other instances stop, too."""
         self._pool.halt()
 
+    def note_fault(self, index: int) -> None:
+        """See ``Pool.note_fault``."""
+        self._pool.note_fault(self._index)
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """See ``Pool.info``."""
         column = slice(self._index, self._index + 1)

@@ -14,10 +14,11 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.env import FMUEnv, request_pool
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.task.interface import checked_value
+from fmugym.task.opening import request_pool
 from fmugym.vector.arguments import (
     UnknownAttributeError,
     autoreset_mode_of,
