@@ -415,7 +415,7 @@ class FMUEnv(Pictured):
             raise
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and isinstance(values, float) and math.isfinite(values):
+        if self._takes_one_real and issubclass(type(values), float) and math.isfinite(values):
             self._input_row[0] = values
             self.inputs = (float(values),)
             return

@@ -22,7 +22,7 @@ from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results
-from fmugym.vector.infos import drawn_info, within
+from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of, within
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, column
 
@@ -153,10 +153,21 @@ class BatchEngine(Engine):
         drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
         self.env._in_hooks = True
         try:
-            return self._observe(None), self._infos(mask) | drawn_info(drawn, mask)
+            observations = self._observe(None)
+            self._require_finite_start(observations, mask)
+            return observations, self._infos(mask) | drawn_info(drawn, mask)
         finally:
             self.env._in_hooks = False
             self.note_starts(mask)
+
+    def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
+        wrong = not_finite(observations)
+        if wrong is not None and (wrong & mask).any():
+            index = int(np.flatnonzero(wrong & mask)[0])
+            first = shown(observation_of(observations, index))
+            raise SimulationError(
+                f"environment {index}: the first observation is not finite: {first}"
+            )
 
     def _begin(
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
@@ -231,9 +242,9 @@ class BatchEngine(Engine):
         """The values of a parameter or an episode variable, one for each environment."""
         variables = self.env.variables
         if name in variables:
-            if np.shape(variables[name])[-1:] != (self._n,):
-                variables[name] = np.array(np.broadcast_to(variables[name], self._n))
             row: FloatArray = variables[name]
+            if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
+                row = variables[name] = results.variable(name, row, self._n)
         else:
             row = self._parameters.setdefault(name, np.full(self._n, np.nan))
         return row
@@ -266,12 +277,20 @@ class BatchEngine(Engine):
         env = self.env
         before = env.action, env.previous_action, env.previous_state
         env.previous_action, env.action = env.action, actions
-        env.previous_state = env.state.copy()
+        self._note_before()
+        env.previous_state = self._outputs_before[: env._output_count]
         try:
             self._write_inputs(env._get_inputs(), resetting)
         except BaseException:  # no FMU was touched: better actions may follow
             env.action, env.previous_action, env.previous_state = before
             raise
+
+    def _note_before(self) -> None:
+        """Copy what a step changes, for environments whose step ends with a fault."""
+        self._outputs_before = self._pool.outputs.copy()
+        if self.env._has_update:
+            names = self.env.variables
+            self._variables_before = {name: self._row(name).copy() for name in names}
 
     def _checked(self, actions: Any) -> npt.NDArray[Any]:
         """Copy the actions, environments last as hooks want them."""
@@ -284,7 +303,7 @@ class BatchEngine(Engine):
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
-        results.input_rows(values, inputs)
+        results.write_inputs(values, inputs)
         if not self.env._real_inputs:
             for index in self._stepping(resetting):
                 inputs[:, index] = fmu_spaces.to_input_types(
@@ -331,8 +350,9 @@ class BatchEngine(Engine):
             rewards[resetting] = 0.0
         infos = self._infos(np.ones(self._n, np.bool_)) if env._has_info else {}
         result = StepResult(self._observe(observed), rewards, terminated, truncated, infos)
-        if has_faults or not_finite(rewards):
-            self._take_faults(result, statuses)
+        if resetting is not None:
+            self._require_finite_start(result.observations, resetting)
+        self._handle_faults(result, statuses, has_faults)
         self.note_ends(terminated, truncated)
         return result
 
@@ -342,15 +362,18 @@ class BatchEngine(Engine):
         What it assigns is copied: it may be part of an array that the next step writes again.
         """
         variables = self.env.variables
-        idle = failed if resetting is None else failed | resetting
         before = {name: self._row(name) for name in variables}
-        kept = {name: row[..., idle] for name, row in before.items()} if idle.any() else {}
         self.env._update()
         for name, row in before.items():
             if variables[name] is not row:
                 variables[name] = results.variable(name, variables[name], self._n)
-        for name, values in kept.items():
-            results.keep(name, self._row(name), idle, values)
+        idle = failed if resetting is None else failed | resetting
+        if idle.any():
+            self._restore_variables(idle)
+
+    def _restore_variables(self, mask: MaskArray) -> None:
+        for name, values in self._variables_before.items():
+            results.restore_variable(name, self._row(name), mask, values[..., mask])
 
     def _reached_limit(self) -> MaskArray:
         """Compare only when the longest episode may have got there."""
@@ -383,43 +406,73 @@ class BatchEngine(Engine):
         failed: MaskArray = (statuses > Status.WARNING) & (statuses != Status.TERMINATED)
         return failed
 
-    def _take_faults(self, result: StepResult, statuses: StatusArray) -> None:
-        """End the episodes whose FMU failed or has stopped, or whose reward is not finite."""
-        stopped = self._stopped(statuses)
+    def _handle_faults(self, result: StepResult, statuses: StatusArray, has_faults: bool) -> None:
+        """Deal with FMUs that failed or asked to stop, and with numbers that are not finite."""
+        wrong_rewards = not_finite(result.rewards)
+        wrong_observations = not_finite(result.observations)
+        if not has_faults and wrong_rewards is None and wrong_observations is None:
+            return
+        stopped, failed = self._stopped(statuses), self._failed(statuses)
         if stopped.any():
             result.infos.update({"fmu_terminated": stopped, "_fmu_terminated": stopped.copy()})
-        reasons = self._reasons(result.rewards, self._failed(statuses))
-        if not reasons:
-            return
+        reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
+        for index in _indices(wrong_rewards, ~failed):
+            reasons[index] = f"_reward_policy returned {result.rewards[index]}{self._when(index)}"
+        for index in _indices(wrong_observations, ~failed):
+            observation = shown(observation_of(result.observations, index))
+            reasons.setdefault(index, f"the observation is {observation}{self._when(index)}")
+        if reasons:
+            self._end_with_faults(result, dict(sorted(reasons.items())), failed)
+
+    def _when(self, index: int) -> str:
+        return f" at t = {self.single(index).time:g} s"
+
+    def _end_with_faults(
+        self, result: StepResult, reasons: Mapping[int, str], failed: MaskArray
+    ) -> None:
+        """End the episodes of some environments, whose state is that before the step."""
         env, config = self.env, self.env.config
+        faulty = np.zeros(self._n, np.bool_)
+        faulty[list(reasons)] = True
         if config.on_fault == "raise":
             index, reason = next(iter(reasons.items()))
             raise SimulationError(f"environment {index}: {reason}")
         for index, reason in reasons.items():
             env.logger.warning("environment %d: %s", index, reason)
-        failed = np.zeros(self._n, np.bool_)
-        failed[list(reasons)] = True
+        if (faulty & ~failed).any():
+            self._undo(result, faulty & ~failed, reasons)
         texts = np.full(self._n, None, dtype=object)
-        texts[failed] = list(reasons.values())
-        rates = within(failed, fault_rates(self._pool.health()))
-        result.infos.update({"fault": texts, "_fault": failed})
-        result.infos.update({"fault_rate": rates, "_fault_rate": failed.copy()})
-        result.rewards[failed] = config.fault_reward
-        result.terminated[failed] = config.on_fault == "terminate"
-        result.truncated[failed] = config.on_fault == "truncate"
+        texts[faulty] = list(reasons.values())
+        rates = within(faulty, fault_rates(self._pool.health()))
+        result.infos.update({"fault": texts, "_fault": faulty})
+        result.infos.update({"fault_rate": rates, "_fault_rate": faulty.copy()})
+        result.rewards[faulty] = config.fault_reward
+        result.terminated[faulty] = config.on_fault == "terminate"
+        result.truncated[faulty] = config.on_fault == "truncate"
 
-    def _reasons(self, rewards: FloatArray, failed: MaskArray) -> dict[int, str]:
-        """Say why episodes end with a fault, by the number of the environment."""
-        reasons = {}
-        for index in np.flatnonzero(failed | ~np.isfinite(rewards)).tolist():
-            text = f"_reward_policy returned {rewards[index]}"
-            reasons[index] = self._pool.failure(index) if failed[index] else text
-        return reasons
+    def _undo(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
+        """Return environments to the state before a step whose numbers are not finite."""
+        env, pool = self.env, self._pool
+        pool.outputs[:, mask] = self._outputs_before[:, mask]
+        if env._has_update:
+            self._restore_variables(mask)
+        for index in np.flatnonzero(mask).tolist():
+            pool.note_fault(index)
+        env._halt()
+        again = results.observations(env._get_observation(), env.observation_space, self._n)
+        for index in _indices(not_finite(again), mask):
+            before = shown(observation_of(again, index))
+            raise SimulationError(
+                f"environment {index}: {reasons[index]}; before it the observation is {before}"
+            )
+        copy_rows(again, result.observations, mask)
+        if env._has_info:
+            copy_rows(self._infos(np.ones(self._n, np.bool_)), result.infos, mask)
 
 
-def not_finite(values: FloatArray) -> bool:
-    """Whether any value is infinite or NaN; this takes a third of the time of ``all``."""
-    return int(np.count_nonzero(np.isfinite(values))) < len(values)
+def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
+    """The numbers of the environments that are in both masks; None stands for an empty mask."""
+    return [] if rows is None else np.flatnonzero(rows & mask).tolist()
 
 
 def _by_name(

@@ -13,11 +13,12 @@ from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.values import LateDict
 from fmugym.vector.engines.base import StepResult
-from fmugym.vector.engines.batch import BatchEngine, not_finite
+from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
 from fmugym.vector.hooks.trace import trace_hooks
+from fmugym.vector.infos import not_finite
 from fmugym.vector.views import light_copy
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -174,6 +175,8 @@ class CompiledEngine(BatchEngine):
         if self._any_foreign or not self._prepared:
             return super().step(actions, resetting)
         self._longest = self._limit  # this path does not count steps
+        if self._may_overflow:
+            self._note_before()
         observations = np.empty(self._shape, _FLOAT32)
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
@@ -191,7 +194,7 @@ class CompiledEngine(BatchEngine):
             told = LateDict.of(_told, self._names, drawn, resetting)  # few ever look at it
             infos = {"drawn": told, "_drawn": resetting}
         result: StepResult = _make_tuple(StepResult, (*arrays, infos))
-        if troubled or (self._may_overflow and not_finite(rewards)):
+        if troubled or (self._may_overflow and not_finite(rewards) is not None):
             self._mend(actions, result, resetting)
         return result
 
@@ -207,7 +210,7 @@ class CompiledEngine(BatchEngine):
             self.env.action, self.env.done = self._checked(actions), result.terminated
             rewards = results.rewards(self.env._reward_policy(), self._n)
             result.rewards[stopped] = rewards[stopped]
-        self._take_faults(result, statuses)
+        self._handle_faults(result, statuses, True)
         self.note_ends(result.terminated, result.truncated)
 
 
