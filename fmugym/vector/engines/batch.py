@@ -54,6 +54,8 @@ class BatchEngine(Engine):
         env.state = self._pool.outputs[: env._output_count]
         env._was_reset = True  # for the views of single environments
         self._given: dict[str, npt.NDArray[Any]] = {}
+        self._outputs_before: FloatArray = self._pool.outputs
+        self._variables_before: dict[str, FloatArray] = {}
         self._make_parameters(env._plan)
         self._note_foreign(slice(None), False)
 
@@ -277,20 +279,13 @@ class BatchEngine(Engine):
         env = self.env
         before = env.action, env.previous_action, env.previous_state
         env.previous_action, env.action = env.action, actions
-        self._note_before()
+        self._outputs_before = self._pool.outputs.copy()
         env.previous_state = self._outputs_before[: env._output_count]
         try:
             self._write_inputs(env._get_inputs(), resetting)
         except BaseException:  # no FMU was touched: better actions may follow
             env.action, env.previous_action, env.previous_state = before
             raise
-
-    def _note_before(self) -> None:
-        """Copy what a step changes, for environments whose step ends with a fault."""
-        self._outputs_before = self._pool.outputs.copy()
-        if self.env._has_update:
-            names = self.env.variables
-            self._variables_before = {name: self._row(name).copy() for name in names}
 
     def _checked(self, actions: Any) -> npt.NDArray[Any]:
         """Copy the actions, environments last as hooks want them."""
@@ -363,6 +358,7 @@ class BatchEngine(Engine):
         """
         variables = self.env.variables
         before = {name: self._row(name) for name in variables}
+        self._variables_before = {name: row.copy() for name, row in before.items()}
         self.env._update()
         for name, row in before.items():
             if variables[name] is not row:

@@ -176,7 +176,7 @@ class CompiledEngine(BatchEngine):
             return super().step(actions, resetting)
         self._longest = self._limit  # this path does not count steps
         if self._may_overflow:
-            self._note_before()
+            self._outputs_before = self._pool.outputs.copy()
         observations = np.empty(self._shape, _FLOAT32)
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
