@@ -76,10 +76,10 @@ def number_of(what: str, value: Any) -> float:
 
 
 def _is_real(value: Any) -> bool:
-    if isinstance(value, np.ndarray | np.generic):
+    if issubclass(type(value), np.ndarray | np.generic):
         return value.ndim == 0 and value.dtype.kind in "fiubO"
-    return isinstance(value, Real) or (
-        hasattr(type(value), "__float__") and not isinstance(value, str | bytes)
+    return issubclass(type(value), Real) or (
+        hasattr(type(value), "__float__") and not issubclass(type(value), str | bytes)
     )
 
 
@@ -173,7 +173,7 @@ def check_mapping(what: str, value: Any) -> dict[str, Any]:
     Raises:
         ConfigError: If it is none.
     """
-    if isinstance(value, Mapping):
+    if issubclass(type(value), Mapping):
         try:
             items = dict(value)
         except Exception:  # a mapping of the caller's whose methods fail

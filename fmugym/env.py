@@ -437,7 +437,7 @@ class FMUEnv(Pictured):
         return is_misfit(action, self.action_space, error)
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and isinstance(values, float) and math.isfinite(values):
+        if self._takes_one_real and issubclass(type(values), float) and math.isfinite(values):
             self._input_row[0] = values
             self.inputs = (float(values),)
             return

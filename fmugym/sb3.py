@@ -21,8 +21,6 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
-from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.env import attribute
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -39,15 +37,6 @@ StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]
 
 _NOTHING_ENDED: dict[str, Any] = {"TimeLimit.truncated": False}
 """The info of a step after which the episode goes on."""
-
-_TOGETHER = frozenset({"close", "reset", "step"})
-"""Methods that one environment cannot do alone."""
-
-_KEPT_FOR_ALL = frozenset(
-    {"action", "after_end", "config", "done", "fmu", "inputs", "out", "parameters"}
-    | {"previous_action", "previous_state", "state", "step_count", "variables"}
-)
-"""Attributes of one environment that are views of those of all."""
 
 
 def make_sb3_env(
@@ -203,8 +192,7 @@ class FMUVecEnv(VecEnv):
         Raises:
             AttributeError: If there is none of this name.
         """
-        singles = self.vector_env._singles()
-        return [attribute(singles[index], attr_name) for index in self._get_indices(indices)]
+        return self.vector_env._get_attr(attr_name, self._numbers(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute or, from the next episode on, a parameter of the FMU.
@@ -218,21 +206,21 @@ class FMUVecEnv(VecEnv):
             ConfigError: If there is nothing of this name, or it is a parameter that the others draw
                 anew in each episode.
         """
-        complete = self._completed(attr_name, dict.fromkeys(self._numbers(indices), value))
-        self.vector_env.set_attr(attr_name, _common(complete))
-        if self.vector_env._is_parameter(attr_name):
-            self._set_parameters[attr_name] = complete
+        env = self.vector_env
+        given = dict.fromkeys(self._numbers(indices), value)
+        if not env._is_parameter(attr_name):
+            env._set_attribute(attr_name, given)
+            return
+        complete = self._all_values(attr_name, given)
+        env.set_attr(attr_name, complete)
+        self._set_parameters[attr_name] = complete
 
-    def _completed(self, name: str, values: Mapping[int, Any]) -> list[Any]:
-        """These values by the number of the environment, and what the other ones have now."""
-        if len(values) < self.num_envs:
-            values = {**dict(enumerate(self._present(name))), **values}
-        return [values[index] for index in range(self.num_envs)]
+    def _all_values(self, name: str, given: Mapping[int, Any]) -> list[Any]:
+        """The values of a parameter for all environments: those given, or else the present ones."""
+        present = [] if len(given) == self.num_envs else self._present_values(name)
+        return [given[i] if i in given else present[i] for i in range(self.num_envs)]
 
-    def _present(self, name: str) -> list[Any]:
-        """What all environments have now, for those that are not to be changed."""
-        if not self.vector_env._is_parameter(name):
-            return self.get_attr(name)
+    def _present_values(self, name: str) -> list[Any]:
         if name in self._set_parameters:
             return self._set_parameters[name]
         env = self.vector_env._prototype
@@ -251,31 +239,8 @@ class FMUVecEnv(VecEnv):
         Raises:
             ConfigError: If the method would part one environment from the others.
         """
-        if method_name in _TOGETHER:
-            raise ConfigError(f"{method_name!r} cannot be called on single environments of many")
         numbers = self._numbers(indices)
-        if method_name == "render":
-            pictures = self.vector_env.render() or [None] * self.num_envs
-            return [pictures[index] for index in numbers]
-        singles = self.vector_env._singles()
-        called = [_Called(singles[index], index) for index in numbers]
-        results = [call.method(method_name)(*method_args, **method_kwargs) for call in called]
-        if isinstance(self.vector_env._engine, BatchEngine):
-            self._keep(called, self.vector_env._engine)
-        return results
-
-    def _keep(self, called: list[_Called], engine: BatchEngine) -> None:
-        """Take over what methods wrote, for single environments are but views of a batch."""
-        written: dict[str, dict[int, Any]] = {}
-        for call in called:
-            for name, value in call.written_attributes().items():
-                written.setdefault(name, {})[call.index] = value
-            for name, value in call.written_variables().items():
-                row = np.array(engine._row(name))
-                row[call.index] = value
-                engine.env.variables[name] = row
-        for name, values in written.items():
-            self.vector_env._set_attribute(name, _common(self._completed(name, values)))
+        return self.vector_env._call(method_name, numbers, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
         """Tell that no single environment has a wrapper."""
@@ -290,41 +255,6 @@ class FMUVecEnv(VecEnv):
             warnings.warn(f"no pictures in the render mode {self.render_mode}", stacklevel=2)
             return [None] * self.num_envs
         return self.env_method("render")
-
-
-class _Called:
-    """One environment before and after a method of it was called."""
-
-    def __init__(self, env: FMUEnv, index: int) -> None:
-        self.index = index
-        self._env = env
-        self._attributes = dict(vars(env))
-        self._variables = dict(env.variables)
-
-    def method(self, name: str) -> Callable[..., Any]:
-        method: Callable[..., Any] = getattr(self._env, name)
-        return method
-
-    def written_attributes(self) -> dict[str, Any]:
-        written = _changes(self._attributes, vars(self._env))
-        for name in written:
-            if name.startswith("_") or name in _KEPT_FOR_ALL:
-                raise ConfigError(f"a method wrote {name!r}, which single environments do not own")
-        return written
-
-    def written_variables(self) -> dict[str, Any]:
-        return _changes(self._variables, self._env.variables)
-
-
-def _common(values: list[Any]) -> Any:
-    """One value for all environments where it is the same number, or else the list."""
-    is_same = all(value is values[0] for value in values) and np.ndim(values[0]) == 0
-    return values[0] if is_same else values
-
-
-def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    missing = object()
-    return {name: v for name, v in after.items() if before.get(name, missing) is not v}
 
 
 def _hand_out(infos: Mapping[str, Any], into: Any) -> None:

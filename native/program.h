@@ -13,7 +13,7 @@ enum {
     PROGRAM_RESULTS = 16  /* results, at most */
 };
 
-/* In the order of OPERATIONS in fmugym/vector/trace.py. */
+/* In the order of OPERATIONS in fmugym/vector/hooks/program.py. */
 typedef enum {
     LOAD_OUTPUT,
     LOAD_INPUT,

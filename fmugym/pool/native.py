@@ -455,7 +455,7 @@ class NativePool(CountedPool):
 
 
 class PlayProgram(Protocol):
-    """See ``fmugym.vector.hooks.trace.Program``."""
+    """See ``fmugym.vector.hooks.program.Program``."""
 
     @property
     def code(self) -> npt.NDArray[np.uint16]:

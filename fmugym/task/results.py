@@ -55,7 +55,7 @@ def as_flag(hook: str, value: Any) -> bool:
         ConfigError: If it is something else.
     """
     flag = _single(given(value, hook))
-    if isinstance(flag, int | float | np.bool_ | np.number):
+    if issubclass(type(flag), int | float | np.bool_ | np.number):
         number = number_of(f"what {hook} returned", flag)
         if number in (0.0, 1.0):
             return bool(number)
@@ -84,7 +84,8 @@ def as_info(value: Any) -> dict[str, Any]:
 
 def _single(value: Any) -> Any:
     """The element of an array of one; anything else as it is."""
-    return value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    is_array = issubclass(type(value), np.ndarray)  # isinstance may call the object's own methods
+    return value.reshape(-1)[0] if is_array and value.size == 1 else value
 
 
 def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
@@ -134,7 +135,7 @@ def _of_integers(space: Any) -> Finiteness:
 
 def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
-        if not isinstance(observation, Mapping) or observation.keys() != parts.keys():
+        if not issubclass(type(observation), Mapping) or observation.keys() != parts.keys():
             raise ConfigError(
                 f"{_OBSERVE} returned {shown(observation)}, expected a dict with the keys "
                 f"{', '.join(map(repr, parts))}"
@@ -146,7 +147,7 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
 
 def _of_tuple(parts: list[Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
-        if not isinstance(observation, tuple) or len(observation) != len(parts):
+        if not issubclass(type(observation), tuple) or len(observation) != len(parts):
             raise ConfigError(
                 f"{_OBSERVE} returned {shown(observation)}, expected a tuple of {len(parts)}"
             )

@@ -11,71 +11,23 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import FloatArray
 from fmugym.task.values import NamedValues
+from fmugym.vector.hooks.program import (
+    MOST_INSTRUCTIONS,
+    OPERATIONS,
+    Program,
+    UntraceableError,
+)
 from fmugym.vector.views import light_copy
 
-__all__ = ["Program", "UntraceableError", "evaluate", "trace_hooks"]
-
-OPERATIONS: Final = (
-    "output",
-    "input",
-    "action",
-    "parameter",
-    "step_count",
-    "constant",
-    "add",
-    "subtract",
-    "multiply",
-    "divide",
-    "negative",
-    "absolute",
-    "square_root",
-    "minimum",
-    "maximum",
-    "less",
-    "less_equal",
-    "greater",
-    "greater_equal",
-    "equal",
-    "not_equal",
-    "and",
-    "or",
-    "not",
-    "where",
-)
-"""The operations in the order of ``enum Operation`` of ``native/program.h``."""
-
-MOST_INSTRUCTIONS: Final = 128
-"""What the native pool has registers for."""
-
-
-class UntraceableError(Exception):
-    """A hook does what a program cannot; it is then evaluated with numpy."""
-
-
-@dataclass(frozen=True)
-class Program:
-    """Instructions for the native pool: each writes the register of its own number.
-
-    Attributes:
-        code: Operation and three operands (registers, or indices of what is loaded), shape (n, 4).
-        constants: What the instructions of the operation ``constant`` refer to, shape (c,).
-        results: The registers of the results, shape (r,).
-    """
-
-    code: npt.NDArray[np.uint16]
-    constants: npt.NDArray[np.float64]
-    results: npt.NDArray[np.uint16]
+__all__ = ["trace_hooks"]
 
 
 class Symbol:
@@ -378,55 +330,3 @@ def _place(operand: float, constants: dict[str, int]) -> int:
     if isinstance(operand, float):
         return constants.setdefault(operand.hex(), len(constants))
     return int(operand)
-
-
-def evaluate(program: Program, batch: FMUEnv) -> list[FloatArray]:
-    """Evaluate a program with numpy, as the native pool does, to check it.
-
-    Args:
-        program: The program.
-        batch: An environment whose attributes hold arrays of M environments.
-
-    Returns:
-        The results, each of shape (M,); Booleans are 0 and 1.
-    """
-    rows = {
-        "output": batch._values,
-        "input": batch.inputs,
-        "action": [batch.action.astype(np.float64)],
-        "parameter": list(batch.parameters.values()),
-        "step_count": [batch.step_count.astype(np.float64)],
-        "constant": [np.full(len(batch.step_count), c) for c in program.constants],
-    }
-    registers: list[FloatArray] = []
-    for number, *operands in program.code.tolist():
-        operation = OPERATIONS[number]
-        if operation in rows:
-            registers.append(np.asarray(rows[operation][operands[0]], np.float64))
-        else:
-            values = [registers[operand] for operand in operands]
-            registers.append(np.asarray(_EVALUATIONS[operation](*values), np.float64))
-    return [registers[number] for number in program.results.tolist()]
-
-
-_EVALUATIONS: Final[Mapping[str, Callable[..., Any]]] = {
-    "add": lambda a, b, _: a + b,
-    "subtract": lambda a, b, _: a - b,
-    "multiply": lambda a, b, _: a * b,
-    "divide": lambda a, b, _: a / b,
-    "negative": lambda a, *_: -a,
-    "absolute": lambda a, *_: np.abs(a),
-    "square_root": lambda a, *_: np.sqrt(a),
-    "minimum": lambda a, b, _: np.minimum(a, b),
-    "maximum": lambda a, b, _: np.maximum(a, b),
-    "less": lambda a, b, _: a < b,
-    "less_equal": lambda a, b, _: a <= b,
-    "greater": lambda a, b, _: a > b,
-    "greater_equal": lambda a, b, _: a >= b,
-    "equal": lambda a, b, _: a == b,
-    "not_equal": lambda a, b, _: a != b,
-    "and": lambda a, b, _: a * b,
-    "or": lambda a, b, _: np.maximum(a, b),
-    "not": lambda a, *_: 1.0 - a,
-    "where": lambda a, b, c: np.where(a != 0.0, b, c),
-}
