@@ -547,7 +547,7 @@ def of_functions(rng):
         "EnvConfig": lambda: EnvConfig.from_dict(value),
         "Paced": lambda: fmugym.Paced(other, hold_after=value),
         "check_fmu_env": lambda: testing.check_fmu_env(value),
-        "check_hooks": lambda: testing.check_hooks(value),
+        "check_hooks": lambda: callable(value) or testing.check_hooks(value),
         "register": lambda: register(rng.choice((value, "fuzz/Odd-v0")), other),
     }
     kind = rng.choice(list(calls))
