@@ -157,6 +157,7 @@ class FMUEnv(Pictured):
         self._spec = self._interface.pool_spec()
         self._warn_of_peculiarities()
         self._prepare_values()
+        self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
         self._pool = open_pool(self.fmu, self._spec, self.config, self.logger, backend, isolation)
@@ -190,7 +191,8 @@ class FMUEnv(Pictured):
             self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
 
     def _prepare_values(self) -> None:
-        interface, config = self._interface, self.config
+        """Set what hooks may read to what it is before the first reset."""
+        interface = self._interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
         fps = min(1 / interface.time_step, _FASTEST_FPS)
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
@@ -205,17 +207,17 @@ class FMUEnv(Pictured):
         self.action = None
         self.previous_action = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
-        self.variables = EpisodeVariables(config.episode_variables)
-        self._plan = self._plan_episode({})
-        self._step_limit = _step_limit(config, self._spec)
+        self.variables = EpisodeVariables(self.config.episode_variables)
         self.step_count = 0
         self.done = False
         self.after_end = False
+
+    def _prepare_episodes(self) -> None:
+        self._plan = self._plan_episode({})
+        self._step_limit = _step_limit(self.config, self._spec)
         self._ended = True
         self._in_hooks = False
         self._was_reset = False
-        self._last_reward: float | None = None
-        self._return = 0.0
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -439,7 +441,7 @@ class FMUEnv(Pictured):
     def _write_inputs(self, values: Any) -> None:
         if self._takes_one_real and issubclass(type(values), float) and math.isfinite(values):
             self._input_row[0] = values
-            self.inputs = (float(values),)
+            self.inputs = (self._input_row.item(0),)
             return
         inputs = tuple(flat_inputs(values, self._interface.inputs, self._source).tolist())
         if not all(map(math.isfinite, inputs)):
