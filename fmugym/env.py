@@ -424,13 +424,13 @@ class FMUEnv(Pictured):
             self._write_inputs(self._get_inputs())
         except BaseException as error:  # the FMU was not touched: a better action may follow
             self.action, self.previous_action, self.previous_state = before
-            if self._is_to_blame(action, error):
+            if self._blames_action(action, error):
                 raise ConfigError(
                     f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
                 ) from error
             raise
 
-    def _is_to_blame(self, action: Any, error: BaseException) -> bool:
+    def _blames_action(self, action: Any, error: BaseException) -> bool:
         """Whether ``_get_inputs`` failed because of an action outside of the action space."""
         if isinstance(error, FMUGymError) or not isinstance(error, Exception):
             return False
