@@ -303,8 +303,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _by_index(self, name: str, values: Any) -> dict[int, Any]:
         """The values by the number of the environment."""
-        is_one_each = isinstance(values, list | tuple | np.ndarray) and np.shape(values) != ()
-        if not is_one_each:
+        is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
+        if not is_row and not issubclass(type(values), list | tuple):
             return dict.fromkeys(range(self.num_envs), values)
         if len(values) != self.num_envs:
             raise ConfigError(
