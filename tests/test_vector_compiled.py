@@ -228,3 +228,32 @@ def test_which_rewards_are_always_finite(reward, is_finite):
     _, judgement = trace_hooks(env)
     assert is_always_finite(judgement, 2) is is_finite
     env.close()
+
+
+class Unattended(Arithmetic):
+    """It has no inputs."""
+
+    def __init__(self):
+        fmugym.FMUEnv.__init__(
+            self,
+            fmugym.bundled_fmu("Pendulum"),
+            {"model_input_names": [], "model_output_names": ["q", "q_dot"], "time_step": 0.02},
+        )
+
+    def _get_inputs(self):
+        return []
+
+    def _is_done(self):
+        return self.state[0] > 0.9
+
+    def _is_truncated(self):
+        return self.step_count > 8
+
+    def _reward_policy(self):
+        return -self.state[0]
+
+
+def test_an_environment_without_inputs():
+    require_pair_equal(Unattended, steps=20, hooks="auto")
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        FMUVectorEnv(Unattended, 2, hooks="compiled")

@@ -38,7 +38,7 @@ class AnyOf(Drawing):
 
 
 class FarLimit(Drawing):
-    """No state that the probe's own steps reach is beyond the limit."""
+    """The hook check's own steps do not reach the limit."""
 
     def _is_done(self):
         return np.any(self.state[0] > 40.0)
