@@ -17,8 +17,9 @@ import numpy.typing as npt
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
+from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
 
@@ -47,25 +48,29 @@ def make_sb3_env(
     monitor: bool = True,
     **kwargs: Any,
 ) -> VecEnv:
-    """Make N environments for Stable-Baselines3, the counterpart of its ``make_vec_env``.
+    """Make N environments for Stable-Baselines3, as its own ``make_vec_env`` does.
 
     Args:
         env: A registered id, or a class; ids bring their ``max_episode_steps``.
         num_envs: N.
         seed: Environment i is seeded with ``seed + i`` at the first reset.
-        monitor: Whether to put a ``VecMonitor`` around them, which the training's log of returns
-            and lengths comes from.
+        monitor: Whether to wrap them in a ``VecMonitor``, which writes returns and lengths to the
+            log of the training.
         kwargs: Arguments of ``FMUVectorEnv`` (``max_episode_steps``, ``hooks``, ``threads``, ...)
             and of the environment.
 
     Raises:
-        ConfigError: If the environment is none of fmugym's, or an argument does not fit.
+        ConfigError: If the environment is unknown or not one of fmugym, or an argument does not
+            fit.
     """
+    seed = check_seed(seed)
     kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
     if isinstance(env, str):
         vector_env = _registered(env, num_envs, kwargs)
-    else:
+    elif callable(env):
         vector_env = vectorized(env)(num_envs, **kwargs)
+    else:
+        raise ConfigError(f"env must be a registered id or a class, got {shown(env)}")
     venv = FMUVecEnv(vector_env)
     if seed is not None:
         venv.seed(seed)
@@ -75,26 +80,29 @@ def make_sb3_env(
 
 def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
     module, _, name = env_id.rpartition(":")
-    if module:
-        import_module(module)
-    creator: Any = gymnasium.spec(name).entry_point
+    try:
+        if module:
+            import_module(module)
+        creator: Any = gymnasium.spec(name).entry_point
+    except (ImportError, ValueError, gymnasium.error.Error) as error:
+        raise ConfigError(f"there is no environment {env_id!r}: {error}") from None
     creator = load_env_creator(creator) if isinstance(creator, str) else creator
     if isinstance(creator, type) and not issubclass(creator, FMUEnv):
-        raise ConfigError(f"{name} is no environment of fmugym; use SB3's own make_vec_env for it")
+        raise ConfigError(f"{name} is not an environment of fmugym; use SB3's make_vec_env for it")
     return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)
 
 
 class FMUVecEnv(VecEnv):
     """N environments in the form that Stable-Baselines3 trains on.
 
-    It gives what SB3's ``DummyVecEnv`` over the N single environments gives, step by step, at the
-    speed of ``FMUVectorEnv``. The arrays and dicts it hands out are new ones.
+    It returns, step by step, what SB3's ``DummyVecEnv`` with N single environments returns, at the
+    speed of ``FMUVectorEnv``. All arrays and dicts that it returns are new.
 
     Args:
-        env: The environments, made with ``autoreset_mode="same_step"``.
+        env: The vector environment, made with ``autoreset_mode="same_step"``.
 
     Attributes:
-        vector_env: The environments, as given.
+        vector_env: The vector environment, as given.
 
     Raises:
         ConfigError: If ``env`` is something else, or has another autoreset mode.
@@ -103,7 +111,7 @@ class FMUVecEnv(VecEnv):
     def __init__(self, env: FMUVectorEnv) -> None:
         if not isinstance(env, FMUVectorEnv):
             raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
-        mode = env.metadata["autoreset_mode"]
+        mode = env.autoreset_mode
         if mode is not AutoresetMode.SAME_STEP:
             raise ConfigError(
                 f"the autoreset mode is {mode.name}, expected SAME_STEP: make the FMUVectorEnv "
@@ -136,7 +144,7 @@ class FMUVecEnv(VecEnv):
         return observations
 
     def _groups_of_options(self) -> list[tuple[MaskArray, dict[str, Any]]]:
-        """The environments that have the same options; most often there is one group, of all."""
+        """Group the environments by their options; most often all are in one group."""
         kinds: list[dict[str, Any]] = []
         for options in self._options:
             if options not in kinds:
@@ -144,15 +152,16 @@ class FMUVecEnv(VecEnv):
         return [(np.array([o == kind for o in self._options]), kind) for kind in kinds]
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Take the actions for ``step_wait``."""
+        """Keep the actions for ``step_wait``."""
         self._actions = actions
 
     def step_wait(self) -> StepReturn:
         """Step all environments; those whose episode ends start the next one.
 
         Returns:
-            Observations, rewards, dones and infos, as SB3 has them: where an episode ended, the
-            observation is the first of the next one, and the info has ``"terminal_observation"``.
+            Observations, rewards, dones and infos in SB3's form. Where an episode ended, the
+            observation is the first of the next episode, and the info has
+            ``"terminal_observation"``.
         """
         observations, rewards, terminated, truncated, infos = self.vector_env.step(self._actions)
         dones = terminated | truncated
@@ -170,7 +179,7 @@ class FMUVecEnv(VecEnv):
         infos: dict[str, Any],
         listed: list[dict[str, Any]],
     ) -> None:
-        """Sort infos of the last step from those of the reset that followed in the same call."""
+        """Separate the infos of the last step from those of the reset that followed it."""
         last, last_infos = infos.pop("final_obs"), infos.pop("final_info")
         _hand_out(last_infos, listed)
         others = list(listed)
@@ -187,15 +196,15 @@ class FMUVecEnv(VecEnv):
     # Single environments.
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Return an attribute, or a parameter of this episode, of some of the environments.
+        """Return an attribute, or a parameter of this episode, of some environments.
 
         Raises:
-            AttributeError: If there is none of this name.
+            ConfigError: If there is none of this name (it is an ``AttributeError``, too).
         """
         return self.vector_env._get_attr(attr_name, self._numbers(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute or, from the next episode on, a parameter of the FMU.
+        """Set an attribute, or a parameter of the FMU from the next episode on.
 
         Args:
             attr_name: An attribute that hooks read, or the name of a parameter.
@@ -203,8 +212,8 @@ class FMUVecEnv(VecEnv):
             indices: The environments, by default all.
 
         Raises:
-            ConfigError: If there is nothing of this name, or it is a parameter that the others draw
-                anew in each episode.
+            ConfigError: If there is nothing of this name, or it is a parameter that the other
+                environments draw in each episode.
         """
         env = self.vector_env
         given = dict.fromkeys(self._numbers(indices), value)
@@ -232,18 +241,19 @@ class FMUVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of some of the environments.
+        """Call a method of some environments.
 
-        Numbers that the method writes to attributes and to episode variables are kept.
+        Numbers that the method assigns to attributes and to episode variables take effect.
 
         Raises:
-            ConfigError: If the method would part one environment from the others.
+            ConfigError: If the method cannot be called for single environments, or changes what
+                they cannot have each for itself.
         """
         numbers = self._numbers(indices)
         return self.vector_env._call(method_name, numbers, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
-        """Tell that no single environment has a wrapper."""
+        """Return False for each: single environments have no wrappers."""
         return [False for _ in self._numbers(indices)]
 
     def _numbers(self, indices: Indices) -> list[int]:
@@ -258,11 +268,11 @@ class FMUVecEnv(VecEnv):
 
 
 def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
-    """Distribute the infos of a vector environment, arrays with masks, over dicts.
+    """Distribute the infos of a vector environment, arrays with masks, to dicts.
 
     Args:
         infos: The infos; the mask of ``name`` is ``_name``.
-        into: The dicts of the environments by number.
+        into: The dict of each environment, by number.
     """
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
@@ -274,7 +284,7 @@ def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
 
 
 def _parts(values: Any, indices: list[int]) -> list[Any]:
-    """Each environment's part, with Python's numbers as single environments have them."""
+    """Each environment's part; numbers become Python's, as in single environments."""
     if isinstance(values, Mapping):
         parts: dict[int, Any] = {index: {} for index in indices}
         _hand_out(values, parts)

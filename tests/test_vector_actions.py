@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from vector_tools import (
     CART_POLE,
+    Drawing,
     Remembering,
     each_backend,
     each_way,
@@ -77,3 +78,37 @@ def test_an_action_that_does_not_fit_changes_nothing(backend, hooks):
         require_equal(vector.step(actions)[0], twin.step(actions)[0])
     vector.close()
     twin.close()
+
+
+@each_way
+@pytest.mark.parametrize("env_id", ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"])
+def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, backend, hooks):
+    """In the third step environment 1 starts its second episode."""
+    ways = {"hooks": hooks, "backend": backend}
+    vector = gym.make_vec(env_id, num_envs=3, max_episode_steps=3, **ways)
+    vector.reset(seed=0)
+    good = np.zeros(vector.action_space.shape, vector.action_space.dtype)
+    vector.step(good)
+    vector.reset(options={"reset_mask": np.array([True, False, True])})
+    vector.step(good)
+    assert vector.step(good)[3].tolist() == [False, True, False]
+    bad = good.copy()
+    bad[1] = 7 if bad.dtype.kind == "i" else np.nan
+    with pytest.raises(ConfigError, match="environment 1"):
+        vector.step(bad)
+    assert vector.step(good)[3].tolist() == [True, False, True]
+    assert vector.get_attr("step_count") == (3, 0, 3)
+    vector.close()
+
+
+@each_way
+def test_a_nan_is_refused_even_where_no_hook_reads_it(backend, hooks):
+    class Deaf(Drawing):
+        def _get_inputs(self):
+            return 0.0 * self.step_count
+
+    vector = FMUVectorEnv(Deaf, 2, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    with pytest.raises(ConfigError, match="environment 1"):
+        vector.step(np.array([[0.0], [np.nan]], np.float32))
+    vector.close()

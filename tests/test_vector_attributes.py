@@ -131,3 +131,112 @@ def test_single_environments_are_read_one_by_one():
     assert envs.get_attr("m_pole") == (0.1, 0.2, 0.3)
     assert [read["m_pole"] for read in envs.call("read_variables", "m_pole")] == [0.1, 0.2, 0.3]
     envs.close()
+
+
+class Limited(CART_POLE):
+    """Its methods write what its hooks read."""
+
+    def __init__(self):
+        super().__init__()
+        self.limit = 2.4
+        self.marks = [0.0]
+
+    def set_limit(self, limit):
+        self.limit = limit
+        return self.limit
+
+    def halve_and_stop(self):
+        self.limit = self.limit / 2
+        self.step_count = 0
+
+    def mark(self, value):
+        self.marks.append(value)
+
+    def name_it(self, name):
+        self.name = name
+
+    def scatter(self):
+        self.limit = 0.01 * self.parameters["m_pole"] + abs(self.state[0])
+
+    def _is_done(self):
+        return abs(self.state[0]) >= self.limit
+
+
+@each_way
+def test_what_a_method_assigns_takes_effect(backend, hooks):
+    vector = FMUVectorEnv(Limited, 3, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    assert vector.step(np.zeros(3, np.int64))[2].tolist() == [False] * 3
+    assert vector.call("set_limit", 0.0) == (0.0,) * 3
+    assert vector.get_attr("limit") == (0.0,) * 3
+    assert vector.step(np.zeros(3, np.int64))[2].tolist() == [True] * 3
+    vector.reset(seed=0)
+    vector.call("set_limit", limit=2.4)
+    assert vector.step(np.zeros(3, np.int64))[2].tolist() == [False] * 3
+    vector.call("scatter")
+    limits = vector.get_attr("limit")
+    assert len(set(limits)) == 3
+    expected = [abs(np.float64(state[0])) + 0.001 for state in vector.get_attr("state")]
+    np.testing.assert_allclose(limits, expected)
+    vector.close()
+
+
+def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing():
+    vector = FMUVectorEnv(Limited, 3, hooks="array")
+    vector.reset(seed=0)
+    vector.step(np.zeros(3, np.int64))
+    with pytest.raises(ConfigError, match="'step_count' cannot be set"):
+        vector.call("halve_and_stop")
+    with pytest.raises(ConfigError, match=r"self\.marks in place"):
+        vector.call("mark", 1.0)
+    assert vector.get_attr("limit") == (2.4,) * 3
+    assert vector.get_attr("marks") == ([0.0],) * 3
+    vector.call("name_it", "trolley")
+    assert vector.get_attr("name") == ("trolley",) * 3
+    vector.close()
+
+
+@each_way
+def test_methods_that_no_environment_can_do_alone(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    for method in ("reset", "step", "close"):
+        with pytest.raises(ConfigError, match=f"{method!r} cannot be called on single"):
+            vector.call(method)
+    assert vector.call("render") == (None, None)
+    for odd in (3, None, ["x"], np.ones(2)):
+        with pytest.raises(ConfigError, match="the name of an attribute must be text"):
+            vector.get_attr(odd)
+    vector.close()
+
+
+ODD_VALUES = (
+    [1.0, [2.0, 3.0], 4.0],
+    [None, 1.0, 2.0],
+    ["a", "b", "c"],
+    [{}, 1.0, 2.0],
+    [1j, 2j, 0],
+)
+
+
+@pytest.mark.parametrize("values", ODD_VALUES, ids=str)
+@each_way
+def test_values_that_are_no_numbers(values, backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    with pytest.raises(ConfigError, match="m_pole"):
+        vector.set_attr("m_pole", values)
+    if hooks != "per_env":
+        with pytest.raises(ConfigError, match="'force_mag' can hold one number"):
+            vector.set_attr("force_mag", values)
+    vector.reset(seed=0)
+    vector.step(np.zeros(3, np.int64))
+    vector.close()
+
+
+@each_way
+def test_what_the_environments_keep_themselves_cannot_be_set(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+    for name in ("state", "step_count", "time", "action_space", "_pool", "step", "_is_done", "fmu"):
+        with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
+            vector.set_attr(name, 1.0)
+    vector.close()

@@ -19,10 +19,16 @@ from vector_tools import (
 )
 
 import fmugym
-from fmugym import ConfigError, Uniform
+from fmugym import ConfigError, Normal, Uniform
 from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.hooks.program import is_always_finite
+from fmugym.vector.hooks.trace import trace_hooks
+
+needs_native = pytest.mark.skipif(
+    not has_native_pool(), reason="hooks are compiled for the native pool"
+)
 
 
 class Powers(Drawing):
@@ -40,7 +46,7 @@ def test_what_cannot_be_compiled_is_left_to_numpy(backend):
         FMUVectorEnv(Powers, 2, hooks="compiled", backend=backend)
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="hooks are compiled for the native pool")
+@needs_native
 def test_plain_arithmetic_is_compiled():
     for cls in (fmugym.envs.CartPoleEnv, fmugym.envs.ModelicaCartPoleEnv, PushedCart):
         FMUVectorEnv(cls, 2, hooks="compiled").close()
@@ -119,7 +125,7 @@ NOT_COMPILED = {
 }
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="hooks are compiled for the native pool")
+@needs_native
 @pytest.mark.parametrize("reason", NOT_COMPILED)
 def test_reasons_against_compiling(reason):
     class Other(Arithmetic):
@@ -144,7 +150,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="hooks are compiled for the native pool")
+@needs_native
 @pytest.mark.parametrize("change", CHANGES)
 def test_compiled_hooks_after_a_change(change, monkeypatch):
     """Once the episodes from before have ended, steps are as fast as before."""
@@ -171,3 +177,83 @@ def test_compiled_hooks_after_a_change(change, monkeypatch):
     assert len(on_arrays) == already < 30
     ours.close()
     theirs.close()
+
+
+def normal_swing():
+    return PushedCart(model_parameters={"x_0": Normal(0.0, 0.1)})
+
+
+@needs_native
+def test_draws_that_the_pool_cannot_make_are_a_reason_against_compiling():
+    with pytest.raises(ConfigError, match=r"draws other than uniform ones.*'x_0'"):
+        FMUVectorEnv(normal_swing, 2, hooks="compiled")
+    FMUVectorEnv(normal_swing, 2, hooks="auto").close()
+
+
+class NotANumber(Arithmetic):
+    """Its reward is NaN where the pendulum swings one way."""
+
+    def _reward_policy(self):
+        return np.sqrt(self.state[1])
+
+
+@needs_native
+def test_programs_whose_results_are_nan_are_the_hooks():
+    FMUVectorEnv(NotANumber, 2, hooks="compiled").close()
+
+
+def constant(env):
+    return np.where(env.done, -1.0, np.minimum(2.0, 1.0))
+
+
+def loaded(env):
+    return np.maximum(abs(env.state[0]), -env.parameters["m"])
+
+
+def overflowing(env):
+    return np.where(env.done, 1.0, env.state[0] * env.state[0])
+
+
+def dividing(env):
+    return 1.0 / env.state[0]
+
+
+@needs_native
+@pytest.mark.parametrize(
+    ("reward", "is_finite"),
+    [(constant, True), (loaded, True), (overflowing, False), (dividing, False)],
+)
+def test_which_rewards_are_always_finite(reward, is_finite):
+    env = type("Other", (Arithmetic,), {"_reward_policy": reward})()
+    _, judgement = trace_hooks(env)
+    assert is_always_finite(judgement, 2) is is_finite
+    env.close()
+
+
+class Unattended(Arithmetic):
+    """It has no inputs."""
+
+    def __init__(self):
+        fmugym.FMUEnv.__init__(
+            self,
+            fmugym.bundled_fmu("Pendulum"),
+            {"model_input_names": [], "model_output_names": ["q", "q_dot"], "time_step": 0.02},
+        )
+
+    def _get_inputs(self):
+        return []
+
+    def _is_done(self):
+        return self.state[0] > 0.9
+
+    def _is_truncated(self):
+        return self.step_count > 8
+
+    def _reward_policy(self):
+        return -self.state[0]
+
+
+def test_an_environment_without_inputs():
+    require_pair_equal(Unattended, steps=20, hooks="auto")
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        FMUVectorEnv(Unattended, 2, hooks="compiled")

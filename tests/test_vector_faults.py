@@ -10,12 +10,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
     ABSURD,
     Cart,
+    Drawing,
     PushedCart,
     each_mode,
     each_way,
     make_pair,
     require_equal,
     require_same_infos,
+    run_side_by_side,
     sampled_actions,
 )
 
@@ -181,4 +183,126 @@ def test_a_start_that_fails_is_an_error(backend, hooks, make_env):
         vector.reset(options={"model_parameters": {"init_status": 3}})
     vector.reset()
     vector.step(np.zeros((2, 1), np.float32))
+    vector.close()
+
+
+class Rewarding(Drawing):
+    """Its reward is not finite in some steps, and its observation overflows in others."""
+
+    def __init__(self, **changes):
+        changes = {"fault_reward": -7.0, "episode_variables": {"sum": 0.0}} | changes
+        super().__init__(max_episode_steps=12, **changes)
+
+    def _update(self):
+        self.variables["sum"] += self.state[0]
+
+    def _reward_policy(self):
+        q, q_dot = self.state
+        wrong = np.where(self.step_count % 2 == 0, np.nan, -np.inf)
+        return np.where(q_dot > 3.0, wrong, q)
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        return np.array([np.where(q_dot < -3.0, np.inf, q), q_dot], np.float32)
+
+    def _get_info(self):
+        return {"sum": self.variables["sum"], "count": self.step_count}
+
+
+@each_way
+@each_mode
+@pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
+def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(
+    on_fault, mode, backend, hooks
+):
+    logging.getLogger("fmugym.Rewarding").setLevel(logging.CRITICAL)
+    ours, theirs = make_pair(
+        Rewarding, mode, hooks=hooks, backend=backend, num_envs=6, on_fault=on_fault
+    )
+    assert run_side_by_side(ours, theirs, mode, 60) > 20
+    counts = ours.health["not_finite"]
+    assert counts.tolist() == [env.health["not_finite"] for env in theirs.envs]
+    assert counts.sum() > 5
+    ours.close()
+    theirs.close()
+
+
+@each_way
+def test_a_number_that_is_not_finite_may_be_raised(backend, hooks):
+    vector = FMUVectorEnv(lambda: Rewarding(on_fault="raise"), 9, hooks=hooks, backend=backend)
+    vector.reset(seed=1)
+    actions = sampled_actions(vector, 12)
+    with pytest.raises(SimulationError, match=r"environment \d: (_reward_policy returned|the obs)"):
+        step_with_all(vector, actions)
+    vector.close()
+
+
+def step_with_all(vector, batches):
+    for actions in batches:
+        vector.step(actions)
+
+
+class Overflowing(Drawing):
+    """Its observation is too large for the float32 of its space once the pendulum is fast."""
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        return np.array([np.where(abs(q_dot) > 2.0, 1e300, q), q_dot])
+
+
+@each_way
+def test_an_observation_that_overflows_is_a_fault(backend, hooks):
+    logging.getLogger("fmugym.Overflowing").setLevel(logging.CRITICAL)
+    vector = FMUVectorEnv(lambda: Overflowing(max_episode_steps=9), 5, hooks=hooks, backend=backend)
+    vector.reset(seed=1)
+    faults = 0
+    for actions in sampled_actions(vector, 30):
+        observations, *_, infos = vector.step(actions)
+        assert np.isfinite(observations).all()
+        faults += int(infos["_fault"].sum()) if "_fault" in infos else 0
+    assert faults > 5
+    vector.close()
+
+
+class Choosing(PushedCart):
+    """Compiled, with a reward that is infinite for one of its actions."""
+
+    def _get_inputs(self):
+        return 1.0 * self.action
+
+    def _reward_policy(self):
+        return np.where(self.action == 1, self.state[0] * 1.0, np.inf)
+
+
+@each_way
+def test_an_infinite_reward_of_plain_arithmetic(backend, hooks):
+    logging.getLogger("fmugym.Choosing").setLevel(logging.CRITICAL)
+    ways = {"backend": backend, "hooks": "compiled" if hooks == "auto" else hooks}
+    vector = FMUVectorEnv(Choosing, 3, **ways)
+    vector.reset(seed=0)
+    first = vector.step(np.array([1, 1, 1]))[0]
+    observations, rewards, _, truncated, infos = vector.step(np.array([1, 0, 1]))
+    assert truncated.tolist() == infos["_fault"].tolist() == [False, True, False]
+    assert infos["fault"][1] == "_reward_policy returned inf at t = 0.04 s"
+    assert rewards[1] == -7.0
+    assert np.isfinite(rewards).all()
+    assert observations[1].tolist() == first[1].tolist()
+    assert observations[0].tolist() != first[0].tolist()
+    assert vector.health["not_finite"].tolist() == [0, 1, 0]
+    assert vector.step(np.array([1, 1, 1]))[1][1] == 0.0
+    vector.close()
+
+
+@each_way
+def test_a_first_observation_that_is_not_finite(backend, hooks):
+    class Blind(Drawing):
+        def _get_observation(self):
+            return np.array(self.state) / (0.0 * self.step_count + 0.0)
+
+    vector = FMUVectorEnv(Blind, 2, hooks=hooks, backend=backend)
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(SimulationError, match="the first observation"),
+    ):
+        vector.reset()
     vector.close()

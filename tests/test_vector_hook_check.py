@@ -13,12 +13,16 @@ from vector_tools import (
     Remembering,
     Shifted,
     each_backend,
+    each_mode,
+    make_pair,
     require_pair_equal,
+    sampled_actions,
 )
 
 from fmugym import ConfigError, ContractError
 from fmugym.testing import check_hooks
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.views import differs
 
 
 class Branching(Drawing):
@@ -34,7 +38,7 @@ class AnyOf(Drawing):
 
 
 class FarLimit(Drawing):
-    """No state that the probe's own steps reach is beyond the limit."""
+    """The hook check's own steps do not reach the limit."""
 
     def _is_done(self):
         return np.any(self.state[0] > 40.0)
@@ -233,3 +237,67 @@ def test_a_prototype_that_does_not_fit_is_closed(temp_root):
     with pytest.raises(ConfigError):
         FMUVectorEnv(Branching, 2, hooks="array")
     assert not list(temp_root.iterdir())
+
+
+class Unknown(Drawing):
+    """NaN stands for what is not known, in attributes, variables and infos."""
+
+    def __init__(self):
+        super().__init__(episode_variables={"last": 0.0})
+        self.unknown = float("nan")
+        self.table = {"a": [float("nan"), np.float64("nan")], "b": np.array([np.nan, 1.0])}
+
+    def _update(self):
+        self.variables["last"] = np.where(self.state[0] > 0, np.nan, self.state[0])
+
+    def _get_info(self):
+        return {
+            "last": self.variables["last"],
+            "unknown": self.unknown,
+            "n": self.out["q"] * np.nan,
+        }
+
+
+def test_nan_equals_nan(caplog):
+    check_hooks(Unknown)
+    require_pair_equal(Unknown, steps=20, hooks="auto")
+    assert not caplog.records
+
+
+def test_values_that_differ():
+    nan = float("nan")
+    equal = [
+        (nan, float("nan")),
+        (np.float64("nan"), np.float64("nan")),
+        (complex(nan, 0), complex(nan, 0)),
+        ([nan, {"a": nan}], [float("nan"), {"a": float("nan")}]),
+        (np.array([nan, 1]), np.array([nan, 1])),
+        (object(), object()),
+    ]
+    unequal = [(nan, 1.0), (1.0, nan), (1, 1.0), ([1], [2]), ({"a": 1}, {"b": 1}), ("a", "b")]
+    assert [pair for pair in equal if differs(*pair)] == []
+    assert [pair for pair in unequal if not differs(*pair)] == []
+
+
+class TwoParts(Drawing):
+    """Observations that are a tuple make no array."""
+
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        return gym.spaces.Tuple([box, box])
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        return np.array([q], np.float32), np.array([q_dot], np.float32)
+
+
+@each_mode
+def test_observations_of_several_parts(mode):
+    ours, theirs = make_pair(TwoParts, mode, hooks="auto")
+    for (first, _), (second, _) in [(ours.reset(seed=1), theirs.reset(seed=1))]:
+        assert [part.tolist() for part in first] == [part.tolist() for part in second]
+    for actions in sampled_actions(ours, 3):
+        first, second = ours.step(actions), theirs.step(actions)
+        assert [part.tolist() for part in first[0]] == [part.tolist() for part in second[0]]
+    ours.close()
+    theirs.close()

@@ -7,7 +7,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from vector_tools import Remembering, each_way, require_equal, sampled_actions
+from vector_tools import (
+    CART_POLE,
+    Remembering,
+    each_mode,
+    each_way,
+    require_equal,
+    sampled_actions,
+)
 
 import fmugym
 from fmugym.vector import FMUVectorEnv
@@ -58,3 +65,35 @@ def test_infos_as_lists(backend, hooks):
         drawn += [info["drawn"]["x_0"] for info in infos if "drawn" in info]
     assert len(set(drawn)) > 2
     wrapped.close()
+
+
+def require_zero_outside_of_masks(infos):
+    for name, mask in infos.items():
+        values = infos.get(name[1:])
+        if not name.startswith("_") or values is None:
+            continue
+        if isinstance(values, Mapping):
+            require_zero_outside_of_masks(values)
+        elif values.dtype == object:
+            assert all(value is None for value in values[~mask]), name
+        else:
+            assert not values[~mask].any(), name
+
+
+@each_way
+@each_mode
+@pytest.mark.parametrize("cls", [Remembering, CART_POLE])
+def test_infos_are_zero_outside_of_their_masks(cls, mode, backend, hooks):
+    vector = FMUVectorEnv(cls, 4, autoreset_mode=mode, hooks=hooks, backend=backend)
+    require_zero_outside_of_masks(vector.reset(seed=0)[1])
+    told = 0
+    for actions in sampled_actions(vector, 40):
+        result = vector.step(actions)
+        ended = result[2] | result[3]
+        infos = result[4]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            infos = vector.reset(options={"reset_mask": ended})[1]
+        require_zero_outside_of_masks(infos)
+        told += "drawn" in infos and not infos["_drawn"].all()
+    assert told > 0
+    vector.close()

@@ -113,7 +113,8 @@ def _of_floats(space: spaces.Box) -> Finiteness:
 
     def is_finite(observation: Any) -> bool:
         if type(observation) is not np.ndarray or observation.dtype is not dtype:
-            observation = _numbers(observation, "fiub")
+            with np.errstate(over="ignore", invalid="ignore"):
+                observation = _numbers(observation, "fiub").astype(dtype)
         if observation.shape != shape:
             _refuse_shape(observation, shape)
         if is_short and math.isfinite(math.hypot(*observation.tolist())):

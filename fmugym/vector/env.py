@@ -303,10 +303,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _by_index(self, name: str, values: Any) -> dict[int, Any]:
         """The values by the number of the environment."""
-        if not isinstance(values, list | tuple | np.ndarray):
+        is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
+        if not is_row and not issubclass(type(values), list | tuple):
             return dict.fromkeys(range(self.num_envs), values)
-        if isinstance(values, np.ndarray) and values.ndim == 0:
-            return dict.fromkeys(range(self.num_envs), values[()])
         try:
             each = list(values)
         except Exception:  # a list of the caller's whose methods fail

@@ -1,4 +1,4 @@
-"""Programs: hooks in the form in which the native pool runs them, and numpy's reading of them.
+"""Programs: hooks in the form that the native pool runs.
 
 A program is a list of instructions on registers. The native pool runs it in the same pass as the
 FMU's step; ``evaluate`` runs it with numpy, so that the two can be compared.
@@ -56,19 +56,20 @@ OPERATIONS: Final = (
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
 MOST_INSTRUCTIONS: Final = 128
-"""What the native pool has registers for."""
+"""The native pool has this many registers."""
 
 
 class UntraceableError(Exception):
-    """A hook does what a program cannot; it is then evaluated with numpy."""
+    """A hook does what a program cannot do."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """Instructions for the native pool: each writes the register of its own number.
+    """Instructions for the native pool. Instruction number i writes register i.
 
     Attributes:
-        code: Operation and three operands (registers, or indices of what is loaded), shape (n, 4).
+        code: The operation and three operands (registers, or the index of the value to load),
+            shape (n, 4).
         constants: What the instructions of the operation ``constant`` refer to, shape (c,).
         results: The registers of the results, shape (r,).
     """
@@ -104,7 +105,7 @@ _MAY_OVERFLOW: Final = frozenset({"add", "subtract", "multiply", "divide", "squa
 
 
 def evaluate(program: Program, batch: FMUEnv) -> list[FloatArray]:
-    """Evaluate a program with numpy, as the native pool does, to check it.
+    """Evaluate a program with numpy, to compare it with the hooks.
 
     Args:
         program: The program.
