@@ -56,6 +56,7 @@ _WARNING: Final = int(Status.WARNING)
 _TERMINATED: Final = int(Status.TERMINATED)
 _ARGUMENTS: Final = ("fmu_path", "config", "log_level", "render_mode", "backend", "isolation")
 _FASTEST_FPS: Final = 1_000_000
+_FLOATS: Final = frozenset({float, np.float64})
 
 
 class FMUEnv(Pictured):
