@@ -18,8 +18,8 @@ from busy import BusyEnv, build
 from measure import Effort, MissingError
 from tables import Table, duration, share
 
-from fmugym.task.opening import request_pool
 from fmugym.envs import CartPoleEnv
+from fmugym.task.opening import request_pool
 
 __all__ = ["tables"]
 

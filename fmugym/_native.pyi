@@ -5,7 +5,7 @@ int8 for statuses. Those that are only read may have any strides.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, final
+from typing import Any, TypedDict, final
 
 import numpy as np
 import numpy.typing as npt
@@ -35,48 +35,91 @@ class Access:
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
 
+class Library(TypedDict):
+    """What the FMU is and how its instances are made."""
+
+    version: int
+    model: bytes
+    token: bytes
+    resources: bytes
+    paths: tuple[bytes, ...]
+    private: bool
+    logging: bool
+    states: bool
+
+class Experiment(TypedDict):
+    """The times of an episode."""
+
+    start_time: float
+    stop_time: float | None
+    tolerance: float | None
+    time_step: float
+    substeps: int
+    warm_up_steps: int
+    retries: int
+    restores: bool
+    rebuilds: bool
+    reloads: bool
+
+class Variables(TypedDict):
+    """What is set and read in each step, and the Strings that are set before initialization."""
+
+    inputs: Access
+    outputs: Access
+    num_observed: int
+    strings: tuple[tuple[int, bytes], ...]
+
+class Arrays(TypedDict):
+    """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
+
+    inputs: Array
+    outputs: Array
+    statuses: Array
+    observations: Array
+    health: Array
+
+class Draws(TypedDict):
+    """See ``NativePool.prepare_play``."""
+
+    block: Array
+    used: Array
+    low: Array
+    width: Array
+    rows: Array
+
+class Episodes(TypedDict):
+    """See ``NativePool.prepare_play``."""
+
+    step_counts: Array
+    ended: Array
+    limit: int
+
 @final
 class Pool:
     """N instances of one FMU.
 
-    ``inputs``, ``outputs``, ``status``, ``observations`` and ``health`` (int64, a row of counts for
-    each instance; see ``fmugym.pool.health``) are the pool's own arrays. A call that
-    is given the very object ``inputs`` or ``observations`` uses it without a look at its buffer.
+    A call that is given the very array ``inputs`` or ``observations`` of the pool uses it without
+    a look at its buffer. Any method may be called from any thread at any time; calls take turns.
+    Afterwards the messages of the FMU go to ``callback``. If that raises an ``Exception``, this is
+    reported as unraisable; anything else, such as ``KeyboardInterrupt``, comes out of the method,
+    whose work is done by then.
 
     Raises:
         OSError: If the FMU cannot be loaded or instantiated.
+        SimulationError: From all methods but ``close``, if the pool is closed.
+        RuntimeError: If an FMU calls the pool that it is in.
     """
 
     def __new__(
         cls,
-        version: int,
-        model: bytes,
-        token: bytes,
-        resources: bytes,
-        paths: tuple[bytes, ...],
-        private_libraries: bool,
-        logging: bool,
-        can_save: bool,
-        start_time: float,
-        stop_time: float | None,
-        tolerance: float | None,
-        time_step: float,
-        substeps: int,
-        warm_up_steps: int,
-        retries: int,
-        strings: tuple[tuple[int, bytes], ...],
-        input_variables: Access,
-        output_variables: Access,
-        num_observed: int,
+        *,
+        library: Library,
+        experiment: Experiment,
+        variables: Variables,
+        arrays: Arrays,
         count: int,
         threads: int,
-        inputs: Array,
-        outputs: Array,
-        status: Array,
-        observations: Array,
-        health: Array,
         callback: Callable[[int, int, str, str], object],
-        /,
     ) -> Pool: ...
     def step_own(self) -> int:
         """Step all with the pool's own inputs; writes the pool's own observations.
@@ -106,23 +149,14 @@ class Pool:
 
     def prepare_play(
         self,
+        *,
         start: Access,
+        start_values: Array,
         inputs: tuple[bytes, bytes, bytes],
         judgement: tuple[bytes, bytes, bytes],
-        lowest_action: int,
-        highest_action: int,
-        limit: int,
-        draws: int,
-        episodes: int,
-        start_values: Array,
-        block: Array,
-        used: Array,
-        low: Array,
-        width: Array,
-        rows: Array,
-        step_counts: Array,
-        ended: Array,
-        /,
+        actions: tuple[int, int],
+        draws: Draws,
+        episodes: Episodes,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 

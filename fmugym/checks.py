@@ -22,13 +22,16 @@ from fmugym.errors import ConfigError, shown, unknown_name
 __all__ = [
     "LARGEST_COUNT",
     "check_count",
+    "check_dict",
     "check_flag",
+    "check_integer",
     "check_mapping",
-    "check_name",
     "check_number",
     "check_option",
     "check_path",
     "check_seed",
+    "check_text",
+    "float_or_nan",
     "has_method",
     "integer_of",
     "number_of",
@@ -39,26 +42,42 @@ LARGEST_COUNT: Final = 2**31 - 1
 
 
 def check_number(
-    what: str, value: Any, minimum: float = -math.inf, *, positive: bool = False
+    what: str,
+    value: Any,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    *,
+    positive: bool = False,
+    may_be_infinite: bool = False,
 ) -> float:
-    """Return a value as a finite float of a range.
+    """Return a value as a float of a range.
 
     Args:
         what: The name of the value, for the error.
-        value: Anything.
-        minimum: The least that is allowed.
-        positive: Whether zero is too little.
+        value: Any object.
+        minimum: The lowest number allowed.
+        maximum: The highest number allowed.
+        positive: Whether 0 is refused too.
+        may_be_infinite: Whether infinity is allowed.
 
     Raises:
-        ConfigError: With the name and the value.
+        ConfigError: If it is no number, NaN, or out of its range.
     """
     number = number_of(what, value)
-    if math.isfinite(number) and number >= minimum and (number > 0 or not positive):
+    in_range = minimum <= number <= maximum and (number > 0 or not positive)
+    if in_range and (may_be_infinite or math.isfinite(number)):
         return number
-    wanted = "positive and finite" if positive else "finite and not negative"
-    raise ConfigError(
-        f"{what} must be {wanted if positive or minimum == 0 else 'finite'}, got {shown(value)}"
-    )
+    kind = "a number" if may_be_infinite else "finite"
+    wanted = kind + _range(minimum, maximum, positive)
+    raise ConfigError(f"{what} must be {wanted}, got {shown(value)}")
+
+
+def _range(minimum: float, maximum: float, positive: bool) -> str:
+    if maximum < math.inf:
+        return f" and from {minimum:g} to {maximum:g}"
+    if positive or minimum == 0:
+        return " and positive" if positive else " and not negative"
+    return f" and at least {minimum:g}" if minimum > -math.inf else ""
 
 
 def number_of(what: str, value: Any) -> float:
@@ -73,6 +92,14 @@ def number_of(what: str, value: Any) -> float:
         with suppress(Exception):  # the number is too large, or the object's own method fails
             return float(value)
     raise ConfigError(f"{what} must be a number, got {shown(value)}")
+
+
+def float_or_nan(value: Any) -> float:
+    """Return a value as a float; NaN if it is no real number."""
+    try:
+        return number_of("", value)
+    except ConfigError:
+        return math.nan
 
 
 def _is_real(value: Any) -> bool:
@@ -93,6 +120,20 @@ def check_count(what: str, value: Any, largest: int = LARGEST_COUNT) -> int:
     if number is None or not 0 < number <= largest:
         bound = "" if number is None or number < 1 else f" of at most {largest}"
         raise ConfigError(f"{what} must be a positive integer{bound}, got {shown(value)}")
+    return number
+
+
+def check_integer(what: str, value: Any, minimum: int, maximum: int) -> int:
+    """Return a value as an integer of a range.
+
+    Raises:
+        ConfigError: With the name and the value.
+    """
+    number = integer_of(value)
+    if number is None or not minimum <= number <= maximum:
+        raise ConfigError(
+            f"{what} must be an integer from {minimum} to {maximum}, got {shown(value)}"
+        )
     return number
 
 
@@ -144,14 +185,14 @@ def has_method(value: object, name: str) -> bool:
         return False
 
 
-def check_name(what: str, value: Any) -> str:
+def check_text(what: str, value: Any) -> str:
     """Return a value as a plain text.
 
     Raises:
         ConfigError: If it is no text.
     """
     if not isinstance(value, str):
-        raise ConfigError(f"{what} must be a name, got {shown(value)}")
+        raise ConfigError(f"{what} must be a text, got {shown(value)}")
     return str.__str__(value)  # a subclass may have odd methods
 
 
@@ -173,14 +214,22 @@ def check_mapping(what: str, value: Any) -> dict[str, Any]:
     Raises:
         ConfigError: If it is none.
     """
-    if issubclass(type(value), Mapping):
-        try:
-            items = dict(value)
-        except Exception:  # a mapping of the caller's whose methods fail
-            items = {None: None}
-        if all(isinstance(name, str) for name in items):
-            return {str.__str__(name): item for name, item in items.items()}
+    items = check_dict(what, value)
+    if all(isinstance(name, str) for name in items):
+        return {str.__str__(name): item for name, item in items.items()}
     raise ConfigError(f"{what} must be a dict with names as keys, got {shown(value)}")
+
+
+def check_dict(what: str, value: Any) -> dict[Any, Any]:
+    """Return a mapping as a new dict.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if issubclass(type(value), Mapping):
+        with suppress(Exception):  # a mapping of the caller's whose methods fail
+            return dict(value)
+    raise ConfigError(f"{what} must be a dict, got {shown(value)}")
 
 
 def check_path(what: str, value: Any) -> Path:

@@ -24,6 +24,7 @@ from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
+    ResetMethod,
 )
 
 __all__ = ["EnvConfig"]
@@ -54,7 +55,7 @@ class EnvConfig:
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         start_time: First communication point; by default the FMU's own default start time.
         stop_time: Given to the FMU unless it is None; the episode is truncated there.
-        tolerance: For the FMU's solver; by default the FMU's own.
+        tolerance: For the FMU's solver; by default that of the FMU's default experiment.
         substeps: Communication steps within one ``step``.
         warm_up: Time simulated at each reset before the first observation, a multiple of
             ``time_step``, with the inputs at their start values.
@@ -69,6 +70,8 @@ class EnvConfig:
         fault_reward: Reward of a step that failed.
         leak_limit: Bytes of memory that resets may take for good. Beyond it the FMU's instances are
             freed and made anew. None for no limit.
+        reset_method: How episodes begin: ``"restore"``, ``"reset"``, ``"instance"``, ``"library"``
+            or ``"process"``; by default the fastest one that a trial has found to be right.
         archive_limits: How large an FMU may be, an ``ArchiveLimits`` or a dict of its arguments; by
             default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's; a relative path is relative to the
@@ -103,6 +106,7 @@ class EnvConfig:
     fault_retries: int = 0
     fault_reward: float = 0.0
     leak_limit: int | None = DEFAULT_LEAK_LIMIT
+    reset_method: str | None = None
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
@@ -145,6 +149,9 @@ class EnvConfig:
         self._set("on_fault", check_option("on_fault policy", self.on_fault, ON_FAULT))
         if self.isolation is not None:
             self._set("isolation", check_option("isolation", self.isolation, ISOLATIONS))
+        if self.reset_method is not None:
+            methods = list(map(str, ResetMethod))
+            self._set("reset_method", check_option("reset method", self.reset_method, methods))
         if isinstance(self.archive_limits, Mapping):
             self._set("archive_limits", _archive_limits(self.archive_limits))
         self._check_names()

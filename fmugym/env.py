@@ -161,13 +161,20 @@ class FMUEnv(Pictured):
         self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
-        self._pool = open_pool(self.fmu, self._spec, self.config, self.logger, backend, isolation)
+        self._pool = open_pool(
+            self.fmu, self._spec, self.config, self._plan, self.logger, backend, isolation
+        )
         self._step_pool = self._pool.step_own
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
         self._observation_row = self._pool.observations[0]
         self._halt = self._pool.halt
         self._pool_tells = bool(self._pool.info())
         self._has_info = self._has_info or self._pool_tells
+
+    @property
+    def reset_method(self) -> str:
+        """How episodes begin; see ``EnvConfig``."""
+        return str(self._open_pool("reset_method").reset_method)
 
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
@@ -440,9 +447,9 @@ class FMUEnv(Pictured):
         return is_misfit(action, self.action_space, error)
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and issubclass(type(values), float) and math.isfinite(values):
+        if self._takes_one_real and type(values) in _FLOATS and math.isfinite(values):
             self._input_row[0] = values
-            self.inputs = (self._input_row.item(0),)
+            self.inputs = (float(values),)
             return
         inputs = tuple(flat_inputs(values, self._interface.inputs, self._source).tolist())
         if not all(map(math.isfinite, inputs)):

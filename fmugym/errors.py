@@ -9,7 +9,8 @@
     ├── SimulationError   an FMI call failed, or a method was called out of order
     └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
-Every error takes one argument, its text, and so survives pickling between processes.
+Every error takes one argument, its text, and so survives pickling between processes. The text is
+shown with ``printable``: it may quote an FMU.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ __all__ = [
     "FMUGymError",
     "FMULoadError",
     "SimulationError",
+    "printable",
     "shown",
     "unknown_argument",
     "unknown_name",
@@ -34,8 +36,31 @@ _LONGEST: Final = 120
 """Characters of a value that an error shows, at most."""
 
 
+def printable(text: object) -> str:
+    r"""Escape what a terminal may obey or a log may take for a line of its own.
+
+    Names, descriptions and messages of an FMU are foreign texts. Every exit uses this function:
+    errors, logs, infos and the command line.
+
+    Args:
+        text: A text, or an object that is turned into one.
+
+    Returns:
+        The text on one line. Letters of all languages stay. Control characters, line breaks,
+        marks that reverse the direction of writing and the like become ``\x1b``, ``\n`` and
+        so on.
+    """
+    line = str(text)
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
 class FMUGymError(Exception):
     """Base class of all errors of this package."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class ConfigError(FMUGymError):
@@ -76,8 +101,7 @@ def shown(value: object) -> str:
         text = f"<{type(value).__name__} without a repr>"
     if "\n" in text:  # an array
         text = " ".join(text.split())
-    if not text.isprintable():
-        text = text.encode("unicode_escape").decode()
+    text = printable(text)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
@@ -86,11 +110,11 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
 
     Args:
         kind: What the name should have named, for example ``"config key"``.
-        name: The name as it was given.
-        known: All the names that would have been right.
+        name: The name that was given.
+        known: All valid names.
 
     Returns:
-        The error, with the nearest known name or, where none is near, some of the known names.
+        The error. It suggests the nearest known name, or lists known names if none is near.
     """
     names = list(known)
     near = _nearest(name, names)

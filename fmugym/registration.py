@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import gymnasium
 
-from fmugym.checks import check_name
+from fmugym.checks import check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.vector import vectorized
 from fmugym.vector.entry_points import vector_entry_point
@@ -44,7 +44,7 @@ def register(
     Raises:
         ConfigError: If the id is malformed, or ``env`` is neither a class nor ``"module:Class"``.
     """
-    env_id, entry_point = check_name("env_id", env_id), _entry_point(env)
+    env_id, entry_point = check_text("env_id", env_id), _entry_point(env)
     is_named = isinstance(entry_point, str)
     default = vector_entry_point(entry_point) if is_named else vectorized(entry_point)
     try:

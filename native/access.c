@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "floats.h"
 #include "platform.h"
 
 static Atomic next_id;
@@ -31,7 +32,7 @@ static void assign_memory(Access *access) {
     }
 }
 
-bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const uint32_t *references,
+bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const char *references,
                  size_t count) {
     memset(access, 0, sizeof *access);
     access->fmi = fmi;
@@ -47,7 +48,7 @@ bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const uin
     assign_memory(access);
     for (size_t i = 0; i < count; i++) {
         Group *group = group_of(access, (Type)types[i]);
-        group->references[group->count] = references[i];
+        memcpy(&group->references[group->count], references + i * sizeof(uint32_t), 4);
         group->positions[group->count++] = (uint32_t)i;
     }
     access->direct = access->number_of_groups == 1 && access->groups[0].type == TYPE_FLOAT64;
@@ -137,22 +138,23 @@ static Type stored_type(const Access *access, const Group *group) {
     return group->type == TYPE_BOOLEAN ? boolean : group->type;
 }
 
-static Status worse(Status a, Status b) {
-    return a > b ? a : b;
-}
-
 Status access_get(const Access *access, const Library *library, void *component, double *values,
                   void *typed) {
     const Fmi *fmi = access->fmi;
     const Group *group = access->groups;
+    const Floats floats = floats_now();
     Status worst = STATUS_OK;
 
     if (access->direct) {
-        return fmi->get(library, component, TYPE_FLOAT64, group->references, group->count, values);
+        worst = fmi->get(library, component, TYPE_FLOAT64, group->references, group->count, values);
+        floats_restore(&floats);
+        return worst;
     }
-    for (size_t i = 0; i < access->number_of_groups && worst != STATUS_FATAL; i++, group++) {
-        worst = worse(worst, fmi->get(library, component, group->type, group->references,
-                                      group->count, typed));
+    for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
+        const Status status =
+            fmi->get(library, component, group->type, group->references, group->count, typed);
+        worst = status > worst ? status : worst;
+        floats_restore(&floats);
         load(group, stored_type(access, group), typed, values);
     }
     return worst;
@@ -162,15 +164,20 @@ Status access_set(const Access *access, const Library *library, void *component,
                   const double *values, void *typed) {
     const Fmi *fmi = access->fmi;
     const Group *group = access->groups;
+    const Floats floats = floats_now();
     Status worst = STATUS_OK;
 
     if (access->direct) {
-        return fmi->set(library, component, TYPE_FLOAT64, group->references, group->count, values);
+        worst = fmi->set(library, component, TYPE_FLOAT64, group->references, group->count, values);
+        floats_restore(&floats);
+        return worst;
     }
-    for (size_t i = 0; i < access->number_of_groups && worst != STATUS_FATAL; i++, group++) {
+    for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
         store(group, stored_type(access, group), values, typed);
-        worst = worse(worst, fmi->set(library, component, group->type, group->references,
-                                      group->count, typed));
+        const Status status =
+            fmi->set(library, component, group->type, group->references, group->count, typed);
+        worst = status > worst ? status : worst;
+        floats_restore(&floats);
     }
     return worst;
 }

@@ -22,13 +22,14 @@ typedef struct {
     Group groups[NUMBER_OF_TYPES];
 } Access;
 
-/* Groups the variables by type, in the order in which the types first appear. Returns whether there
- * was enough memory. */
-bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const uint32_t *references,
+/* Groups the variables by type, in the order in which the types first appear. The references are
+ * numbers of 32 bits at any address. Returns whether there was enough memory. */
+bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const char *references,
                  size_t count);
 void access_close(Access *access);
 
-/* Both use typed as scratch memory, of access_scratch bytes, and return the worst status. */
+/* Both use typed as scratch memory, of access_scratch bytes, and return the worst status; after one
+ * worse than a warning no other type is asked. */
 static inline size_t access_scratch(const Access *access) {
     return access->count * sizeof(double);
 }

@@ -7,6 +7,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "floats.h"
 #include "library.h"
 
 /* FMI's own codes, and two of ours; the same values as fmugym.fmi.instance.Status. */
@@ -78,6 +79,7 @@ typedef struct {
     void *const *components;
     const uint32_t *places;
     const double *times;
+    const Floats *floats; /* the environment that each instance shall find */
     const double *inputs;
     double *outputs;
     Outcome *outcomes;
@@ -156,8 +158,10 @@ static inline bool exchange_by(const Fmi *fmi, const Library *library, const Exc
 
     for (size_t i = 0; i < e.count; i++) {
         e.outcomes[i] = exchange_once(fmi, library, &e, i);
+        floats_restore_if_seen(e.floats);
         good &= e.outcomes[i].status == STATUS_OK;
     }
+    floats_restore(e.floats);
     return good;
 }
 

@@ -57,6 +57,8 @@ static void unlink_log(const Log *log) {
 }
 
 void log_close(Log *log) {
+    size_t dropped;
+
     mutex_lock(&lock);
     unlink_log(log);
     mutex_unlock(&lock);
@@ -64,11 +66,9 @@ void log_close(Log *log) {
         forget(log, i);
     }
     free(log->recent);
-    for (Message *message = log->first, *next; message != NULL; message = next) {
-        next = message->next;
-        message_free(message);
-    }
-    memset(log, 0, sizeof *log);
+    log->recent = NULL;
+    log->count = 0;
+    messages_free(log_take(log, &dropped));
 }
 
 uint64_t log_environment(const Log *log, size_t index) {
@@ -79,6 +79,32 @@ void message_free(Message *message) {
     free(message->category);
     free(message->text);
     free(message);
+}
+
+void messages_free(Message *first) {
+    for (Message *message = first, *next; message != NULL; message = next) {
+        next = message->next;
+        message_free(message);
+    }
+}
+
+void log_give_back(Log *log, Message *first, size_t dropped) {
+    Message *last = first;
+
+    mutex_lock(&lock);
+    log->queued += first != NULL;
+    while (last != NULL && last->next != NULL) {
+        last = last->next;
+        log->queued++;
+    }
+    if (last != NULL) {
+        last->next = log->first;
+        log->last = log->first == NULL ? last : log->last;
+        log->first = first;
+    }
+    log->dropped += dropped;
+    atomic_set(&log->pending, log->first != NULL || log->dropped > 0);
+    mutex_unlock(&lock);
 }
 
 Message *log_take(Log *log, size_t *dropped) {

@@ -48,6 +48,9 @@ uint64_t log_environment(const Log *log, size_t index);
 /* Takes all queued messages; the caller frees each. Also tells how many did not fit. */
 Message *log_take(Log *log, size_t *dropped);
 void message_free(Message *message);
+void messages_free(Message *first);
+/* Puts messages that were taken, and the number of those that did not fit, before the others. */
+void log_give_back(Log *log, Message *first, size_t dropped);
 
 /* The recent messages of an instance joined by " | ", to be freed by the caller; NULL if none. */
 char *log_said(Log *log, size_t index);

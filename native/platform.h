@@ -84,6 +84,15 @@ static inline bool atomic_replace(Atomic *a, uint64_t *expected, uint64_t value)
 
 #endif
 
+/* The model of few instructions is fine for a few bytes of a library that is loaded late. */
+#if defined _MSC_VER
+#define THREAD_LOCAL __declspec(thread)
+#elif defined __linux__
+#define THREAD_LOCAL _Thread_local __attribute__((tls_model("initial-exec")))
+#else
+#define THREAD_LOCAL _Thread_local
+#endif
+
 /* Locks and conditions */
 
 #if defined _WIN32
@@ -96,8 +105,14 @@ typedef CONDITION_VARIABLE Condition;
 static inline void mutex_lock(Mutex *m) {
     AcquireSRWLockExclusive(m);
 }
+static inline bool mutex_try_lock(Mutex *m) {
+    return TryAcquireSRWLockExclusive(m) != 0;
+}
 static inline void mutex_unlock(Mutex *m) {
     ReleaseSRWLockExclusive(m);
+}
+static inline void mutex_destroy(Mutex *m) {
+    (void)m;
 }
 static inline void condition_wait(Condition *c, Mutex *m) {
     SleepConditionVariableSRW(c, m, INFINITE, 0);
@@ -119,8 +134,14 @@ typedef pthread_cond_t Condition;
 static inline void mutex_lock(Mutex *m) {
     pthread_mutex_lock(m);
 }
+static inline bool mutex_try_lock(Mutex *m) {
+    return pthread_mutex_trylock(m) == 0;
+}
 static inline void mutex_unlock(Mutex *m) {
     pthread_mutex_unlock(m);
+}
+static inline void mutex_destroy(Mutex *m) {
+    pthread_mutex_destroy(m);
 }
 static inline void condition_wait(Condition *c, Mutex *m) {
     pthread_cond_wait(c, m);

@@ -19,18 +19,24 @@ bool play_has_bad_action(const Turn *turn) {
     return is_any_outside(turn->actions, play->count, play->lowest_action, play->highest_action);
 }
 
-static double *fractions_of(const Draws *d, size_t index) {
-    return d->block + (index * d->episodes + (size_t)d->used[index]) * d->draws;
+static double *block_of(const Draws *d, size_t index) {
+    return d->block + index * d->episodes * d->draws;
+}
+
+/* How many episodes of its block an environment has used; all where there is no such number, as the
+ * memory is the owner's. */
+static size_t used_by(const Draws *d, size_t index) {
+    const uint64_t used = (uint64_t)d->used[index];
+    return used < d->episodes ? (size_t)used : d->episodes;
 }
 
 void play_foresee(const Play *play, size_t index) {
-    prefetch(fractions_of(&play->draws, index));
+    const Draws *d = &play->draws;
+    prefetch(block_of(d, index) + used_by(d, index) * d->draws);
 }
 
-static void draw_ahead(const Draws *d, size_t index) {
-    const Stream *stream = d->streams[index];
-    d->used[index] = 0;
-    double *fractions = fractions_of(d, index);
+static void draw_ahead(const Draws *d, const Stream *stream, size_t index) {
+    double *fractions = block_of(d, index);
 
     for (size_t i = 0; i < d->episodes * d->draws; i++) {
         fractions[i] = stream->next_double(stream->state);
@@ -45,17 +51,19 @@ void play_draw(const Turn *turn, size_t index) {
     if (d->draws == 0) {
         return;
     }
-    if ((size_t)d->used[index] >= d->episodes) {
-        draw_ahead(d, index);
+    size_t used = used_by(d, index);
+    if (used == d->episodes) {
+        draw_ahead(d, turn->streams[index], index);
+        used = 0;
     }
-    const double *fractions = fractions_of(d, index);
+    const double *fractions = block_of(d, index) + used * d->draws;
 
     for (size_t i = 0; i < d->draws; i++) {
         const double scaled = d->width[i] * fractions[i], value = d->low[i] + scaled;
         play->start_values[(size_t)d->rows[i] * play->count + index] = value;
         turn->drawn[i * play->count + index] = value;
     }
-    d->used[index]++;
+    d->used[index] = (int64_t)used + 1;
 }
 
 static Source source_of(const Turn *turn) {
@@ -125,4 +133,9 @@ size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     program_run(&play->judgement, &source, begin, count, scratch->judgement);
     return judge(turn, begin, count, scratch->judgement[results[DONE]],
                  scratch->judgement[results[TRUNCATED]], scratch->judgement[results[REWARD]]);
+}
+
+void play_skip(const Turn *turn, size_t index) {
+    turn->rewards[index] = 0.0;
+    turn->terminated[index] = turn->truncated[index] = 0;
 }

@@ -20,11 +20,10 @@ typedef struct {
 
 /* The draws of an episode: uniform numbers of [0, 1), drawn ahead for each environment. */
 typedef struct {
-    const Stream *const *streams; /* of each environment */
-    size_t draws;                 /* of one episode */
-    size_t episodes;              /* drawn ahead for one environment */
-    double *block;                /* draws for each episode of each environment */
-    int64_t *used;                /* episodes of its block that an environment has used */
+    size_t draws;    /* of one episode */
+    size_t episodes; /* drawn ahead for one environment */
+    double *block;   /* draws for each episode of each environment */
+    int64_t *used;   /* episodes of its block that an environment has used */
     const double *low, *width;
     const int64_t *rows; /* of the start values, one for each draw */
 } Draws;
@@ -47,6 +46,7 @@ typedef struct {
 /* One step of all environments: where its results go. */
 typedef struct {
     const Play *play;
+    const Stream *const *streams; /* of each environment */
     const int64_t *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
@@ -67,6 +67,9 @@ void play_open(const Turn *turn, PlayScratch *scratch);
  * stepped, and after; the second returns how many episodes have ended now. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
+
+/* For an environment that is neither reset nor stepped for want of memory. */
+void play_skip(const Turn *turn, size_t index);
 
 /* Asks for the memory that play_draw will read. */
 void play_foresee(const Play *play, size_t index);

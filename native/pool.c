@@ -8,6 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "floats.h"
 #include "threads.h"
 
 static const double PARALLEL_FROM = 20e3; /* ns of work for which waking a helper pays */
@@ -17,8 +18,6 @@ static const double LARGEST_CHUNK = 50e3; /* ns */
 static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states of one pool */
 
 enum {
-    TRIALS = 5,
-    REHEARSED = 3, /* steps */
     STACK_VALUES = 512,
     RUN = PROGRAM_WIDTH, /* instances of a run */
     MANY = 64,         /* instances from which on every call is measured */
@@ -27,6 +26,36 @@ enum {
 
 static const char *const BAD_INPUTS = "the inputs are not finite";
 static const char *const BAD_OUTPUTS = "the outputs are not finite";
+
+/* Which pools a thread is inside of: an FMU written in Python that calls its own pool gets an error
+ * instead of waiting for itself. */
+
+enum { NESTED = 8 }; /* deeper ones are not noticed */
+
+static THREAD_LOCAL struct {
+    const Pool *pools[NESTED];
+    size_t depth;
+} inside;
+
+static void begin_inside(const Pool *pool) {
+    if (inside.depth < NESTED) {
+        inside.pools[inside.depth] = pool;
+    }
+    inside.depth++;
+}
+
+static void end_inside(void) {
+    inside.depth--;
+}
+
+static bool is_inside(const Pool *pool) {
+    for (size_t i = 0; i < inside.depth && i < NESTED; i++) {
+        if (inside.pools[i] == pool) {
+            return true;
+        }
+    }
+    return false;
+}
 
 /* Failures */
 
@@ -137,15 +166,23 @@ static bool build(Pool *pool, Instance *me) {
     const Identity identity = {name_of(pool, index), s->token, s->resources,
                                log_environment(&pool->log, index), s->logging};
 
+    const Floats floats = floats_now();
+
+    mutex_lock(&pool->making);
     me->component = s->fmi->instantiate(me->library, &identity);
+    mutex_unlock(&pool->making);
+    floats_restore(&floats);
     me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
     return me->component != NULL;
 }
 
 static Status free_state(const Pool *pool, Instance *me, void **state) {
+    const Floats floats = floats_now();
     Status status = STATUS_OK;
+
     if (*state != NULL && me->phase != PHASE_DEAD) {
         status = judge(me, pool->settings.fmi->free_state(me->library, me->component, state));
+        floats_restore(&floats);
     }
     *state = NULL; /* after Fatal the standard forbids to free it: the memory is given up */
     return status;
@@ -166,14 +203,18 @@ static void free_states(Pool *pool, Instance *me) {
 
 static void discard(Pool *pool, Instance *me) {
     const Fmi *fmi = pool->settings.fmi;
+    const Floats floats = floats_now();
 
     free_states(pool, me);
     if (me->phase == PHASE_STEPPING || me->phase == PHASE_ENDED) {
         judge(me, fmi->terminate(me->library, me->component));
     }
     if (me->phase != PHASE_DEAD) {
+        mutex_lock(&pool->making);
         fmi->free_instance(me->library, me->component);
+        mutex_unlock(&pool->making);
     }
+    floats_restore(&floats);
     me->component = NULL;
     me->phase = PHASE_DEAD;
     me->generation++;
@@ -185,42 +226,41 @@ static void discard(Pool *pool, Instance *me) {
 /* A private library may be loaded anew: whatever Fatal left in its globals is gone then. */
 static void reload_private_library(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
+    const Floats floats = floats_now(); /* code runs when a library is loaded, too */
     char unused[256];
 
     if (s->private_libraries) {
         library_close(me->library);
-        if (library_open(me->library, s->paths[index_of(pool, me)], unused, sizeof unused)) {
-            s->fmi->bind(me->library, unused, sizeof unused);
+        if (library_open(me->library, s->paths[index_of(pool, me)], unused, sizeof unused) &&
+            !s->fmi->bind(me->library, unused, sizeof unused)) {
+            library_close(me->library);
         }
     }
+    floats_restore(&floats);
 }
 
-static Status replace(Pool *pool, Instance *me) {
+static Status rebuild(Pool *pool, Instance *me) {
     const bool was_dead = me->phase == PHASE_DEAD;
 
-    health_of(pool, me)[REPLACEMENTS]++;
     discard(pool, me);
-    if (was_dead) {
+    if (was_dead || pool->settings.reloads) {
         reload_private_library(pool, me);
     }
-    if (me->library->functions != NULL && build(pool, me)) {
+    const bool loaded = me->library->functions != NULL;
+    if (loaded && build(pool, me)) {
         return STATUS_OK;
     }
-    Failure *failure = note_failure(me, "the FMU refused to be instantiated anew", -1);
+    Failure *failure = note_failure(me, loaded ? "the FMU refused to be instantiated anew"
+                                               : "the FMU's library cannot be loaded anew", -1);
     if (failure != NULL) {
         failure->said = log_said(&pool->log, index_of(pool, me));
     }
     return STATUS_FATAL;
 }
 
-/* Memory that an instance has leaked may go with it. */
-static Status recycle(Pool *pool, Instance *me) {
-    me->due = false;
-    if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
-        return STATUS_OK;
-    }
-    health_of(pool, me)[RECYCLINGS]++;
-    return replace(pool, me);
+static Status replace(Pool *pool, Instance *me) {
+    health_of(pool, me)[REPLACEMENTS]++;
+    return rebuild(pool, me);
 }
 
 /* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
@@ -230,7 +270,9 @@ static Status return_to_instantiated(Pool *pool, Instance *me) {
         return STATUS_OK;
     }
     if (me->phase != PHASE_DEAD) {
+        const Floats floats = floats_now();
         const Status status = pool->settings.fmi->reset(me->library, me->component);
+        floats_restore(&floats);
         if (status <= STATUS_WARNING) {
             me->phase = PHASE_INSTANTIATED;
             return STATUS_OK;
@@ -270,11 +312,13 @@ static Status fail_step(Pool *pool, Instance *me, double time, Status status) {
 static Status step_in_parts(Pool *pool, Instance *me, double time, int64_t parts) {
     const Settings *s = &pool->settings;
     const double size = pool->step_size / (double)parts;
+    const Floats floats = floats_now();
     Status status = STATUS_OK;
 
     for (int64_t i = 0; i < parts && status <= STATUS_WARNING; i++) {
         status = s->fmi->do_step(me->library, me->component, time + (double)i * size, size,
                                  pool->no_return);
+        floats_restore(&floats);
     }
     return status;
 }
@@ -287,7 +331,9 @@ static Status retry(Pool *pool, Instance *me, double time, void *before) {
     Status status = STATUS_DISCARD;
 
     for (int64_t i = 1; i <= s->retries && status == STATUS_DISCARD; i++) {
+        const Floats floats = floats_now();
         const Status restored = s->fmi->set_state(me->library, me->component, before);
+        floats_restore(&floats);
         if (restored > STATUS_WARNING) {
             return restored;
         }
@@ -300,8 +346,10 @@ static Status retry(Pool *pool, Instance *me, double time, void *before) {
 
 static Status step_with_retries(Pool *pool, Instance *me, double time) {
     void *before = NULL;
+    const Floats floats = floats_now();
     Status status = pool->settings.fmi->get_state(me->library, me->component, &before);
 
+    floats_restore(&floats);
     if (status > STATUS_WARNING) {
         return status;
     }
@@ -356,6 +404,7 @@ typedef struct {
     double *inputs; /* of a run of instances, one after the other */
     double *outputs;
     bool sound;     /* whether these inputs are all finite */
+    const Floats *floats; /* the environment that FMUs shall find */
 } Scratch;
 
 static void copy_outputs(const Pool *pool, const Instance *me, double *values) {
@@ -442,6 +491,7 @@ typedef struct {
 static Status set_start_values(void *context) {
     StartContext *c = context;
     const Settings *s = &c->pool->settings;
+    const Floats floats = floats_now();
     Status status = access_set(c->start, c->me->library, c->me->component, c->scratch.values,
                                c->scratch.typed);
 
@@ -449,6 +499,7 @@ static Status set_start_values(void *context) {
         const StringValue *string = &s->strings[i];
         status = s->fmi->set_string(c->me->library, c->me->component, string->reference,
                                     string->text);
+        floats_restore(&floats);
         c->refused = status > STATUS_WARNING ? string->reference : c->refused;
     }
     return status;
@@ -485,6 +536,7 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     const Settings *s = &pool->settings;
     StartContext context = {pool, me, start, scratch, UINT32_MAX};
     const char *doing = "initialization";
+    const Floats floats = floats_now();
     Status status = return_to_instantiated(pool, me);
 
     if (status > STATUS_WARNING) {
@@ -492,6 +544,7 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     }
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
+    floats_restore(&floats);
     if (status > STATUS_WARNING) {
         return fail_initialization(pool, me, &context, doing, status);
     }
@@ -503,22 +556,15 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
  * restored from then on. */
 
 static bool states_are_of_use(Pool *pool, const Instance *me) {
-    return pool->settings.can_save && !me->unsavable && !atomic_get(&pool->trial.refuted);
-}
-
-static void give_states_up(Pool *pool) {
-    atomic_set(&pool->trial.refuted, 1);
-}
-
-static bool owns_trial(Pool *pool, const Instance *me) {
-    const uint64_t mine = index_of(pool, me) + 1;
-    uint64_t owner = atomic_get(&pool->trial.owner);
-    return owner == mine || (owner == 0 && atomic_replace(&pool->trial.owner, &owner, mine));
+    return pool->settings.restores && !me->unsavable && !atomic_get(&pool->states_too_large);
 }
 
 static Status save_state(Pool *pool, Instance *me, void **state) {
+    const Floats floats = floats_now();
+
     *state = NULL;
     const Status status = pool->settings.fmi->get_state(me->library, me->component, state);
+    floats_restore(&floats);
     return status > STATUS_WARNING ? fail(pool, me, "saving the FMU state", status) : status;
 }
 
@@ -526,7 +572,9 @@ static Status restore_state(Pool *pool, Instance *me, void *state) {
     if (me->phase == PHASE_DEAD) {
         return refuse(me, "no restore after a fatal error");
     }
+    const Floats floats = floats_now();
     const Status status = pool->settings.fmi->set_state(me->library, me->component, state);
+    floats_restore(&floats);
     if (status > STATUS_WARNING) {
         fail(pool, me, "restoring the FMU state", status);
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
@@ -537,72 +585,18 @@ static Status restore_state(Pool *pool, Instance *me, void *state) {
 
 static bool too_large(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
+    const Floats floats = floats_now();
     const size_t size = s->fmi->state_size(me->library, me->component, me->saved);
+    floats_restore(&floats);
     return size > STATES_LIMIT / s->count;
 }
 
-/* Steps with inputs; returns whether that went well. */
-static bool try_steps(Pool *pool, Instance *me, const double *inputs, double *outputs,
-                      void *typed) {
-    const Access *access = pool->settings.outputs;
-    const int64_t before = me->steps;
-
-    atomic_set(&pool->log.muted, index_of(pool, me) + 1); /* nobody has asked for these steps */
-    bool well = access_set(pool->settings.inputs, me->library, me->component, inputs, typed) <=
-                STATUS_WARNING;
-
-    for (size_t i = 0; i < REHEARSED && well; i++, outputs += access->count) {
-        well = advance(pool, me) <= STATUS_WARNING &&
-               access_get(access, me->library, me->component, outputs, typed) <= STATUS_WARNING;
-    }
-    atomic_set(&pool->log.muted, 0);
-    me->steps = before;
-    return well;
-}
-
-/* Steps twice from the kept state, with the inputs that were written last: an FMU may have left a part
- * of its state out. */
-static bool rehearse(Pool *pool, Instance *me, const Matrix *inputs, void *typed) {
-    const size_t width = pool->settings.inputs->count;
-    const size_t size = REHEARSED * pool->settings.outputs->count;
-    double *memory = malloc((width + 2 * size + 1) * sizeof *memory);
-    bool well = memory != NULL;
-
-    if (well) {
-        gather(inputs, index_of(pool, me), width, memory);
-        well = all_finite(memory, width);
-    }
-    for (size_t i = 0; i < 2 && well; i++) {
-        well = try_steps(pool, me, memory, memory + width + i * size, typed) &&
-               restore_state(pool, me, me->saved) <= STATUS_WARNING;
-    }
-    well = well && memcmp(memory + width, memory + width + size, size * sizeof *memory) == 0;
-    free(memory);
-    return well;
-}
-
-static Status keep_state(Pool *pool, Instance *me, uint64_t initialization, const Matrix *inputs,
-                         void *typed) {
-    const Status status = save_state(pool, me, &me->saved);
-
-    if (status > STATUS_WARNING) {
+static void keep_state(Pool *pool, Instance *me) {
+    if (save_state(pool, me, &me->saved) > STATUS_WARNING) {
         me->unsavable = true;
-        return status;
+    } else if (too_large(pool, me)) {
+        atomic_set(&pool->states_too_large, 1);
     }
-    if (!owns_trial(pool, me)) {
-        return STATUS_OK;
-    }
-    pool->trial.initialization = initialization;
-    if (too_large(pool, me)) {
-        give_states_up(pool);
-    } else if (!pool->trial.rehearsed && !rehearse(pool, me, inputs, typed)) {
-        give_states_up(pool);
-        drop_failure(me);
-        free_state(pool, me, &me->saved);
-        return judge(me, STATUS_ERROR); /* to be initialized anew */
-    }
-    pool->trial.rehearsed = true;
-    return STATUS_OK;
 }
 
 static double *start_values_of(const Pool *pool, const Instance *me) {
@@ -618,8 +612,6 @@ static bool starts_as_before(const Pool *pool, const Instance *me, const Access 
 static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
                          Scratch scratch) {
     const Access *start = call->start;
-    const uint64_t began = again ? clock_now() : 0;
-
     free_state(pool, me, &me->saved);
     const Status status = initialize(pool, me, start, scratch);
     if (status > STATUS_WARNING) {
@@ -628,32 +620,10 @@ static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
     again = again && me->start_id == start->id; /* it may have been replaced */
     me->start_id = start->id;
     memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
-    if (!again || !states_are_of_use(pool, me)) {
-        return STATUS_OK;
-    }
-    if (keep_state(pool, me, clock_now() - began, &call->inputs, scratch.typed) <= STATUS_WARNING) {
-        return STATUS_OK;
+    if (again && states_are_of_use(pool, me)) {
+        keep_state(pool, me);
     }
     return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
-}
-
-/* Compares a restored instance with the initialized one; returns whether it may go on so. */
-static bool passes_trial(Pool *pool, Instance *me, uint64_t restoration, Scratch scratch) {
-    Trial *trial = &pool->trial;
-    const size_t size = pool->settings.outputs->count * sizeof(double);
-
-    copy_outputs(pool, me, scratch.values);
-    if (memcmp(scratch.values, trial->outputs, size) != 0) {
-        give_states_up(pool);
-        return false;
-    }
-    if (trial->trials == 0 || restoration < trial->restoration) {
-        trial->restoration = restoration;
-    }
-    if (++trial->trials == TRIALS && trial->restoration > trial->initialization) {
-        give_states_up(pool);
-    }
-    return true;
 }
 
 static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
@@ -663,11 +633,7 @@ static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Sc
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
     begin_counting_at(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    status = read_outputs(pool, me, scratch);
-    if (status == STATUS_OK && me->saved != NULL && owns_trial(pool, me)) {
-        copy_outputs(pool, me, pool->trial.outputs);
-    }
-    return status;
+    return read_outputs(pool, me, scratch);
 }
 
 static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
@@ -682,7 +648,22 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
     return read_outputs(pool, me, scratch);
 }
 
-/* By the cheapest way that gives the same as a fresh instance. */
+/* Makes an instance anew that has leaked memory, or that no reset would make as new. */
+static Status make_anew_if_due(Pool *pool, Instance *me) {
+    const bool due = me->due;
+
+    me->due = false;
+    if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
+        return STATUS_OK;
+    }
+    if (due) {
+        health_of(pool, me)[RECYCLINGS]++;
+        return replace(pool, me);
+    }
+    return pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
+}
+
+/* By the reset method of the settings. */
 static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
     const Access *start = call->start;
     const Matrix *values = &call->start_values;
@@ -691,7 +672,7 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     count_steps(pool, me);
     health_of(pool, me)[RESETS]++;
     health_of(pool, me)[RETRIED] = 0;
-    if (me->due && recycle(pool, me) > STATUS_WARNING) {
+    if (make_anew_if_due(pool, me) > STATUS_WARNING) {
         return STATUS_FATAL;
     }
     gather(values, index_of(pool, me), start->count, scratch.values);
@@ -700,15 +681,11 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
         return restart(pool, me, call, again && stepped, scratch);
     }
-    const bool trying = owns_trial(pool, me) && pool->trial.trials < TRIALS;
-    const uint64_t began = trying ? clock_now() : 0;
     const Status status = return_to_start(pool, me, scratch);
-    const bool refused = me->saved == NULL;
-    if (!refused && (!trying || status > STATUS_WARNING ||
-                     passes_trial(pool, me, clock_now() - began, scratch))) {
+    if (me->saved != NULL) {
         return status;
     }
-    gather(values, index_of(pool, me), start->count, scratch.values);
+    gather(values, index_of(pool, me), start->count, scratch.values); /* it refused */
     return restart(pool, me, call, again, scratch);
 }
 
@@ -986,6 +963,7 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
         .components = line->components,
         .places = line->places,
         .times = line->times,
+        .floats = scratch.floats,
         .inputs = scratch.inputs,
         .outputs = scratch.outputs,
         .outcomes = line->outcomes,
@@ -1061,12 +1039,21 @@ static size_t play_through(Task *task, size_t begin, size_t end, Scratch scratch
     return troubled;
 }
 
-/* Without 16 bytes per value nothing else will work either. */
+/* Without 16 bytes per value nothing else will work either. The caller's arrays are filled all the
+ * same: with what was there before. */
 static size_t give_chunk_up(Task *task, size_t begin, size_t end) {
+    const Call *call = task->call;
+
     for (size_t i = begin; i < end; i++) {
         const size_t index = task->listed ? task->pool->chosen[i] : i;
         refuse(&task->pool->instances[index], "out of memory");
         task->pool->settings.status[index] = STATUS_ERROR;
+        if (call->observations != NULL) {
+            write_observation(task->pool, index, call->observations);
+        }
+        if (call->turn != NULL) {
+            play_skip(call->turn, index);
+        }
     }
     return end - begin;
 }
@@ -1097,8 +1084,9 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     if (memory == NULL) {
         return give_chunk_up(task, begin, end);
     }
+    const Floats floats = floats_now();
     const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in,
-                             true};
+                             true, &floats};
     const size_t troubled = work_with(task, begin, end, scratch);
     if (memory != stack) {
         free(memory);
@@ -1110,8 +1098,10 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
 static void work(void *context, size_t begin, size_t end) {
     Task *task = context;
     const uint64_t began = task->measured ? clock_now() : 0;
-    const size_t troubled = work_with_memory(task, begin, end);
 
+    begin_inside(task->pool);
+    const size_t troubled = work_with_memory(task, begin, end);
+    end_inside();
     if (troubled > 0) {
         atomic_add(&task->troubled, troubled);
     }
@@ -1156,7 +1146,7 @@ static void run(Task *task, double mean, size_t first, size_t count) {
         .work = work_on_rest,
         .context = &rest,
         .count = count - first,
-        .helpers = total < PARALLEL_FROM ? 0 : task->pool->settings.threads - 1,
+        .helpers = total < PARALLEL_FROM || task->call->alone ? 0 : task->pool->settings.threads - 1,
         .smallest = at_least_one(SMALLEST_CHUNK / mean),
         .largest = at_least_one(LARGEST_CHUNK / mean),
     };
@@ -1169,15 +1159,6 @@ static void run_measured(Task *task, Cost *cost, size_t count) {
     if (task->measured) {
         const double mean = (double)atomic_get(&task->time) / (double)count;
         cost->mean += (mean - cost->mean) / 8.0;
-    }
-}
-
-/* Others read it without the lock. */
-static void note_whether_quick(Pool *pool, int operation) {
-    const double total = pool->costs[operation].mean * (double)pool->settings.count;
-    const uint64_t quick = total < QUICK;
-    if (atomic_get(&pool->quick[operation]) != quick) {
-        atomic_set(&pool->quick[operation], quick);
     }
 }
 
@@ -1195,12 +1176,12 @@ static size_t run_task(Task *task, size_t count) {
     } else {
         run_measured(task, cost, count);
     }
-    note_whether_quick(task->pool, task->operation);
     return (size_t)atomic_get(&task->troubled);
 }
 
 bool pool_is_quick(const Pool *pool, int operation) {
-    return atomic_get(&pool->quick[operation]) != 0;
+    const double mean = pool->costs[operation].mean;
+    return mean > 0.0 && mean * (double)pool->settings.count < QUICK;
 }
 
 /* Calls */
@@ -1236,124 +1217,116 @@ static bool make_room_for_starts(Pool *pool, const Access *start) {
     return true;
 }
 
+/* The new start values may need more room than there is. */
+static size_t run_with_starts(Task *task, size_t count) {
+    return make_room_for_starts(task->pool, task->call->start) ? run_task(task, count)
+                                                               : give_chunk_up(task, 0, count);
+}
+
 size_t pool_step(Pool *pool, const Call *call) {
     Task task = {.pool = pool, .call = call, .operation = STEP};
-
-    mutex_lock(&pool->lock);
-    const size_t troubled = run_task(&task, pool->settings.count);
-    mutex_unlock(&pool->lock);
-    return troubled;
+    return run_task(&task, pool->settings.count);
 }
 
 size_t pool_reset(Pool *pool, const Call *call) {
     Task task = {.pool = pool, .call = call, .operation = RESET, .listed = true};
-
-    mutex_lock(&pool->lock);
-    const size_t count = choose(pool, call->mask);
-    const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
-                                                                    : give_chunk_up(&task, 0, count);
-    mutex_unlock(&pool->lock);
-    return troubled;
+    return run_with_starts(&task, choose(pool, call->mask));
 }
 
 size_t pool_step_or_reset(Pool *pool, const Call *call) {
     Task task = {.pool = pool, .call = call, .operation = MIXED};
-    const size_t count = pool->settings.count;
-
-    mutex_lock(&pool->lock);
-    const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
-                                                                    : give_chunk_up(&task, 0, count);
-    mutex_unlock(&pool->lock);
-    return troubled;
+    return run_with_starts(&task, pool->settings.count);
 }
 
 size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
     Task task = {.pool = pool, .call = call, .operation = PLAY};
-    const size_t count = pool->settings.count;
+    const size_t troubled = run_with_starts(&task, pool->settings.count);
 
-    mutex_lock(&pool->lock);
-    const size_t troubled = make_room_for_starts(pool, call->start) ? run_task(&task, count)
-                                                                    : give_chunk_up(&task, 0, count);
-    mutex_unlock(&pool->lock);
     *ended = (size_t)atomic_get(&task.ended);
     return troubled;
 }
 
-size_t pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask) {
-    const Call call = {.mask = mask};
-    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .snapshot = snapshot};
-
-    task.listed = true;
-    mutex_lock(&pool->lock);
-    const size_t troubled = run_task(&task, choose(pool, mask));
-    mutex_unlock(&pool->lock);
-    return troubled;
+/* Reads variables of one instance to a column of values. */
+static Status read_instance(Pool *pool, Instance *me, const Access *access, double *memory,
+                            double *column) {
+    if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
+        return refuse(me, "nothing can be read before a reset has mended the instance");
+    }
+    const Status status =
+        access_get(access, me->library, me->component, memory, memory + access->count);
+    if (status > STATUS_WARNING) {
+        return fail(pool, me, "reading variables", status);
+    }
+    for (size_t i = 0; i < access->count; i++) {
+        column[i * pool->settings.count] = memory[i];
+    }
+    return status;
 }
 
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
-    const size_t count = pool->settings.count;
     double *memory = malloc((2 * access->count + 1) * sizeof *memory);
-    ptrdiff_t failed = memory == NULL ? 0 : -1;
+    ptrdiff_t failed = -1;
 
-    mutex_lock(&pool->lock);
-    for (size_t i = 0; i < count && failed < 0; i++) {
+    if (memory == NULL) {
+        refuse(&pool->instances[0], "out of memory");
+        return 0;
+    }
+    for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
         Instance *me = &pool->instances[i];
-        if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
-            refuse(me, "nothing can be read before a reset has mended the instance");
+        if (read_instance(pool, me, access, memory, values + i) > STATUS_WARNING) {
             failed = (ptrdiff_t)i;
-            break;
-        }
-        const Status status =
-            access_get(access, me->library, me->component, memory, memory + access->count);
-        if (status > STATUS_WARNING) {
-            fail(pool, me, "reading variables", status);
-            failed = (ptrdiff_t)i;
-        }
-        for (size_t j = 0; j < access->count; j++) {
-            values[j * count + i] = memory[j];
         }
     }
-    mutex_unlock(&pool->lock);
     free(memory);
     return failed;
 }
 
 bool pool_failure(Pool *pool, size_t index, Failure *copy) {
-    mutex_lock(&pool->lock);
     const Failure *failure = pool->instances[index].failure;
+
     if (failure != NULL) {
         *copy = *failure;
         copy->said = copy_text(failure->said);
         copy->values = copy_values(failure->values, failure->number_of_values);
     }
-    mutex_unlock(&pool->lock);
     return failure != NULL;
 }
 
 void pool_count_steps(Pool *pool) {
-    mutex_lock(&pool->lock);
     for (size_t i = 0; i < pool->settings.count; i++) {
         count_steps(pool, &pool->instances[i]);
     }
-    mutex_unlock(&pool->lock);
 }
 
 void pool_recycle(Pool *pool) {
-    mutex_lock(&pool->lock);
     for (size_t i = 0; i < pool->settings.count; i++) {
         pool->instances[i].due = true;
     }
-    mutex_unlock(&pool->lock);
 }
 
 /* Snapshots */
 
-bool snapshot_open(Snapshot *snapshot, size_t count) {
-    memset(snapshot, 0, sizeof *snapshot);
+Snapshot *snapshot_new(size_t count) {
+    Snapshot *snapshot = calloc(1, sizeof *snapshot);
+
+    if (snapshot == NULL) {
+        return NULL;
+    }
     snapshot->states = calloc(count, sizeof *snapshot->states);
     snapshot->steps = calloc(count, sizeof *snapshot->steps);
     snapshot->generations = calloc(count, sizeof *snapshot->generations);
-    return snapshot->states != NULL && snapshot->steps != NULL && snapshot->generations != NULL;
+    if (snapshot->states == NULL || snapshot->steps == NULL || snapshot->generations == NULL) {
+        snapshot_free(snapshot);
+        return NULL;
+    }
+    return snapshot;
+}
+
+void snapshot_free(Snapshot *snapshot) {
+    free(snapshot->states);
+    free(snapshot->steps);
+    free(snapshot->generations);
+    free(snapshot);
 }
 
 static bool is_own(const Pool *pool, const Snapshot *snapshot, size_t index) {
@@ -1370,25 +1343,39 @@ static void unlink_snapshot(Pool *pool, const Snapshot *snapshot) {
     }
 }
 
-static void free_own_states(Pool *pool, Snapshot *snapshot) {
-    mutex_lock(&pool->lock);
+/* The states of a closed pool went with its instances. */
+static void drop_snapshot(Pool *pool, Snapshot *snapshot) {
     unlink_snapshot(pool, snapshot);
     for (size_t i = 0; i < pool->settings.count && pool->open; i++) {
         if (is_own(pool, snapshot, i)) {
             free_state(pool, &pool->instances[i], &snapshot->states[i]);
         }
     }
-    mutex_unlock(&pool->lock);
+    snapshot_free(snapshot);
 }
 
-void snapshot_close(Snapshot *snapshot) {
-    if (snapshot->pool != NULL) {
-        free_own_states(snapshot->pool, snapshot);
+static void drop_abandoned(Pool *pool) {
+    if (!atomic_get(&pool->abandoned)) {
+        return;
     }
-    free(snapshot->states);
-    free(snapshot->steps);
-    free(snapshot->generations);
-    memset(snapshot, 0, sizeof *snapshot);
+    atomic_set(&pool->abandoned, 0); /* before the look at the snapshots: no later one is missed */
+    for (Snapshot *snapshot = pool->snapshots, *next; snapshot != NULL; snapshot = next) {
+        next = snapshot->next;
+        if (atomic_get(&snapshot->abandoned)) {
+            drop_snapshot(pool, snapshot);
+        }
+    }
+}
+
+/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the next
+ * one inside finds it. */
+void pool_abandon(Pool *pool, Snapshot *snapshot) {
+    atomic_set(&snapshot->abandoned, 1);
+    atomic_set(&pool->abandoned, 1);
+    if (mutex_try_lock(&pool->lock)) {
+        begin_inside(pool);
+        pool_leave(pool);
+    }
 }
 
 static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
@@ -1405,33 +1392,30 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
 }
 
 ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot) {
-    ptrdiff_t failed = -1;
-
-    mutex_lock(&pool->lock);
-    snapshot->pool = pool;
+    pool->no_return = false;
     snapshot->next = pool->snapshots;
     pool->snapshots = snapshot;
-    for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
+    for (size_t i = 0; i < pool->settings.count; i++) {
         if (save_instance(pool, &pool->instances[i], snapshot) > STATUS_WARNING) {
-            failed = (ptrdiff_t)i;
+            drop_snapshot(pool, snapshot);
+            return (ptrdiff_t)i;
         }
     }
-    mutex_unlock(&pool->lock);
-    return failed;
+    return -1;
 }
 
-ptrdiff_t pool_find_foreign(Pool *pool, const Snapshot *snapshot, Mask mask) {
-    ptrdiff_t foreign = -1;
+bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled) {
+    const Call call = {.mask = mask};
+    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .snapshot = snapshot};
 
-    mutex_lock(&pool->lock);
-    for (size_t i = 0; i < pool->settings.count && foreign < 0; i++) {
-        const bool chosen = mask.data == NULL || is_in(mask, i);
-        if (chosen && (snapshot->pool != pool || !is_own(pool, snapshot, i))) {
-            foreign = (ptrdiff_t)i;
+    for (size_t i = 0; i < pool->settings.count; i++) {
+        if ((mask.data == NULL || is_in(mask, i)) && !is_own(pool, snapshot, i)) {
+            return false;
         }
     }
-    mutex_unlock(&pool->lock);
-    return foreign;
+    task.listed = true;
+    *troubled = run_task(&task, choose(pool, mask));
+    return true;
 }
 
 /* Opening and closing */
@@ -1457,18 +1441,21 @@ static void unlink_pool(const Pool *pool) {
     mutex_unlock(&list_lock);
 }
 
+static size_t number_of_libraries(const Settings *s) {
+    return s->private_libraries ? s->count : 1;
+}
+
 static bool allocate(Pool *pool) {
     const Settings *s = &pool->settings;
 
     pool->name_size = strlen(s->model) + sizeof "_4294967295_4294967295";
-    pool->libraries = calloc(s->private_libraries ? s->count : 1, sizeof *pool->libraries);
+    pool->libraries = calloc(number_of_libraries(s), sizeof *pool->libraries);
     pool->instances = calloc(s->count, sizeof *pool->instances);
     pool->names = calloc(s->count, pool->name_size);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
-    pool->trial.outputs = calloc(s->outputs->count + 1, sizeof *pool->trial.outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
-           pool->chosen != NULL && pool->starts != NULL && pool->trial.outputs != NULL;
+           pool->chosen != NULL && pool->starts != NULL;
 }
 
 static void prepare_instance(Pool *pool, size_t index) {
@@ -1478,20 +1465,20 @@ static void prepare_instance(Pool *pool, size_t index) {
     snprintf(pool->names + index * pool->name_size, pool->name_size, "%s_%u_%zu", s->model,
              (unsigned)pool->log.id, index);
     me->library = &pool->libraries[s->private_libraries ? index : 0];
-    me->phase = PHASE_DEAD;
 }
 
 static bool load_libraries(Pool *pool, char *error, size_t size) {
     const Settings *s = &pool->settings;
+    const Floats floats = floats_now();
+    bool loaded = true;
 
-    for (size_t i = 0; i < (s->private_libraries ? s->count : 1); i++) {
+    for (size_t i = 0; i < number_of_libraries(s) && loaded; i++) {
         pool->libraries[i].identifier = s->model;
-        if (!library_open(&pool->libraries[i], s->paths[i], error, size) ||
-            !s->fmi->bind(&pool->libraries[i], error, size)) {
-            return false;
-        }
+        loaded = library_open(&pool->libraries[i], s->paths[i], error, size) &&
+                 s->fmi->bind(&pool->libraries[i], error, size);
     }
-    return true;
+    floats_restore(&floats);
+    return loaded;
 }
 
 static bool build_all(Pool *pool, char *error, size_t size) {
@@ -1510,12 +1497,14 @@ static bool build_all(Pool *pool, char *error, size_t size) {
 bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     memset(pool, 0, sizeof *pool);
     mutex_reset(&pool->lock);
+    mutex_reset(&pool->making);
     pool->settings = *settings;
     pool->step_size = settings->time_step / (double)settings->substeps;
-    pool->no_return = !settings->can_save;
+    pool->no_return = !settings->restores && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
                    settings->outputs->direct;
     pool->open = true;
+    link_pool(pool);
     snprintf(error, size, "out of memory");
     if (!log_open(&pool->log, settings->count) || !allocate(pool)) {
         return false;
@@ -1523,45 +1512,73 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     for (size_t i = 0; i < settings->count; i++) {
         prepare_instance(pool, i);
     }
-    link_pool(pool);
     return load_libraries(pool, error, size) && build_all(pool, error, size);
 }
 
+/* As many as were made before memory ran out. */
 static void free_instances(Pool *pool) {
     const Settings *s = &pool->settings;
+    const Floats floats = floats_now();
 
     for (size_t i = 0; i < s->count && pool->instances != NULL; i++) {
         discard(pool, &pool->instances[i]);
         drop_failure(&pool->instances[i]);
     }
-    for (size_t i = 0; i < (s->private_libraries ? s->count : 1) && pool->libraries != NULL; i++) {
+    for (size_t i = 0; i < number_of_libraries(s) && pool->libraries != NULL; i++) {
         library_close(&pool->libraries[i]);
     }
-}
-
-static void forget_snapshots(Pool *pool) {
-    for (Snapshot *snapshot = pool->snapshots, *next; snapshot != NULL; snapshot = next) {
-        next = snapshot->next;
-        snapshot->pool = NULL;
-        snapshot->next = NULL;
-    }
-    pool->snapshots = NULL;
+    floats_restore(&floats);
 }
 
 void pool_close(Pool *pool) {
-    mutex_lock(&pool->lock);
-    if (pool->open) {
-        pool->open = false;
-        free_instances(pool);
-        forget_snapshots(pool);
-        free(pool->libraries);
-        free(pool->instances);
-        free(pool->starts);
-        free(pool->names);
-        free(pool->chosen);
-        free(pool->trial.outputs);
-        unlink_pool(pool);
+    drop_abandoned(pool);
+    free_instances(pool);
+    pool->open = false;
+    free(pool->libraries);
+    free(pool->instances);
+    free(pool->starts);
+    free(pool->names);
+    free(pool->chosen);
+    unlink_pool(pool);
+}
+
+void pool_dispose(Pool *pool) {
+    while (pool->snapshots != NULL) {
+        drop_snapshot(pool, pool->snapshots);
     }
+    mutex_destroy(&pool->lock);
+    mutex_destroy(&pool->making);
+}
+
+/* Entering */
+
+static Entry enter_locked(Pool *pool) {
+    if (!pool->open) {
+        mutex_unlock(&pool->lock);
+        return ENTRY_CLOSED;
+    }
+    begin_inside(pool);
+    return ENTRY_ENTERED;
+}
+
+Entry pool_try_enter(Pool *pool) {
+    if (is_inside(pool)) {
+        return ENTRY_INSIDE;
+    }
+    return mutex_try_lock(&pool->lock) ? enter_locked(pool) : ENTRY_BUSY;
+}
+
+Entry pool_enter(Pool *pool) {
+    if (is_inside(pool)) {
+        return ENTRY_INSIDE;
+    }
+    mutex_lock(&pool->lock);
+    return enter_locked(pool);
+}
+
+void pool_leave(Pool *pool) {
+    drop_abandoned(pool);
+    end_inside();
     mutex_unlock(&pool->lock);
 }
 
@@ -1585,6 +1602,7 @@ static void after_fork_in_child(void) {
     threads_reset();
     for (Pool *pool = pools; pool != NULL; pool = pool->next) {
         mutex_reset(&pool->lock);
+        mutex_reset(&pool->making);
     }
 }
 

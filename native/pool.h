@@ -1,7 +1,9 @@
 /* N instances of one FMU: stepped, reset, saved and restored without Python.
  *
- * The pool writes outputs and statuses into memory of its owner. Every function may be called from
- * any thread; calls for one pool wait for each other. */
+ * The pool writes outputs and statuses into memory of its owner. Calls may come from any thread:
+ * each begins with pool_enter or pool_try_enter and ends with pool_leave, so that the calls for one
+ * pool take turns. Whoever holds the GIL must not wait for a pool, as the thread inside may need it;
+ * that is what pool_try_enter is for. */
 
 #ifndef FMUGYM_POOL_H
 #define FMUGYM_POOL_H
@@ -27,6 +29,9 @@ typedef struct {
     bool private_libraries;   /* whether there is one for each instance */
     bool logging;
     bool can_save;
+    bool restores; /* whether episodes begin by a restored state where the start values are the same */
+    bool rebuilds; /* whether each episode begins with a new instance, */
+    bool reloads;  /* and with its private library loaded anew */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -60,11 +65,11 @@ enum {
 };
 
 typedef enum {
+    PHASE_DEAD, /* after Fatal, or where there is no instance: no call is legal */
     PHASE_INSTANTIATED,
     PHASE_STEPPING,
-    PHASE_ENDED,  /* after a step that was not done: reading and a reset are legal */
-    PHASE_FAILED, /* after Error: a reset is legal */
-    PHASE_DEAD    /* after Fatal, or where there is no instance: no call is legal */
+    PHASE_ENDED, /* after a step that was not done: reading and a reset are legal */
+    PHASE_FAILED /* after Error: a reset is legal */
 } Phase;
 
 /* Why the last status was worse than a warning. */
@@ -94,8 +99,8 @@ typedef struct {
 } Instance; /* of 64 bytes */
 
 typedef struct Snapshot {
-    struct Snapshot *next;
-    struct Pool *pool; /* NULL once the pool is closed */
+    struct Snapshot *next; /* in the list of the pool's snapshots */
+    Atomic abandoned;      /* whether the pool is to free it */
     void **states;
     int64_t *steps;
     uint32_t *generations;
@@ -109,18 +114,6 @@ typedef struct {
 
 enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
 
-/* The first instance that saves its initial state finds out whether that was a good idea: whether
- * the FMU comes out the same, sooner, and small enough. */
-typedef struct {
-    Atomic owner; /* its index + 1 */
-    Atomic refuted;
-    bool rehearsed; /* whether steps from a restored state were found to be the same */
-    size_t trials;
-    uint64_t initialization; /* shortest times, ns */
-    uint64_t restoration;
-    double *outputs; /* after the initialization */
-} Trial;
-
 typedef struct Pool {
     struct Pool *next; /* in the list of all pools */
     Settings settings;
@@ -128,6 +121,7 @@ typedef struct Pool {
     bool no_return;   /* whether no state will ever be restored */
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
+    Mutex making; /* held while an instance is made or freed: FMUs keep lists of theirs */
     bool open;
     Log log;
     Library *libraries;
@@ -138,9 +132,9 @@ typedef struct Pool {
     size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
+    Atomic abandoned; /* whether any of these has been abandoned */
     Cost costs[OPERATIONS];
-    Atomic quick[OPERATIONS]; /* whether a call is short */
-    Trial trial;
+    Atomic states_too_large;
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */
@@ -163,14 +157,35 @@ typedef struct {
     Matrix start_values;
     float *observations; /* one row of num_observed for each instance, or NULL */
     const Turn *turn;    /* what surrounds the steps, or NULL */
+    bool alone;          /* whether no other thread may help */
 } Call;
 
 /* To be called once per process. */
 void pool_prepare_process(void);
 
-/* Returns whether all could be loaded and instantiated; if not, error tells why and the pool is
- * closed, with its log still open. */
+/* Returns whether all could be loaded and instantiated; if not, error tells why, and the pool must be
+ * closed. Only pool_open and pool_dispose need no pool_enter. */
 bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size);
+
+/* Frees what a closed pool still has. Nobody may use it any more. */
+void pool_dispose(Pool *pool);
+
+typedef enum {
+    ENTRY_ENTERED, /* pool_leave is due */
+    ENTRY_BUSY,    /* another thread is inside */
+    ENTRY_CLOSED,
+    ENTRY_INSIDE /* this thread is inside: an FMU has called its own pool */
+} Entry;
+
+/* Waits for its turn, so never returns ENTRY_BUSY. */
+Entry pool_enter(Pool *pool);
+/* Returns at once. */
+Entry pool_try_enter(Pool *pool);
+void pool_leave(Pool *pool);
+
+/* All functions from here on are for those inside. */
+
+/* Frees all instances; the pool is closed for everyone who enters later. */
 void pool_close(Pool *pool);
 
 /* Whether a call is known to be so short that nobody will mind waiting for it. */
@@ -186,7 +201,7 @@ void pool_count_steps(Pool *pool);
 /* Lets each instance be replaced by a new one at its next reset. */
 void pool_recycle(Pool *pool);
 
-/* All three return how many of the instances have a status worse than a warning now. */
+/* These return how many of the instances have a status worse than a warning now. */
 
 /* Steps all instances but those in the mask; writes all observations. */
 size_t pool_step(Pool *pool, const Call *call);
@@ -194,20 +209,27 @@ size_t pool_step(Pool *pool, const Call *call);
 size_t pool_reset(Pool *pool, const Call *call);
 /* Starts those in the mask anew and steps the others; writes all observations. */
 size_t pool_step_or_reset(Pool *pool, const Call *call);
-
 /* Starts those anew whose episode has ended and steps the others, with the turn's programs before
  * and after; writes all observations and how many episodes have ended now. */
 size_t pool_play(Pool *pool, const Call *call, size_t *ended);
 
-/* These return the index of the first instance that fails, or -1. */
-ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);
-ptrdiff_t pool_find_foreign(Pool *pool, const Snapshot *snapshot, Mask mask);
+/* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 
-/* Returns how many have a status worse than a warning now. */
-size_t pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask);
+/* Snapshots. A new one belongs to the pool that saves its states to it. */
 
-bool snapshot_open(Snapshot *snapshot, size_t count);
-void snapshot_close(Snapshot *snapshot);
+Snapshot *snapshot_new(size_t count); /* NULL without memory */
+/* For one that no pool has. */
+void snapshot_free(Snapshot *snapshot);
+/* Returns the index of the first instance that fails, or -1; then the snapshot has been freed or
+ * belongs to the pool. */
+ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);
+/* Returns whether all instances in the mask are those that were saved, and how many of them have a
+ * status worse than a warning now. */
+bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled);
+
+/* Frees a pool's snapshot, now or once the thread inside the pool leaves. Waits for nobody and may be
+ * called from anywhere, so also inside. */
+void pool_abandon(Pool *pool, Snapshot *snapshot);
 
 #endif

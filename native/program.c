@@ -5,6 +5,7 @@
 
 #include "platform.h"
 
+/* Those that are registers. */
 static size_t number_of_operands(uint16_t operation) {
     if (operation <= LOAD_CONSTANT) {
         return 0;
@@ -27,15 +28,30 @@ static bool load_is_sound(const Program *program, const Source *source, Instruct
         return i.operands[0] < source->number_of_parameters;
     case LOAD_CONSTANT:
         return i.operands[0] < program->number_of_constants;
+    case LOAD_ACTION:
+    case LOAD_STEP_COUNT:
+        return i.operands[0] == 0;
     default:
         return true;
     }
 }
 
+/* Operands that an operation does not have are 0, so that they name a register that is there. */
+static bool rest_is_zero(Instruction i) {
+    const size_t used = i.operation <= LOAD_CONSTANT ? 1 : number_of_operands(i.operation);
+    uint16_t rest = 0;
+
+    for (size_t k = used; k < 3; k++) {
+        rest |= i.operands[k];
+    }
+    return rest == 0;
+}
+
 static bool instruction_is_sound(const Program *program, const Source *source, size_t place) {
     const Instruction i = program->code[place];
 
-    if (i.operation >= NUMBER_OF_OPERATIONS || !load_is_sound(program, source, i)) {
+    if (i.operation >= NUMBER_OF_OPERATIONS || !load_is_sound(program, source, i) ||
+        !rest_is_zero(i)) {
         return false;
     }
     for (size_t k = 0; k < number_of_operands(i.operation); k++) {
@@ -166,7 +182,6 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
         if (i.operation <= LOAD_CONSTANT) {
             load(source, i, begin, count, registers[place]);
         } else {
-            /* operands that an operation does not have are 0: register 0 is always there */
             compute(i.operation, registers[i.operands[0]], registers[i.operands[1]],
                     registers[i.operands[2]], registers[place]);
         }

@@ -11,9 +11,9 @@
 
 #include "threads.h"
 
-#include <fenv.h>
 #include <string.h>
 
+#include "floats.h"
 #include "platform.h"
 
 #if !defined _WIN32
@@ -41,7 +41,7 @@ typedef struct {
     Atomic waiting; /* whether the caller sleeps */
     /* constant from the opening of the tickets until all is done */
     Job job;
-    fenv_t environment;
+    Floats floats; /* of the caller */
     Mutex lock;
     Condition finished;
     char padding[64];
@@ -106,7 +106,7 @@ static void take_range(Slot *slot, size_t range, bool helper, uint64_t *epoch) {
         }
         if (helper && *epoch != ticket >> 32) {
             *epoch = ticket >> 32;
-            fesetenv(&slot->environment);
+            floats_restore(&slot->floats);
         }
         const size_t count = (size_t)atomic_get(&slot->count);
         slot->job.work(slot->job.context, begin, begin + size);
@@ -211,17 +211,28 @@ static void *helper_entry(void *number) {
     return NULL;
 }
 
-/* Signals are for the threads that were there before. */
+/* Signals are for the threads that were there before, except those of a thread's own faults: if they
+ * are blocked, the system ends the process without a word from any handler. */
+static void block_signals(sigset_t *before) {
+    static const int faults[] = {SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGABRT, SIGTRAP, SIGSYS};
+    sigset_t blocked;
+
+    sigfillset(&blocked);
+    for (size_t i = 0; i < sizeof faults / sizeof *faults; i++) {
+        sigdelset(&blocked, faults[i]);
+    }
+    pthread_sigmask(SIG_SETMASK, &blocked, before);
+}
+
 static bool start_helper(size_t number) {
     pthread_attr_t attributes;
     pthread_t thread;
-    sigset_t all, before;
+    sigset_t before;
 
     pthread_attr_init(&attributes);
     pthread_attr_setstacksize(&attributes, STACK_SIZE);
     pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
-    sigfillset(&all);
-    pthread_sigmask(SIG_SETMASK, &all, &before);
+    block_signals(&before);
     const bool made = pthread_create(&thread, &attributes, helper_entry,
                                      (void *)(uintptr_t)number) == 0;
     pthread_sigmask(SIG_SETMASK, &before, NULL);
@@ -276,7 +287,7 @@ static void open_slot(Slot *slot, const Job *job) {
         atomic_set(&slot->tickets[i], epoch << 32 | CLOSED);
     }
     slot->job = *job;
-    fegetenv(&slot->environment);
+    slot->floats = floats_now();
     atomic_set(&slot->limit, job->helpers);
     atomic_set(&slot->smallest, job->smallest);
     atomic_set(&slot->largest, job->largest);

@@ -42,7 +42,7 @@ def one_step(env):
     env.step(0.0)
 
 
-@pytest.mark.parametrize("value", ODD, ids=lambda value: repr(value)[:30])
+@pytest.mark.parametrize("value", ODD, ids=lambda value: type(value).__name__)
 @pytest.mark.parametrize("name", HOOKS)
 def test_what_is_of_no_use_is_refused_with_the_name_of_the_hook(make_env, name, value):
     method = f"_{name}"

@@ -239,13 +239,19 @@ class TestRefused:
         edits["</fmiModelDescription>"] = "</VendorAnnotations></fmiModelDescription>"
         refused(probe_fmu(tmp_path, 1, edits), "no co-simulation interface")
 
+    @pytest.mark.parametrize("version", MAJOR_VERSIONS)
     @pytest.mark.parametrize(
-        "identifier", ["../../x", "/tmp/x", "a b", "", "1x", "x.so", "x\u00e4", "a\nb"]
+        "identifier", ["../../x", "/tmp/x", "a\\b", "c:x", "", ".", "..", "a\nb", "x" * 300]
     )
-    def test_a_model_identifier_that_is_a_path(self, tmp_path, identifier):
+    def test_a_model_identifier_that_is_a_path(self, tmp_path, identifier, version):
         text = identifier.replace("\n", "&#10;")
         edits = {'modelIdentifier="Probe"': f'modelIdentifier="{text}"'}
-        refused(probe_fmu(tmp_path, 2, edits), "is not a C identifier")
+        refused(probe_fmu(tmp_path, version, edits), "the modelIdentifier is .*expected the name")
+
+    @pytest.mark.parametrize("identifier", ["a b", "1x", "x.so", "x\u00e4", "a-b"])
+    def test_functions_of_fmi_1_begin_with_the_model_identifier(self, tmp_path, identifier):
+        edits = {'modelIdentifier="Probe"': f'modelIdentifier="{identifier}"'}
+        refused(probe_fmu(tmp_path, 1, edits), "expected a C identifier")
 
     @pytest.mark.parametrize(
         "xml",

@@ -191,6 +191,18 @@ SPECIMENS = (
     dies("overflows its stack", "signal SIGSEGV", fault="overflow"),
     Specimen("loops for ever", Outcome("hangs"), LATE, fault="loop", versions=(1, 3)),
     Specimen("sleeps for ever", Outcome("hangs"), LATE, fault="sleep", versions=(2,)),
+    dies(
+        "forks a process, which lives on, and crashes",
+        "signal SIGSEGV",
+        fault="fork_and_crash",
+    ),
+    Specimen(
+        "forks a process and loops for ever",
+        Outcome("hangs"),
+        LATE,
+        fault="fork_and_loop",
+        versions=(2,),
+    ),
     Specimen(
         "crashes in a constructor of its library",
         TRIED,
@@ -318,6 +330,7 @@ SPECIMENS = (
         Outcome("truncated", "in a step"),
         fault="close_others",
     ),
+    same("forks a process, which lives on", FINE, fault="fork"),
     survives("leaks in each step", "memory", fault="leak", at=0, rounds=10),
     survives(
         "leaks in each reset", "memory", fault="leak", calls=("reset",), rounds=10, versions=(1,)

@@ -1,4 +1,4 @@
-"""Where the FMUs that come with the package are."""
+"""The FMUs that come with the package."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def bundled_fmu(model: str, fmi_version: str | float = "2.0") -> Path:
 
     Args:
         model: One of ``MODELS``.
-        fmi_version: One of ``FMI_VERSIONS``, as text or number; "2.0" or "3.0" for the double
-            pendulum.
+        fmi_version: One of ``FMI_VERSIONS``, as text or number. The double pendulum has only "2.0"
+            and "3.0".
 
     Returns:
         The path of the FMU.
 
     Raises:
-        ConfigError: If there is no such model or version, or the model not in this version.
+        ConfigError: If there is no such model or version, or no such model in this version.
     """
     is_number = isinstance(fmi_version, int | float)
     version = str(number_of("fmi_version", fmi_version)) if is_number else fmi_version
@@ -55,5 +55,5 @@ def bundled_fmu(model: str, fmi_version: str | float = "2.0") -> Path:
 
 
 def is_bundled(path: Path) -> bool:
-    """Whether an FMU is one of those that come with the package."""
+    """Whether an FMU comes with the package."""
     return any(path.is_relative_to(folder) for folder in _FOLDERS)

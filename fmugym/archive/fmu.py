@@ -1,4 +1,4 @@
-"""An FMU file: opened once, checked, extracted to a folder of its own and cleaned up.
+"""An FMU file: it is opened once, checked, extracted to its own folder and cleaned up.
 
 Reading the description never executes the FMU. Loading it (``fmugym.fmi``, ``fmugym.pool``) does:
 an FMU is native code that runs with all the rights of the process.
@@ -10,35 +10,39 @@ import logging
 import math
 import os
 import weakref
-import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path, PurePosixPath
-from typing import BinaryIO, Final, cast
+from pathlib import Path
+from typing import Final
 
 import fmpy
 
-from fmugym.archive.description import ModelDescription, Variable, read_model_description
-from fmugym.archive.safe_zip import ZIP_ERRORS, ArchiveLimits, checked_entries
-from fmugym.archive.shared_library import check_library, load_globally, missing_libraries
+from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.executable import check_library
+from fmugym.archive.loader import ask_in_a_child
+from fmugym.archive.packages import describe_missing
+from fmugym.archive.reading import read_model_description
+from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.temporary import make_folder, remove_folder
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError, FMULoadError, shown
+from fmugym.errors import ConfigError, FMULoadError, printable, shown
 
 __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_PROBE_TIMEOUT: Final = 60.0
-"""Seconds that the trial of an unknown FMU may take, the start of its process included."""
+"""Seconds that the trial of an unknown FMU may take, including the start of its process."""
 
-_NEVER_NEEDED = {"documentation", "sources"}
+_NEVER_NEEDED: Final = {"documentation", "sources"}
+_MOST_FINDINGS: Final = 20
+"""Findings that the log repeats; ``FMU.findings`` has all."""
 
 
 class LoadableFMU(ABC):
-    """What a pool needs to know of an FMU in order to load it.
+    """What a pool needs in order to load an FMU.
 
     Args:
         path: The ``.fmu`` file.
@@ -61,7 +65,7 @@ class LoadableFMU(ABC):
 
     @property
     def library(self) -> str:
-        """The name inside the archive of the library that this machine needs."""
+        """The place of the library for this machine, relative to the folder of ``extract``."""
         file_name = self.description.model_identifier + fmpy.sharedLibraryExtension
         return f"binaries/{self.platform}/{file_name}"
 
@@ -71,34 +75,34 @@ class LoadableFMU(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Remove what ``extract`` has made; calling it again is fine."""
+        """Remove what ``extract`` has made; more than one call is fine."""
 
     def prepare_library(self) -> Path:
         """Make the FMU's library ready to be loaded into this process.
 
-        Loads the libraries of ``preload`` and looks for those that the FMU's library needs.
+        Loads the libraries of ``preload`` and those that the FMU brings along where the loader
+        does not look, and finds out which others are missing.
 
         Returns:
             The path of the library, in the folder of ``extract``.
 
         Raises:
-            FMULoadError: As ``extract``; or if a library of ``preload`` cannot be loaded, or
-                others are missing.
+            FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
+                are missing.
         """
         library = self.extract() / self.library
         for path in self.preload:
             load_globally(path)
         missing = missing_libraries(library)
         if missing:
-            raise FMULoadError(
-                f"{self.path.name} needs shared libraries that are not found here: "
-                f"{', '.join(missing)}; install them, or name their files in preload=[...]"
-            )
+            raise FMULoadError(describe_missing(self.path.name, missing))
+        for stray in stray_libraries(library):
+            load_globally(str(stray))
         return library
 
 
 class ExtractedFMU(LoadableFMU):
-    """An FMU in a folder that belongs to somebody else and stays when this object is closed.
+    """An FMU in a folder that somebody else owns, and that stays when this object is closed.
 
     Args:
         path: The ``.fmu`` file.
@@ -127,14 +131,16 @@ class FMU(LoadableFMU):
     Args:
         path: The ``.fmu`` file.
         limits: What is too large to be opened; by default ``ArchiveLimits()``.
-        preload: Shared libraries to be loaded before the FMU's, for symbols or libraries that it
-            does not find by itself: paths, or names that the system's loader finds.
-        probe_timeout: Seconds that an FMU which is not known yet may take for a first load and step
-            in a process of its own; None to go without. See ``fmugym.trial``.
+        preload: Shared libraries to load before the FMU's, which may need them: paths, or names
+            that the system's loader finds.
+        probe_timeout: Seconds that the first load and step of an unknown FMU may take in a process
+            of its own; None to do without. See ``fmugym.trial``.
 
     Attributes:
         path: The file's absolute path.
         description: The model description.
+        findings: What breaks rules of the standard in the archive and in the model description,
+            as texts.
         limits, preload, probe_timeout: As given; ``preload`` a tuple with absolute paths.
 
     Raises:
@@ -157,21 +163,26 @@ class FMU(LoadableFMU):
         _check_probe_timeout(probe_timeout)
         self.probe_timeout = probe_timeout
         libraries = _absolute(preload)
-        self._entries = checked_entries(file, self.limits)
-        super().__init__(file, read_model_description(file, self.limits), libraries)
+        self._archive = SafeZip(file, self.limits)
+        super().__init__(file, read_model_description(self._archive, self.limits), libraries)
+        self._library_place, note = find_library(list(self._archive.files), self.library)
+        self.findings = (*self._archive.notes, *note, *self.description.findings)
         self._folder: Path | None = None
         self._remove_folder: weakref.finalize[..., FMU] | None = None
-        if self.description.findings:
+        self._log_findings()
+
+    def _log_findings(self) -> None:
+        if self.findings:
             logger.info(
-                "%s: %d findings in the model description: %s",
-                self.path.name,
-                len(self.description.findings),
-                "; ".join(self.description.findings),
+                "%s: %d findings in the FMU: %s",
+                printable(self.path.name),
+                len(self.findings),
+                printable("; ".join(self.findings[:_MOST_FINDINGS])),
             )
 
     @classmethod
     def of(cls, source: FMU | str | os.PathLike[str]) -> FMU:
-        """Open an FMU of one's own: by its path, or with the arguments of one that is open."""
+        """Open an FMU by its path, or open a second one with the arguments of the first."""
         if not isinstance(source, FMU):
             return cls(source)
         return cls(
@@ -188,18 +199,55 @@ class FMU(LoadableFMU):
     @cached_property
     def platforms(self) -> tuple[str, ...]:
         """The folders under ``binaries/``, which name the platforms the FMU was built for."""
-        parts = [PurePosixPath(name).parts for name in self._entries]
+        parts = [place.split("/") for place in self._archive.files]
         return tuple(sorted({p[1] for p in parts if len(p) > 2 and p[0] == "binaries"}))
 
     @property
     def runs_here(self) -> bool:
-        """Whether the FMU has a library for this platform."""
-        return self.library in self._entries
+        """Whether nothing is known that would keep the FMU from being loaded on this machine."""
+        return not self.obstacles
+
+    @cached_property
+    def obstacles(self) -> tuple[str, ...]:
+        """What keeps the FMU from being loaded on this machine, as texts with the cure.
+
+        There is no library for this platform or processor, or it needs shared libraries that are
+        missing here. Nothing of the FMU is loaded.
+        """
+        try:
+            self._check_library()
+            missing = self.missing_libraries
+        except FMULoadError as error:
+            return (str(error),)
+        return (printable(describe_missing(self.path.name, missing)),) if missing else ()
+
+    @cached_property
+    def missing_libraries(self) -> tuple[str, ...]:
+        """The shared libraries that the FMU needs and this system does not have.
+
+        Empty where there is no library for this platform, and on systems other than Linux.
+
+        Raises:
+            FMULoadError: If a library of the FMU is damaged.
+        """
+        if self._library_place is None:
+            return ()
+        if self._folder is not None:
+            return self._missing_in(self._folder)
+        folder = make_folder()
+        try:
+            self._extract_to(folder, only="binaries")
+            return self._missing_in(folder)
+        finally:
+            remove_folder(folder, os.getpid())
+
+    def _missing_in(self, folder: Path) -> tuple[str, ...]:
+        return tuple(missing_libraries(folder / self.library, self.preload, ask_in_a_child))
 
     def extract(self) -> Path:
         """Extract what this machine needs, once, into a temporary folder.
 
-        The folder goes with ``close``, with this object, or with the interpreter.
+        The folder is removed by ``close``, with this object, or at the end of the interpreter.
 
         Returns:
             The folder.
@@ -209,11 +257,6 @@ class FMU(LoadableFMU):
         """
         if self._folder is not None:
             return self._folder
-        if not self.runs_here:
-            raise FMULoadError(
-                f"{self.path.name} has no library for this platform ({self.library}); "
-                f"it was built for: {', '.join(self.platforms) or 'no platform at all'}"
-            )
         self._check_library()
         folder = make_folder()
         self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
@@ -226,35 +269,88 @@ class FMU(LoadableFMU):
         return folder
 
     def _check_library(self) -> None:
-        """Look at the library where it is: nothing is written of what cannot be loaded."""
-        with self._opened() as archive, archive.open(self.library) as file:
-            size = archive.getinfo(self.library).file_size
-            check_library(cast(BinaryIO, file), size, f"{self.path.name}: {self.library}")
+        """Look at the library inside the archive: nothing is written if it cannot be loaded."""
+        place = self._library_place
+        if place is None:
+            raise FMULoadError(self._no_library())
+        with self._archive.open(place) as file:
+            size = self._archive.files[place].file_size
+            check_library(file, size, f"{self.path.name}: {place}")
 
-    def _extract_to(self, folder: Path) -> None:
-        wanted = [name for name in self._entries if self._needed(PurePosixPath(name))]
-        with self._opened() as archive:
-            archive.extractall(folder, wanted)
-            (folder / "resources").mkdir(exist_ok=True)  # tools pass its path in any case
+    def _no_library(self) -> str:
+        """Say which library is missing, and what there is instead."""
+        folder, _, name = self.library.rpartition("/")
+        there = [p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), folder)]
+        if there:
+            return (
+                f"{self.path.name} has {len(there)} libraries for this platform in {folder} "
+                f"({', '.join(there)}), but none is named {name}; give the right one that name"
+            )
+        return (
+            f"{self.path.name} has no library for this platform ({self.library}); it was built "
+            f"for: {', '.join(self.platforms) or 'no platform at all'}"
+        )
 
-    @contextmanager
-    def _opened(self) -> Iterator[zipfile.ZipFile]:
-        try:
-            with zipfile.ZipFile(self.path) as archive:
-                yield archive
-        except ZIP_ERRORS as error:
-            raise FMULoadError(f"{self.path.name} cannot be extracted: {error}") from None
+    def _extract_to(self, folder: Path, only: str = "") -> None:
+        """Extract the files that are needed, or those of one folder of them."""
+        files = {p: self._target(p) for p in self._archive.files if self._needed(p, only)}
+        folders = [self._target(p) for p in self._archive.folders if self._needed(p, only)]
+        self._archive.extract(folder, files, [*folders, "resources"])  # tools pass its path always
 
-    def _needed(self, name: PurePosixPath) -> bool:
-        if name.parts[0] == "binaries":
-            return len(name.parts) > 2 and name.parts[1] == self.platform
-        return name.parts[0] not in _NEVER_NEEDED
+    def _needed(self, place: str, only: str) -> bool:
+        first, _, rest = place.partition("/")
+        if only and first != only:
+            return False
+        if first == "binaries":
+            return rest.partition("/")[0].casefold() == self.platform.casefold() and "/" in rest
+        return first not in _NEVER_NEEDED
+
+    def _target(self, place: str) -> str:
+        """Where a file is extracted to: the library gets its standard name."""
+        if place == self._library_place:
+            return self.library
+        first, _, rest = place.partition("/")
+        if first == "binaries":
+            return f"binaries/{self.platform}/{rest.partition('/')[2]}"
+        return place
 
     def close(self) -> None:
         """Remove the temporary folder; more than one call is fine."""
         self._folder = None
         if self._remove_folder is not None:
             self._remove_folder()
+
+
+def find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:
+    """Find the library for this platform, which some tools give another name.
+
+    Args:
+        places: The places of all files.
+        wanted: The place of the library by the standard.
+
+    Returns:
+        Its place, or None; and a note if that is not the place by the standard.
+    """
+    if wanted in places:
+        return wanted, []
+    folder = wanted.rpartition("/")[0]
+    there = _libraries_in(places, folder)
+    same = [place for place in there if place.casefold() == wanted.casefold()]
+    candidates = same or there
+    if len(candidates) != 1:
+        return None, []
+    return candidates[0], [f"the library is {candidates[0]!r}, expected {wanted!r}; it is used"]
+
+
+def _libraries_in(places: Sequence[str], folder: str) -> list[str]:
+    """The libraries right in a folder, whose name may differ in case."""
+    suffix = fmpy.sharedLibraryExtension.casefold()
+    return [
+        place
+        for place in places
+        if place.rpartition("/")[0].casefold() == folder.casefold()
+        and place.casefold().endswith(suffix)
+    ]
 
 
 def _check_probe_timeout(timeout: float | None) -> None:

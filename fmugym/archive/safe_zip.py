@@ -1,31 +1,35 @@
-"""What a zip archive is checked for before anything of it is unpacked.
+"""A zip archive that is checked before anything of it is unpacked, and unpacked within bounds.
 
-Unpacking a hostile or broken archive can write outside of its folder, fill the disk, or take what
-one file says for another. So its directory is read first, within bounds, and compared with the
-headers in front of the files.
+A hostile or broken archive could write outside of its folder, fill the disk or the memory, or hold
+two files for one place. Archives of some tools are merely untidy: their names have backslashes, a
+folder has no entry or two, ``binaries`` is spelled ``Binaries``. Such names are tidied up, and what
+was tidied up is told in ``SafeZip.notes``.
 """
 
 from __future__ import annotations
 
+import copy
 import io
-import lzma
+import os
+import posixpath
+import re
 import stat
 import struct
 import sys
 import zipfile
 import zlib
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, cast
 
 from fmugym.checks import check_count
 from fmugym.errors import FMULoadError
 
-__all__ = ["ZIP_ERRORS", "ArchiveLimits", "checked_entries", "over_limit"]
+__all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
 
-ZIP_ERRORS = (
+_ZIP_ERRORS: Final = (
     OSError,
     EOFError,
     RuntimeError,
@@ -33,17 +37,25 @@ ZIP_ERRORS = (
     struct.error,
     zipfile.BadZipFile,
     zlib.error,
-    lzma.LZMAError,
 )
 """What Python's zipfile raises for a damaged archive."""
 
 _METHODS: Final = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
-_LOCAL_HEADER: Final = struct.Struct("<4s22xHH")
 _ENCRYPTED: Final = 1
 _SMALL: Final = 16 * 2**20
 """Bytes that may be unpacked whatever the ratio."""
 _DIRECTORY_BYTES_PER_ENTRY: Final = 512
+_MOST_FOLDERS: Final = 64
+"""Folders inside of each other. Windows and Linux refuse the paths of much deeper ones anyway."""
+_MOST_LINKS: Final = 8
+"""Symbolic links that may point to each other."""
+_LONGEST_TARGET: Final = 4096
+_LONGEST_QUOTE: Final = 120
+"""Characters of a name that an error quotes."""
+_STANDARD_FOLDERS: Final = ("binaries", "documentation", "extra", "resources", "sources")
+_DEVICE: Final = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _folds_case = sys.platform in {"win32", "darwin"}
+_has_devices = sys.platform == "win32"
 
 
 @dataclass(frozen=True)
@@ -51,7 +63,7 @@ class ArchiveLimits:
     """How large an FMU may be before it is refused unread.
 
     Attributes:
-        max_entries: Number of files in the archive.
+        max_entries: Number of files and folders in the archive.
         max_extracted_bytes: Size of all its files together, uncompressed.
         max_ratio: Ratio of that size to the archive's own, beyond 16 MiB. Zeros reach 1000, the
             libraries and tables of FMUs 2 to 20.
@@ -74,38 +86,221 @@ class ArchiveLimits:
             object.__setattr__(self, field.name, check_count(field.name, value, sys.maxsize))
 
 
-def checked_entries(path: Path, limits: ArchiveLimits) -> tuple[str, ...]:
-    """Check every entry of an archive; nothing is unpacked.
+class SafeZip:
+    """A zip archive whose directory has been read and checked; it is not kept open.
 
     Args:
         path: The archive.
         limits: What is too large.
 
-    Returns:
-        The names of its files, without the folders.
+    Attributes:
+        path: As given.
+        files: zipfile's record of each file, by its place: a relative path with slashes, inside of
+            the folder to which the archive is extracted.
+        folders: The places of the folders that have an entry of their own.
+        notes: What was untidy, as texts.
 
     Raises:
         FMULoadError: If it is no zip archive, too large, or not sound.
     """
-    try:
-        if not path.is_file():
-            raise FMULoadError(f"there is no FMU at {path}")
-        return _checked_files(path, limits)
-    except ZIP_ERRORS as error:
-        raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
+
+    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
+        self.path = path
+        self.files: dict[str, zipfile.ZipInfo] = {}
+        self.folders: set[str] = set()
+        self.notes: list[str] = []
+        try:
+            if not path.is_file():
+                raise FMULoadError(f"there is no FMU at {path}")
+            entries = _read_directory(path, limits)
+        except _ZIP_ERRORS as error:
+            raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
+        _check_sizes(path, entries, limits)
+        self._links: dict[str, zipfile.ZipInfo] = {}
+        for entry in entries:
+            self._add(entry)
+        if self._links:
+            self._follow_links()
+            _check_sizes(path, list(self.files.values()), limits)
+        self._check_folders()
+
+    # Reading the directory
+
+    def _add(self, entry: zipfile.ZipInfo) -> None:
+        place = self._place(entry)
+        if not place and not entry.file_size:  # such as "./"
+            return
+        if entry.filename.endswith(("/", "\\")):
+            self.folders.add(place)
+            return
+        self._check_file(entry, place)
+        if stat.S_ISLNK(entry.external_attr >> 16):
+            self._links[place] = entry
+        elif self._prefers(place, entry):
+            self.files[place] = entry
+
+    def _prefers(self, place: str, entry: zipfile.ZipInfo) -> bool:
+        """Choose among files of one place as zipfile does: the exact name, of those the last."""
+        other = self.files.get(place)
+        if other is None:
+            return True
+        exact = other.filename == place and entry.filename != place
+        if (other.CRC, other.file_size) != (entry.CRC, entry.file_size):
+            used = "the one with exactly this name" if exact else "the last one"
+            self._note(f"the archive has several files {_quoted(place)}; {used} is used")
+        return not exact
+
+    def _place(self, entry: zipfile.ZipInfo) -> str:
+        """Turn the name of an entry into the place of its file."""
+        name = entry.filename.replace("\\", "/")
+        if name != entry.filename:
+            self._note("names in the archive have backslashes; they are taken for slashes")
+        if _escapes(name):
+            raise self._refusal(entry, "would be written outside of the FMU's own folder")
+        if name.count("/") > _MOST_FOLDERS:
+            raise self._refusal(entry, f"lies in more than {_MOST_FOLDERS} folders")
+        return self._with_standard_case("/".join(PurePosixPath(name).parts))
+
+    def _with_standard_case(self, place: str) -> str:
+        """Spell the names that the FMI standard gives as the standard does."""
+        first, slash, rest = place.partition("/")
+        known = _STANDARD_FOLDERS if slash else (*_STANDARD_FOLDERS, "modelDescription.xml")
+        spelled = next((name for name in known if name.casefold() == first.casefold()), first)
+        if spelled != first:
+            self._note(f"{_quoted(first)} in the archive is taken for {spelled!r}")
+        return spelled + slash + rest
+
+    def _check_file(self, entry: zipfile.ZipInfo, place: str) -> None:
+        if not place:
+            raise self._refusal(entry, "has content but no name")
+        if _has_devices and any(_DEVICE.fullmatch(part) for part in place.split("/")):
+            raise self._refusal(entry, "has the name of a device of Windows")
+        if entry.header_offset < 0:
+            raise self._refusal(entry, "is not all there; copy or export the FMU again")
+        if entry.flag_bits & _ENCRYPTED:
+            raise self._refusal(entry, "is encrypted; pack the archive without a password")
+        if entry.compress_type not in _METHODS:
+            raise self._refusal(
+                entry,
+                f"is compressed by method {entry.compress_type}; FMI allows only stored (0) and "
+                "deflated (8) files, so pack the archive again",
+            )
+
+    def _follow_links(self) -> None:
+        """Let each symbolic link stand for the file of the archive that it points to."""
+        targets = {place: self._link_target(place) for place in self._links}
+        for place, entry in self._links.items():
+            target = targets[place]
+            for _ in range(_MOST_LINKS):
+                target = targets.get(target, target)
+            if target not in self.files:
+                raise self._refusal(
+                    entry,
+                    f"is a symbolic link to {_quoted(targets[place])}, not a file of the archive",
+                )
+            self.files[place] = copy.copy(self.files[target])
+
+    def _link_target(self, place: str) -> str:
+        entry = self._links[place]
+        with self._opened() as archive, archive.open(entry) as file:
+            target = os.fsdecode(_read_at_most(cast(BinaryIO, file), _LONGEST_TARGET))
+        return posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
+
+    def _check_folders(self) -> None:
+        """Find files where a folder has to be, and places that are one place on this system.
+
+        Some tools leave out the slash at the end of a folder's name. Such an entry is empty.
+        """
+        for folder in _folders_of([*self.files, *(f"{folder}/." for folder in self.folders)]):
+            entry = self.files.get(folder)
+            if entry is not None and entry.file_size:
+                raise self._refusal(entry, "is a file, but other files lie inside of it")
+            if entry is not None:
+                del self.files[folder]
+        self._check_case()
+
+    def _check_case(self) -> None:
+        seen: dict[str, str] = {}
+        for place in self.files if _folds_case else ():
+            other = seen.setdefault(place.casefold(), place)
+            if other != place:
+                raise self._refusal(
+                    self.files[place],
+                    f"and {_quoted(other)} differ only in case, so that this system cannot hold "
+                    "both",
+                )
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes and len(self.notes) < 20:
+            self.notes.append(text)
+
+    def _refusal(self, entry: zipfile.ZipInfo, why: str) -> FMULoadError:
+        return FMULoadError(f"{self.path.name} is refused: {_quoted(entry.filename)} {why}")
+
+    # Unpacking
+
+    def read(self, place: str, limit: int) -> bytes:
+        """Unpack a file into memory.
+
+        Args:
+            place: Its place.
+            limit: The most bytes to read, whatever the archive says of its size.
+
+        Returns:
+            Its content; one byte more than ``limit`` if it is longer.
+
+        Raises:
+            FMULoadError: If it is damaged.
+        """
+        with self.open(place) as file:
+            return _read_at_most(file, limit + 1)
+
+    @contextmanager
+    def open(self, place: str) -> Iterator[BinaryIO]:
+        """Open a file for reading, as a context.
+
+        Raises:
+            FMULoadError: If it is damaged, also where that shows only later in the context.
+        """
+        with self._opened() as archive, archive.open(self.files[place]) as file:
+            yield cast(BinaryIO, file)
+
+    def extract(self, folder: Path, files: Mapping[str, str], folders: Iterable[str] = ()) -> None:
+        """Write files and folders.
+
+        Args:
+            folder: Where to write.
+            files: The place in ``folder`` of each file, by its place in the archive.
+            folders: Places in ``folder`` of folders to make, which may stay empty.
+
+        Raises:
+            FMULoadError: If a file is damaged or cannot be written.
+        """
+        with self._opened() as archive:
+            for place in folders:
+                (folder / place).mkdir(parents=True, exist_ok=True)
+            for place, target in files.items():
+                entry = self.files[place]
+                entry.filename = target  # zipfile replaces the characters that Windows forbids
+                archive.extract(entry, folder)
+
+    @contextmanager
+    def _opened(self) -> Iterator[zipfile.ZipFile]:
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                yield archive
+        except OSError as error:
+            raise FMULoadError(f"{self.path.name} cannot be unpacked: {error}") from None
+        except _ZIP_ERRORS as error:
+            raise FMULoadError(
+                f"{self.path.name} is damaged: {error}; copy or export the FMU again"
+            ) from None
 
 
-def _checked_files(path: Path, limits: ArchiveLimits) -> tuple[str, ...]:
+def _read_directory(path: Path, limits: ArchiveLimits) -> Sequence[zipfile.ZipInfo]:
     most = _DIRECTORY_BYTES_PER_ENTRY * limits.max_entries
     with _BoundedReader(path, most) as file, zipfile.ZipFile(file) as archive:
-        entries = archive.infolist()
-        _check_sizes(path, entries, limits)
-        for entry in entries:
-            _check_entry(path, entry)
-        _check_layout(path, file, entries, archive.start_dir)
-    files = [entry.filename for entry in entries if not entry.is_dir()]
-    _check_collisions(path, files)
-    return tuple(files)
+        return archive.infolist()
 
 
 class _BoundedReader(io.BufferedReader):
@@ -122,12 +317,22 @@ class _BoundedReader(io.BufferedReader):
         if size is not None and size > self._most:
             raise zipfile.BadZipFile(
                 f"its directory has {size} bytes, the limit is {self._most}; raise max_entries of "
-                "ArchiveLimits if that is right"
+                "ArchiveLimits if you trust it"
             )
         return super().read(size)
 
 
+def _read_at_most(file: BinaryIO, count: int) -> bytes:
+    """Read in pieces: zipfile unpacks up to 2 GiB for one read without a size."""
+    pieces = []
+    while count > 0 and (piece := file.read(min(count, 2**16))):
+        pieces.append(piece)
+        count -= len(piece)
+    return b"".join(pieces)
+
+
 def _check_sizes(path: Path, entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> None:
+    """Compare the sizes that the directory gives; zipfile never unpacks more of a file."""
     _check_limit(path, "has {} files", len(entries), limits, "max_entries")
     size = sum(entry.file_size for entry in entries)
     _check_limit(path, "unpacks to {} bytes", size, limits, "max_extracted_bytes")
@@ -146,69 +351,31 @@ def over_limit(found: str, limit: int, name: str) -> FMULoadError:
     """Make the error for what is too large.
 
     Args:
-        found: What is how large, with the name of the FMU.
-        limit: What would have been allowed.
-        name: The attribute of ``ArchiveLimits`` that says so.
+        found: What was found, with the name of the FMU.
+        limit: The limit.
+        name: The attribute of ``ArchiveLimits`` that sets the limit.
     """
     return FMULoadError(
         f"{found}, the limit is {limit}; if you trust it, raise {name} of ArchiveLimits"
     )
 
 
-def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
-    name = PurePosixPath(entry.filename)
-    if not name.parts:
-        raise FMULoadError(f"{path.name} has a file without a name: {entry.filename!r}")
-    if _escapes(entry.filename, name):
-        raise FMULoadError(f"{path.name} has a file outside of its own folder: {entry.filename!r}")
-    if stat.S_ISLNK(entry.external_attr >> 16):
-        raise FMULoadError(f"{path.name} has a symbolic link: {entry.filename!r}; pack its target")
-    if entry.flag_bits & _ENCRYPTED:
-        raise FMULoadError(f"{path.name} is encrypted: {entry.filename!r}; pack it without")
-    if entry.compress_type not in _METHODS:
-        raise FMULoadError(
-            f"{path.name}: {entry.filename!r} is compressed by method {entry.compress_type}; FMI "
-            "allows stored (0) and deflated (8) files, pack it anew"
-        )
+def _escapes(name: str) -> bool:
+    """Whether a path is absolute, has a Windows drive, or climbs to a folder above."""
+    return name.startswith("/") or name[1:2] == ":" or ".." in name.split("/")
 
 
-def _escapes(text: str, name: PurePosixPath) -> bool:
-    """Absolute and upward paths, and what Windows would take for a drive, device or stream."""
-    return name.is_absolute() or ".." in name.parts or "\\" in text or ":" in text
+def _folders_of(places: Iterable[str]) -> set[str]:
+    """Find all folders above places; each is looked at once."""
+    folders: set[str] = set()
+    for place in places:
+        folder = posixpath.dirname(place)
+        while folder and folder not in folders:
+            folders.add(folder)
+            folder = posixpath.dirname(folder)
+    return folders
 
 
-def _check_layout(
-    path: Path, file: BinaryIO, entries: Sequence[zipfile.ZipInfo], directory: int
-) -> None:
-    """Each file's bytes lie in front of the next one's: no bytes are unpacked twice."""
-    inner = sorted(entries, key=lambda entry: entry.header_offset)
-    starts = [entry.header_offset for entry in inner[1:]] + [directory]
-    for entry, limit in zip(inner, starts, strict=True):
-        end = _data_start(path, file, entry) + entry.compress_size
-        if end > directory:
-            raise FMULoadError(f"{path.name} is cut short: {entry.filename!r} is not all there")
-        if end > limit:
-            raise FMULoadError(
-                f"{path.name} has files that overlap: {entry.filename!r} and the next one share "
-                "bytes; it is not a sound archive"
-            )
-
-
-def _data_start(path: Path, file: BinaryIO, entry: zipfile.ZipInfo) -> int:
-    file.seek(entry.header_offset)
-    header = file.read(_LOCAL_HEADER.size)
-    if len(header) < _LOCAL_HEADER.size or not header.startswith(b"PK\x03\x04"):
-        raise FMULoadError(f"{path.name} is damaged: {entry.filename!r} is not where it should be")
-    _, name_length, extra_length = _LOCAL_HEADER.unpack(header)
-    return entry.header_offset + _LOCAL_HEADER.size + int(name_length) + int(extra_length)
-
-
-def _check_collisions(path: Path, names: Iterable[str]) -> None:
-    """Two files that would be written to one place, or a file where a folder is to be."""
-    places = Counter(PurePosixPath(n.casefold() if _folds_case else n) for n in names)
-    for place, count in places.items():
-        if count > 1:
-            raise FMULoadError(f"{path.name} has two files of one name: {str(place)!r}")
-        for parent in place.parents:
-            if parent in places:
-                raise FMULoadError(f"{path.name} has a file that is also a folder: {str(parent)!r}")
+def _quoted(name: str) -> str:
+    """Quote a name of any length."""
+    return repr(name if len(name) <= _LONGEST_QUOTE else name[:_LONGEST_QUOTE] + "...")

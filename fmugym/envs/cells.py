@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from fmugym.checks import check_name, check_number, has_method
+from fmugym.checks import check_number, check_text, has_method
 from fmugym.errors import ConfigError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool import Paced
@@ -77,7 +77,7 @@ def paced_cells(
         raise ConfigError("gym_token= names a lease: give no user_token and no gym_time with it")
     for name, token in (("user_token", user_token), ("gym_token", gym_token)):
         if token is not None:
-            check_name(name, token)
+            check_text(name, token)
     session_time = check_number("session_time", session_time, positive=True)
     if gym_time is not None:
         gym_time = check_number("gym_time", gym_time, positive=True)

@@ -1,4 +1,4 @@
-"""Getting and setting a fixed list of variables with arguments that are prepared once."""
+"""Getting and setting a fixed list of variables with arguments prepared once."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ __all__ = ["Access"]
 
 
 class Access:
-    """The values of a fixed list of variables, copied to or from the FMU one call per C type.
+    """The values of a fixed list of variables, moved to or from the FMU with one call per C type.
 
     Args:
         instance: The instance.
         variables: The variables, all of them numeric.
-        values: Memory to be used, contiguous, float64; by default memory of its own.
+        values: The memory to use, contiguous float64; by default new memory.
 
     Attributes:
-        values: The row of values, float64, in the order of the variables. Where all variables are
-            of the C type ``double`` the FMU reads and writes this very memory.
+        values: The values, float64, in the order of the variables. If all variables have the C type
+            ``double``, the FMU reads and writes this memory directly.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Access:
         self._use_single_call()
 
     def _use_single_call(self) -> None:
-        """Where one call moves all values, as in nearly every FMU, let it be the method itself."""
+        """Make the method the FMU's function, if one call moves all values, as in most FMUs."""
         if len(self._groups) == 1 and self._groups[0][1] is self.values:
             get, set_, arguments = self._groups[0][2]
             self.get = functools.partial(get, *arguments)  # type: ignore[method-assign]

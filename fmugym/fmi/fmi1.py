@@ -19,7 +19,7 @@ __all__ = ["FMI1Instance"]
 
 
 class FMI1Instance(Instance):
-    """FMI 1.0 co-simulation, stand-alone: no FMU state, no way to tell Terminated from Discard."""
+    """FMI 1.0 stand-alone co-simulation, without FMU state and without a status for Terminated."""
 
     slave_class = FMU1Slave
     dtypes: ClassVar[dict[str, Any]] = {
@@ -48,7 +48,7 @@ class FMI1Instance(Instance):
 
     @classmethod
     def mend(cls, slave: Any) -> None:
-        """FMPy takes the status of these for a string: any but OK would be dereferenced."""
+        """Declare that these return an int. FMPy declares a string, and dereferences all but OK."""
         for name in cls._STATUS_FUNCTIONS:
             slave._functions[name].restype = ctypes.c_int
 

@@ -52,7 +52,7 @@ class FMI2Instance(Instance):
         return step
 
     def _judge_discard(self) -> int:
-        """What a discarded step comes to; whoever cannot tell why has discarded it."""
+        """Find out why a step was discarded. If the FMU cannot tell, it counts as Discard."""
         terminated = ctypes.c_int(0)
         get_status = self._function("GetBooleanStatus")
         status = get_status(self._component, self._TERMINATED, ctypes.byref(terminated))

@@ -18,7 +18,7 @@ __all__ = ["FMI3Instance"]
 
 
 class FMI3Instance(Instance):
-    """FMI 3.0 co-simulation, without event mode, early return and intermediate update."""
+    """FMI 3.0 co-simulation without event mode, early return and intermediate update."""
 
     slave_class = FMU3Slave
     dtypes: ClassVar[dict[str, Any]] = {
@@ -72,7 +72,7 @@ class FMI3Instance(Instance):
         no_return = not self._may_return
 
         def step(time: float, step_size: float) -> int:
-            flags[1] = flags[2] = False  # an FMU that has nothing to say may not write them
+            flags[1] = flags[2] = False  # an FMU may leave them unwritten
             status: int = do_step(component, time, step_size, no_return, *results)
             if status <= Status.WARNING and flags[1]:
                 status = Status.TERMINATED

@@ -1,7 +1,7 @@
 """One co-simulation instance of an FMU, whatever its FMI version.
 
-Calls in the step loop go through ctypes with arguments prepared beforehand, because FMPy's own
-wrappers build new arrays for every call.
+Calls in the step loop go through ctypes with prepared arguments, because FMPy's wrappers build new
+arrays for every call.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["Initialize", "Instance", "SavedState", "Span"]
 
 
 class Span(NamedTuple):
-    """What an FMU is told of the simulation at its start; see ``Instance.initialize``."""
+    """What the FMU gets to know at the start of a simulation; see ``Instance.initialize``."""
 
     start_time: float
     stop_time: float | None
@@ -35,17 +35,17 @@ class Span(NamedTuple):
 
     @property
     def times(self) -> tuple[float, bool, float]:
-        """Start time, whether there is a stop time, and that."""
+        """Start time, whether there is a stop time, and the stop time."""
         return self.start_time, self.stop_time is not None, self.stop_time or 0.0
 
     @property
     def tolerances(self) -> tuple[bool, float]:
-        """Whether there is a tolerance, and that."""
+        """Whether there is a tolerance, and the tolerance."""
         return self.tolerance is not None, self.tolerance or 0.0
 
 
 Initialize = Callable[[Span, Callable[[], None]], None]
-"""Takes what the FMU is told, and the function that sets the start values."""
+"""Takes the span of the simulation and the function that sets the start values."""
 
 
 class Instance(ABC):
@@ -53,16 +53,16 @@ class Instance(ABC):
 
     Attributes:
         phase: Decides which calls are legal.
-        step: Does one communication step; takes the current communication point and the step size
-            in seconds, both finite, and returns a ``Status``. It never raises, since a failed step
-            ends one episode only.
+        step: Does one communication step. It takes the current communication point and the step
+            size in seconds, both finite, and returns a ``Status``. It never raises, because a
+            failed step ends only one episode.
     """
 
     slave_class: ClassVar[Any]
     dtypes: ClassVar[dict[str, Any]]
-    """numpy's type for each of the C types by which this FMI version gets and sets values."""
+    """numpy's type for each C type of this FMI version."""
     enumeration_type: ClassVar = "Integer"
-    """The C type of enumerations."""
+    """The C type of enumerations in this FMI version."""
 
     def __init__(self, description: ModelDescription, slave: Any, target: logging.Logger) -> None:
         self.phase = Phase.DEAD
@@ -73,6 +73,7 @@ class Instance(ABC):
         self._instantiate_checked()
         self._component = ctypes.c_void_p(self._slave.component)
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
+        self._may_return = False  # to a state of an earlier time, of which FMI tells the FMU
         self.step = self._prepare_step()
         self._initialize = self._prepare_initialization()
         self._reset_function = self._function("Reset")
@@ -91,11 +92,11 @@ class Instance(ABC):
             )
         self.phase = Phase.INSTANTIATED
 
-    # What the versions differ in.
+    # What differs between the versions.
 
     @classmethod
     def mend(cls, slave: Any) -> None:
-        """Correct what FMPy has wrong for this version, which is nothing for most."""
+        """Correct FMPy's mistakes for this version; most need nothing."""
         return
 
     @abstractmethod
@@ -110,15 +111,10 @@ class Instance(ABC):
     @abstractmethod
     def _prepare_initialization(self) -> Initialize: ...
 
-    # What they have in common.
-
-    @property
-    def _may_return(self) -> bool:
-        """Whether states of earlier times may be restored, of which FMI tells the FMU."""
-        return self._description.capabilities.can_get_and_set_fmu_state
+    # What the versions have in common.
 
     def _function(self, name: str, *argtypes: Any, restype: Any = ctypes.c_int) -> Any:
-        """Look a function up anew, so that FMPy's prototype of it stays as it is."""
+        """Look up a function of our own, so that FMPy's prototype stays as it is."""
         function = self._slave.dll[self._function_name(name)]
         function.restype = restype
         if argtypes:
@@ -126,7 +122,7 @@ class Instance(ABC):
         return function
 
     def c_type(self, variable: Variable) -> str:
-        """The C type, in the standard's naming, by which a variable is got and set."""
+        """The C type of a variable, by its name in the standard."""
         return self.enumeration_type if variable.kind == "enumeration" else variable.type
 
     def prepare_access(
@@ -151,7 +147,7 @@ class Instance(ABC):
 
     @contextmanager
     def muted(self) -> Iterator[None]:
-        """Drop the messages of calls that nobody has asked for."""
+        """Drop the FMU's messages inside this context."""
         self._log.muted = True
         try:
             yield
@@ -184,8 +180,8 @@ class Instance(ABC):
         Args:
             start_time: In seconds.
             stop_time: In seconds, or None to leave it undefined.
-            tolerance: For solvers inside of the FMU, or None to leave it to the FMU.
-            set_start_values: Called where start values are to be set.
+            tolerance: For the FMU's solver, or None to leave it to the FMU.
+            set_start_values: Sets the start values; called when FMI allows it.
 
         Raises:
             SimulationError: If the FMU fails.
@@ -193,7 +189,7 @@ class Instance(ABC):
         self._require(Phase.INSTANTIATED, "initialize")
         try:
             self._initialize(Span(start_time, stop_time, tolerance), set_start_values)
-        except BaseException:  # half-way: whatever the status, only a reset is legal now
+        except BaseException:  # half-way: only a reset is legal now
             if self.phase is Phase.INSTANTIATED:
                 self.phase = Phase.FAILED
             raise
@@ -203,7 +199,7 @@ class Instance(ABC):
         """Return to the state just after instantiation, start values included.
 
         Raises:
-            SimulationError: If the FMU fails, or is past any reset.
+            SimulationError: If the FMU fails, or had a fatal error before.
         """
         if self.phase is Phase.DEAD:
             raise SimulationError(
@@ -221,7 +217,7 @@ class Instance(ABC):
         if self.can_read:
             self.judge(self._function("Terminate")(self._component))
         fatal, self.phase = self.phase is Phase.DEAD, Phase.DEAD
-        if not fatal:  # after Fatal the standard forbids even this: the memory is given up
+        if not fatal:  # after Fatal the standard forbids even this: the memory stays lost
             self._function("FreeInstance", restype=None)(self._component)
         self._slave.component = None
         self._log.close()
@@ -230,18 +226,18 @@ class Instance(ABC):
         """Raise for a status worse than a warning.
 
         Raises:
-            SimulationError: With what failed and what the FMU logged.
+            SimulationError: With the call that failed and the FMU's last messages.
         """
         if status > Status.WARNING or status < 0:
             raise SimulationError(self.describe_failure(doing, self.judge(status)))
 
     def describe_failure(self, doing: str, status: int) -> str:
-        """Say what failed, in one sentence, with the FMU's own last messages."""
+        """Say which call failed, with the FMU's last messages."""
         label = Status(status).name.capitalize()
         return f"{self._log.instance_name}: {doing} returned {label}{self._log.said()}"
 
     def judge(self, status: int) -> int:
-        """Note which calls are still legal after a status; returns it as a ``Status``."""
+        """Note which calls are legal after a status; returns it as a ``Status``."""
         status = sane(status)
         if status == Status.FATAL:
             self.phase = Phase.DEAD
@@ -250,7 +246,7 @@ class Instance(ABC):
         return status
 
     def judge_step(self, status: int) -> int:
-        """Note that after a step that was not done FMI wants no other; otherwise as ``judge``."""
+        """As ``judge``, and forbid more steps after a step that was not done."""
         if status != Status.TERMINATED:
             status = self.judge(status)
         if status > Status.WARNING:
@@ -258,7 +254,7 @@ class Instance(ABC):
         return status
 
     def forbid_steps(self) -> None:
-        """Let there be no more steps until a reset."""
+        """Forbid steps until a reset."""
         if self.phase is Phase.STEPPING:
             self.phase = Phase.ENDED
 
@@ -278,11 +274,11 @@ class Instance(ABC):
     def jacobian(
         self, unknowns: Sequence[Variable], knowns: Sequence[Variable]
     ) -> npt.NDArray[np.float64]:
-        """Differentiate variables by others, at the present communication point.
+        """Differentiate variables by others at the current communication point.
 
         Args:
-            unknowns: What is differentiated: outputs or derivatives of states, scalar reals.
-            knowns: By what: continuous inputs or states, scalar reals.
+            unknowns: The variables to differentiate: outputs or derivatives, scalar reals.
+            knowns: The variables to differentiate by: continuous inputs or states, scalar reals.
 
         Returns:
             The partial derivatives, shape (len(unknowns), len(knowns)), in the variables' units.
@@ -325,7 +321,7 @@ class Instance(ABC):
         """Copy the FMU state.
 
         Raises:
-            SimulationError: If the FMU offers none, or fails.
+            SimulationError: If the FMU cannot save its state, or fails.
         """
         if not self._description.capabilities.can_get_and_set_fmu_state:
             raise SimulationError(f"{self._description.model_name} cannot get and set its state")
@@ -333,6 +329,9 @@ class Instance(ABC):
         state = ctypes.c_void_p()
         get_state = self._function(self._state_function("Get"))
         self.check("saving the FMU state", get_state(self._component, ctypes.byref(state)))
+        if not self._may_return:
+            self._may_return = True
+            self.step = self._prepare_step()
         saved = SavedState(self, state)
         self._saved_states.add(saved)
         return saved
@@ -341,7 +340,7 @@ class Instance(ABC):
         """Return to a state saved by this instance.
 
         Raises:
-            SimulationError: If the FMU fails, or is past any call.
+            SimulationError: If the FMU fails, or had a fatal error before.
         """
         if self.phase is Phase.DEAD:
             raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
@@ -361,7 +360,7 @@ class Instance(ABC):
 
 
 class SavedState:
-    """The owner of an FMU state: frees it once, while its instance still lives.
+    """The owner of an FMU state, which frees it once, while its instance lives.
 
     Attributes:
         pointer: The FMU's own handle.

@@ -31,8 +31,8 @@ class Library:
     """The shared library of an FMU, loaded from the FMU's temporary folder.
 
     Args:
-        fmu: The FMU. It is extracted if need be, and closed together with the library.
-        target: The logger that gets the messages of all instances.
+        fmu: The FMU. It is extracted if necessary, and closed with the library.
+        target: The logger for the messages of all instances.
 
     Raises:
         FMULoadError: If the library cannot be loaded or lacks a function of the standard.
@@ -56,6 +56,7 @@ class Library:
 
         Raises:
             FMULoadError: If the FMU refuses.
+            SimulationError: If the library is closed.
         """
         if not self.close.alive:
             raise SimulationError(f"{self._fmu.path.name} is closed")
@@ -64,14 +65,14 @@ class Library:
         return instance
 
     def discard(self, instance: Instance) -> None:
-        """Free an instance now instead of with its library."""
+        """Free an instance before its library is closed."""
         if instance in self._native.instances:
             self._native.instances.remove(instance)
         instance.free()
 
 
 class _Native:
-    """What the finalizer of a library needs: it must not refer to the library itself."""
+    """The part of a library that its finalizer needs, which must not refer to the library."""
 
     def __init__(self, fmu: LoadableFMU) -> None:
         self.fmu = fmu

@@ -1,10 +1,10 @@
 """Messages of FMUs, on their way to Python's ``logging``.
 
-FMI 1.0 and 2.0 hand the FMU a C function with a variable number of arguments, which ctypes cannot
-make. FMPy ships a native proxy that formats the text, but the proxy knows one target per process,
-and calling it after that target is gone ends the process. So there is one set of callbacks here,
-alive as long as the process, which finds the receiver by the instance's unique name (FMI 3.0: by
-its environment pointer).
+In FMI 1.0 and 2.0 the FMU gets a C function with a variable number of arguments, which ctypes
+cannot make. FMPy has a native proxy that formats the text. The proxy knows one target per process,
+and a call after that target is gone ends the process. So this module has one set of callbacks that
+lives as long as the process. They find the receiver by the unique name of the instance, in FMI 3.0
+by its environment pointer.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from fmpy.fmi2 import fmi2CallbackFunctions
 from fmpy.fmi3 import fmi3LogMessageCallback
 from fmpy.logging import addLoggerProxy
 
+from fmugym.errors import printable
+
 __all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message"]
 
 logger = logging.getLogger(__name__)
@@ -35,12 +37,12 @@ class MessageLog:
 
     Args:
         model: The model's name, the first part of the instance name.
-        target: The logger that gets the messages.
+        target: The logger for the messages.
 
     Attributes:
         environment: A number that is unique in the process.
         instance_name: A name that is unique in the process.
-        recent: The last messages, for the text of errors.
+        recent: The last messages, for errors.
         muted: Whether messages are dropped.
     """
 
@@ -55,11 +57,11 @@ class MessageLog:
 
     @property
     def wants_debug(self) -> bool:
-        """Whether the FMU is to log more than errors."""
+        """Whether the FMU is asked to log more than errors."""
         return self._target.isEnabledFor(logging.INFO)
 
     def receive(self, status: int, category: str, message: str) -> None:
-        """Pass one message on, at the level of its status."""
+        """Pass a message on, at the level of its status."""
         if self.muted:
             return
         self.recent.append(message)
@@ -76,8 +78,8 @@ class MessageLog:
 
 
 def _deliver(environment: int | None, status: int, category: bytes, message: bytes) -> None:
-    category_text = (category or b"").decode(errors="replace")
-    text = (message or b"").decode(errors="replace").rstrip()
+    category_text = printable((category or b"").decode(errors="replace"))
+    text = printable((message or b"").decode(errors="replace").rstrip())
     receiver = _receivers.get(environment or 0)
     if receiver is not None:
         receiver.receive(status, category_text, text)
@@ -91,7 +93,7 @@ def _by_name(_: Any, name: bytes, status: int, category: bytes, message: bytes) 
 
 
 def _make_callbacks(structure: Any) -> Any:
-    """Fill a callback structure: the layout is the same in FMI 1.0 and 2.0 as far as we use it."""
+    """Fill a callback structure. The members used here are the same in FMI 1.0 and 2.0."""
     types = dict(structure._fields_)
     callbacks = structure()
     callbacks.logger = types["logger"](_by_name)

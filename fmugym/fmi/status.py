@@ -1,4 +1,4 @@
-"""What FMI calls return, and where an instance is in FMI's state machine."""
+"""What FMI calls return, and the states of FMI's state machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["Phase", "Status", "sane"]
 
 
 class Status(enum.IntEnum):
-    """What a call returned: FMI's own codes, and two of ours."""
+    """What a call returned: FMI's codes, and two more."""
 
     OK = 0
     WARNING = 1
@@ -22,18 +22,18 @@ class Status(enum.IntEnum):
 
 
 class Phase(enum.Enum):
-    """Where an instance is in FMI's state machine, as far as it decides which call is legal."""
+    """The states of FMI's state machine that decide which calls are legal."""
 
     INSTANTIATED = enum.auto()
     STEPPING = enum.auto()
     ENDED = enum.auto()
-    """After a step that was not done: reading and a reset are legal."""
+    """After a step that was not done: only reading and a reset are legal."""
     FAILED = enum.auto()
-    """After Error: a reset is legal."""
+    """After Error: only a reset is legal."""
     DEAD = enum.auto()
     """After Fatal or free: no call is legal."""
 
 
 def sane(status: int) -> int:
-    """Pending is an error, since no asynchronous step was asked for, and so is any other code."""
+    """Turn codes that no call here may return into an error, Pending included."""
     return status if 0 <= status <= Status.FATAL else Status.ERROR

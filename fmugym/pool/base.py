@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.errors import SimulationError
-from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
+from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -155,6 +155,11 @@ class Pool(ABC):
     def is_real(self) -> bool:
         """Whether a step may move something real, so that nothing is to be tried with it."""
         return False
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """How instances start an episode anew."""
+        return ResetMethod.RESET
 
     @property
     def can_play(self) -> bool:

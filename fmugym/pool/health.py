@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fmugym.fmi.status import Status
 from fmugym.pool.base import Pool
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.spec import PoolSpec, ResetMethod
 
 __all__ = [
     "HEALTH",
@@ -80,6 +80,11 @@ class CountedPool(Pool):
 
     _spec: PoolSpec
     _counts: HealthArray
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """See ``Pool.reset_method``."""
+        return self._spec.reset_method
 
     def _count_steps(self) -> None:
         """Let the counts have all steps until now."""

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from fmugym import _native
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
-from fmugym.errors import FMULoadError, SimulationError
+from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.pool.base import (
     FloatArray,
@@ -39,6 +39,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["NativePool"]
 
@@ -141,39 +142,51 @@ class NativePool(CountedPool):
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
+        method = spec.reset_method
         paths = [fmu.prepare_library()]
         folder = fmu.extract()
         if private_libraries:
             paths = _copy_library(folder, Path(fmu.library), self.num_instances)
         try:
             return _native.Pool(
-                description.fmi_major_version,
-                description.model_identifier.encode(),
-                description.instantiation_token.encode(),
-                _resources(folder, description.fmi_major_version),
-                tuple(os.fsencode(path) for path in paths),
-                private_libraries,
-                log.isEnabledFor(logging.INFO),
-                description.capabilities.can_get_and_set_fmu_state,
-                spec.start_time,
-                spec.stop_time,
-                spec.tolerance,
-                spec.time_step,
-                spec.substeps,
-                spec.warm_up_steps,
-                spec.fault_retries,
-                tuple((v.value_reference, text.encode()) for v, text in spec.strings),
-                self._access(spec.inputs),
-                self._access(spec.outputs),
-                spec.num_observed,
-                self.num_instances,
-                self.threads,
-                self.inputs,
-                self.outputs,
-                self.statuses,
-                self.observations,
-                self._counts,
-                _Receiver(log, description.model_identifier, self._first_index),
+                library={
+                    "version": description.fmi_major_version,
+                    "model": description.model_identifier.encode(),
+                    "token": description.instantiation_token.encode(),
+                    "resources": _resources(folder, description.fmi_major_version),
+                    "paths": tuple(os.fsencode(path) for path in paths),
+                    "private": private_libraries,
+                    "logging": log.isEnabledFor(logging.INFO),
+                    "states": description.capabilities.can_get_and_set_fmu_state,
+                },
+                experiment={
+                    "start_time": spec.start_time,
+                    "stop_time": spec.stop_time,
+                    "tolerance": spec.tolerance,
+                    "time_step": spec.time_step,
+                    "substeps": spec.substeps,
+                    "warm_up_steps": spec.warm_up_steps,
+                    "retries": spec.fault_retries,
+                    "restores": method is ResetMethod.RESTORE,
+                    "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
+                    "reloads": method is ResetMethod.LIBRARY,
+                },
+                variables={
+                    "inputs": self._access(spec.inputs),
+                    "outputs": self._access(spec.outputs),
+                    "num_observed": spec.num_observed,
+                    "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                },
+                arrays={
+                    "inputs": self.inputs,
+                    "outputs": self.outputs,
+                    "statuses": self.statuses,
+                    "observations": self.observations,
+                    "health": self._counts,
+                },
+                count=self.num_instances,
+                threads=self.threads,
+                callback=_Receiver(log, description.model_identifier, self._first_index),
             )
         except OSError as error:
             raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
@@ -222,6 +235,8 @@ class NativePool(CountedPool):
         if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
             name = self._fmu.description.model_name
             raise SimulationError(f"{name} cannot get and set its state")
+        if self._watch is not None:
+            self._watch.has_snapshots = True
         snapshot = self._open_pool().save()
         if isinstance(snapshot, int):
             raise SimulationError(self.failure(snapshot))
@@ -251,7 +266,7 @@ class NativePool(CountedPool):
             variables = self._spec.inputs if "inputs" in doing else self._spec.outputs
             return f"{doing}: {_not_finite(variables, values)}"
         text = self._sentence(index, doing, status, time, string)
-        text += f"; the FMU said: {said}" if said else ""
+        text += f"; the FMU said: {printable(said)}" if said else ""
         return f"the warm-up failed: {text}" if in_warm_up else text
 
     def _sentence(self, index: int, doing: str, status: int, time: float, string: int) -> str:
@@ -421,22 +436,13 @@ class NativePool(CountedPool):
         block, used, low, width, rows = draws
         count, ended, limit = episodes
         self._pool.prepare_play(
-            self._access(variables),
-            _program_bytes(programs[0]),
-            _program_bytes(programs[1]),
-            actions[0],
-            actions[1],
-            limit,
-            block.shape[2],
-            block.shape[1],
-            start_values,
-            block.reshape(-1),
-            used,
-            low,
-            width,
-            rows,
-            count,
-            ended,
+            start=self._access(variables),
+            start_values=start_values,
+            inputs=_program_bytes(programs[0]),
+            judgement=_program_bytes(programs[1]),
+            actions=actions,
+            draws={"block": block, "used": used, "low": low, "width": width, "rows": rows},
+            episodes={"step_counts": count, "ended": ended, "limit": limit},
         )
         return self._pool.play
 
@@ -486,12 +492,14 @@ class _Receiver:
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         number = self._first_index + index
-        self._log.log(level, "%s_%d: [%s] %s", self._model, number, category, message)
+        texts = printable(category), printable(message)
+        self._log.log(level, "%s_%d: [%s] %s", self._model, number, *texts)
 
 
 def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
     pairs = zip(variables, np.frombuffer(values).tolist(), strict=True)
-    return ", ".join(f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+    bad = (f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+    return printable(", ".join(bad))
 
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:

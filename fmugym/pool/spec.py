@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import Variable
@@ -13,6 +14,7 @@ __all__ = [
     "DEFAULT_LEAK_LIMIT",
     "ISOLATIONS",
     "PoolSpec",
+    "ResetMethod",
     "whole_number_of_steps",
 ]
 
@@ -24,6 +26,21 @@ DEFAULT_CALL_TIMEOUT: Final = 60.0
 
 DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
 """Bytes that resets may take for good."""
+
+
+class ResetMethod(StrEnum):
+    """How an instance starts an episode anew, from the fastest way to the surest."""
+
+    RESTORE = "restore"
+    """Restore the FMU state after initialization where the start values are the same."""
+    RESET = "reset"
+    """Call the FMU's reset function and initialize the instance."""
+    INSTANCE = "instance"
+    """Free the instance and make a new one."""
+    LIBRARY = "library"
+    """Also load the shared library anew, so that its global variables begin anew."""
+    PROCESS = "process"
+    """Start a new worker process."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +62,8 @@ class PoolSpec:
         fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
             8 ... smaller ones, from the FMU state before it.
         leak_limit: Bytes that resets may take before instances are recycled; None for ever.
+        reset_method: How instances start an episode anew.
+        input_limits: Lowest and highest value of each input; empty for those of the FMU.
     """
 
     inputs: tuple[Variable, ...]
@@ -59,6 +78,8 @@ class PoolSpec:
     strings: tuple[tuple[Variable, str], ...] = ()
     fault_retries: int = 0
     leak_limit: int | None = None
+    reset_method: ResetMethod = ResetMethod.RESET
+    input_limits: tuple[tuple[float, float], ...] = ()
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; never a sum, which would drift."""

@@ -13,6 +13,7 @@ from fmugym.checks import check_number
 from fmugym.distributions import Uniform, draw, is_distribution
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import checked_value
+from fmugym.trial.rehearsal import Starts
 
 __all__ = ["Episode", "EpisodePlan", "Sampler"]
 
@@ -116,6 +117,12 @@ class EpisodePlan:
     def scaled(self, fractions: FloatArray) -> FloatArray:
         """Turn uniform numbers of [0, 1), shape (draws, M), into the drawn values."""
         return self._low + self._width * fractions
+
+    def starts(self) -> Starts:
+        """Draw two episodes for the trial of resets, from a stream that nothing else uses."""
+        rng = np.random.default_rng(0)
+        columns = [self.draw(rng).start_values[:, 0].tolist() for _ in range(2)]
+        return Starts(self.model_variables, tuple(zip(*columns, strict=True)))
 
     def draw(self, rng: np.random.Generator) -> Episode:
         """Draw one episode.

@@ -58,12 +58,16 @@ class Interface:
         Raises:
             ConfigError: If the FMU's contradict each other.
         """
-        low, high = self.config.bounds.get(variable.name, (variable.minimum, variable.maximum))
+        low, high = self._limits(variable)
         if not low <= high:
             raise ConfigError(
                 f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds'"
             )
         return low, high
+
+    def _limits(self, variable: Variable) -> tuple[float, float]:
+        low, high = self.config.bounds.get(variable.name, (variable.minimum, variable.maximum))
+        return float(low), float(high)
 
     def pool_spec(self) -> PoolSpec:
         """What the pool has to do.
@@ -82,11 +86,12 @@ class Interface:
             substeps=config.substeps,
             start_time=description.start_time if start is None else start,
             stop_time=config.stop_time,
-            tolerance=config.tolerance,
+            tolerance=description.tolerance if config.tolerance is None else config.tolerance,
             warm_up_steps=self._warm_up_steps(),
             strings=self.strings,
             fault_retries=config.fault_retries,
             leak_limit=config.leak_limit,
+            input_limits=tuple(map(self._limits, self.inputs)),
         )
 
     def _warm_up_steps(self) -> int:

@@ -17,6 +17,7 @@ from fmugym.checks import check_option, check_path
 from fmugym.config import EnvConfig
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
+from fmugym.task.episode import EpisodePlan
 from fmugym.trial.opening import make_pool
 
 __all__ = ["open_fmu", "open_pool", "request_pool"]
@@ -58,6 +59,7 @@ def open_pool(
     fmu: FMU,
     spec: PoolSpec,
     config: EnvConfig,
+    plan: EpisodePlan,
     log: logging.Logger,
     backend: Any,
     isolation: str | None,
@@ -74,6 +76,8 @@ def open_pool(
     options: dict[str, Any] = {
         "isolation": isolation or config.isolation,
         "call_timeout": config.call_timeout,
+        "reset_method": config.reset_method,
+        "starts": plan.starts(),
         **requested,
     }
     if backend is not None:

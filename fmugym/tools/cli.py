@@ -4,13 +4,14 @@
 
     fmugym info model.fmu [--json] [--all] [--filter GLOB]
     fmugym skeleton model.fmu [--output my_env.py]
+    fmugym stand-in model.fmu [--folder FOLDER]
 
-Neither executes anything of the FMU. Output is printable ASCII. The exit code is 0, 1 where the
-FMU or a file cannot be used (one line on the error stream says why), or 2 where the arguments are
+None of them executes anything of the FMU. Output is printable ASCII. The exit code is 0, 1 if the
+FMU or a file cannot be used (one line on the error stream says why), or 2 if the arguments are
 wrong.
 
-The JSON of ``info --json`` is one object. Keys are added at times; when one goes or changes its
-meaning, ``schema`` is raised. What the FMU does not give is null, or ``""`` for a text.
+``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
+or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
 
 - ``schema``: 1
 - ``path``: absolute path of the FMU
@@ -19,16 +20,23 @@ meaning, ``schema`` is raised. What the FMU does not give is null, or ``""`` for
 - ``interfaces``: of ``co-simulation``, ``model exchange``, ``scheduled execution``
 - ``platforms``: the folders under ``binaries/``
 - ``platform``, ``library``: the folder and the file that this machine needs
-- ``runs_here``: whether the FMU has that file
+- ``runs_here``: whether nothing is known that would keep the FMU from being loaded
+- ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
+- ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
+  with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``
+- ``execution_tool``: the tool that must be installed; null if the FMU needs none
+- ``trial``: what the first meeting on this machine has shown: ``deterministic``, the grades of
+  ``resets`` by method, the ``reset_method``, what ``several_instances`` need, ``isolate``, and the
+  ``deaths`` of workers; null before
 - ``capabilities``: flags by name, those of ``fmugym.archive.description.Capabilities``
 - ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
 - ``fixed_internal_step_size``: in s
-- ``findings``: texts, what is not valid in the model description
+- ``findings``: texts, what breaks rules in the archive and in the model description
 - ``variable_counts``: number of all variables by causality
-- ``variables``: those asked for, in the order of the XML, each with ``name``, ``causality``,
-  ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``, ``nominal``,
-  ``start`` (in the variable's type; a text for arrays and what is malformed or not finite),
-  ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
+- ``variables``: those that were asked for, in the order of the XML, each with ``name``,
+  ``causality``, ``variability``, ``initial``, ``type``, ``shape``, ``unit``, ``min``, ``max``,
+  ``nominal``, ``start`` (in the variable's type; a text for arrays and for what is malformed or not
+  finite), ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
   ``settable_in_step``
 """
 
@@ -46,6 +54,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import FMUGymError
 from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.skeleton import Skeleton
+from fmugym.tools.stand_in import build_stand_in
 
 __all__ = ["main"]
 
@@ -66,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments.run(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader, ``head`` say, has seen enough
+    except BrokenPipeError:  # the reader, for example ``head``, has ended
         _drop_output()
     except (FMUGymError, OSError) as error:
         print(f"fmugym: error: {plain(error)}", file=sys.stderr)
@@ -82,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_info(commands)
     _add_skeleton(commands)
+    _add_stand_in(commands)
     return parser
 
 
@@ -110,6 +120,16 @@ def _add_skeleton(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     )
 
 
+def _add_stand_in(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "build a replacement for an old libgfortran that an FMU needs; takes a C compiler"
+    command = commands.add_parser("stand-in", help=text, description=text.capitalize() + ".")
+    command.set_defaults(run=_stand_in)
+    command.add_argument("fmu", type=Path, metavar="FMU")
+    command.add_argument(
+        "--folder", type=Path, default=Path(), help="where to write it; by default this folder"
+    )
+
+
 def _info(arguments: argparse.Namespace) -> None:
     fmu = FMU(arguments.fmu)
     facts = overview(fmu, everything=arguments.all, pattern=arguments.filter)
@@ -127,6 +147,16 @@ def _skeleton(arguments: argparse.Namespace) -> None:
         print(f"fmugym: note: {plain(note)}", file=sys.stderr)
 
 
+def _stand_in(arguments: argparse.Namespace) -> None:
+    built = build_stand_in(FMU(arguments.fmu), arguments.folder)
+    for library in built:
+        print(plain(f"{library.path}: {len(library.served)} functions"))
+        for name in library.lacking:
+            print(plain(f"  without {name}: an FMU that calls it ends its process"))
+    paths = ", ".join(repr(str(library.path)) for library in built)
+    print(plain(f'Put it into the config: "preload": [{paths}]'))
+
+
 def _drop_output() -> None:
-    """Let what is still buffered go nowhere; the interpreter would complain at its end."""
+    """Discard what is still buffered, which the interpreter would complain about at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Linear models of FMUs, from the directional derivatives that they provide (FMI 2.0 and 3.0)."""
+"""Linear models of FMUs from their directional derivatives (FMI 2.0 and 3.0)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LinearModel:
     Attributes:
         A: Derivatives of ``derivatives`` by ``states``, shape (n, n).
         B: Derivatives of ``derivatives`` by ``inputs``, shape (n, m).
-        f: The values of ``derivatives`` where the FMU was linearized, shape (n,); 0 at an
+        f: The values of ``derivatives`` at the point of linearization, shape (n,); 0 at an
             equilibrium.
         x0: The values of ``states`` there, shape (n,).
         u0: The values of ``inputs`` there, shape (m,).
@@ -63,24 +63,24 @@ def linearize(
     inputs: str | Sequence[str] | None = None,
     at: Mapping[str, float | str] | None = None,
 ) -> LinearModel:
-    """Linearize an FMU where it is after its initialization.
+    """Linearize an FMU at the point it reaches by its initialization.
 
     The FMU computes the derivatives itself, by ``fmi2GetDirectionalDerivative`` or
-    ``fmi3GetDirectionalDerivative``: there is no step size and no error of truncation.
+    ``fmi3GetDirectionalDerivative``. So there is no step size and no truncation error.
 
     Args:
-        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` hold.
-        states: Names of continuous states, or one name; by default all that the FMU declares. What
-            is left out is held constant.
+        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` are used.
+        states: Names of continuous states, or one name; by default all that the FMU declares. The
+            other states are held constant.
         inputs: Names of continuous inputs, or one name; by default all of them.
-        at: Values set before initialization by name: start values of states, inputs, parameters.
+        at: Values by name, set before initialization: start values of states, inputs, parameters.
 
     Returns:
         The linear model.
 
     Raises:
         ConfigError: If the FMU provides no directional derivatives or declares no states; if a name
-            is unknown, or that of a variable of another kind; if a value does not fit.
+            is unknown or belongs to a variable of another kind; if a value does not fit.
         FMULoadError: If the FMU cannot be loaded.
         SimulationError: If the FMU fails.
     """
@@ -125,7 +125,7 @@ def _chosen(
     names: str | Sequence[str] | None,
     known: Sequence[str],
 ) -> Variables:
-    """Look the chosen variables up; all that are known, if none was chosen."""
+    """Look up the chosen variables, or all known ones if none were chosen."""
     names = known if names is None else (names,) if isinstance(names, str) else names
     for name in names:
         variable = description.variable(name)
@@ -140,7 +140,7 @@ def _chosen(
 def _start_values(
     description: ModelDescription, values: Mapping[str, float | str]
 ) -> dict[Variable, float | str]:
-    """Check the values; those of Strings stay texts."""
+    """Check the values; values of Strings stay texts."""
     checked: dict[Variable, float | str] = {}
     for name, value in values.items():
         variable = start_variable(description, name, value)

@@ -1,6 +1,6 @@
-"""What a user wants to know of an FMU at first sight, as plain data and as text.
+"""The facts about an FMU that a user asks for first, as plain data and as text.
 
-Nothing of the FMU is executed: all of it stands in the archive's listing and the XML.
+They come from the archive and the XML. Nothing of the FMU is executed.
 """
 
 from __future__ import annotations
@@ -14,14 +14,17 @@ from typing import Any, Final
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.packages import source_of
+from fmugym.errors import FMULoadError, printable
+from fmugym.trial.trial import known_verdict
 
 __all__ = ["as_text", "overview", "plain", "start_value"]
 
 SCHEMA: Final = 1
-"""Raised when a key of the overview goes or changes its meaning; new keys do not raise it."""
+"""Raised when a key goes or changes its meaning; new keys do not raise it."""
 
 SHOWN: Final = ("input", "output", "parameter")
-"""The causalities that are listed without being asked for."""
+"""The causalities that are listed by default."""
 
 _HEADINGS: Final = {
     "input": "Inputs",
@@ -34,16 +37,17 @@ _HEADINGS: Final = {
 }
 _COLUMNS: Final = ("name", "type", "unit", "range", "start", "variability", "description")
 _WIDEST: Final = 44
+_MOST_FINDINGS: Final = 100
 
 
 def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) -> dict[str, Any]:
-    """Gather what there is to say of an FMU.
+    """Gather the facts about an FMU.
 
     Args:
         fmu: The FMU.
-        everything: List variables of every causality, not only those of ``SHOWN``.
-        pattern: List only variables whose name matches, of every causality. ``*`` stands for any
-            text and ``?`` for one character; brackets stand for themselves, as FMI names have them.
+        everything: List variables of all causalities, not only those in ``SHOWN``.
+        pattern: List the variables of all causalities whose name matches. ``*`` matches any text
+            and ``?`` one character; brackets match themselves, since names of arrays have them.
 
     Returns:
         Dicts, lists, strings, finite numbers, Booleans and None; ``fmugym.tools.cli`` describes
@@ -60,13 +64,50 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         "platform": fmu.platform,
         "library": fmu.library,
         "runs_here": fmu.runs_here,
+        "obstacles": list(fmu.obstacles),
+        "missing_libraries": [_library_row(name) for name in _missing_libraries(fmu)],
+        "execution_tool": _execution_tool(fmu),
         "capabilities": asdict(description.capabilities),
         "default_experiment": {name: getattr(description, name) for name in _TIMES},
         "fixed_internal_step_size": description.fixed_internal_step_size,
-        "findings": list(description.findings),
+        "trial": _trial(fmu),
+        "findings": list(fmu.findings),
         "variable_counts": dict(Counter(variable.causality for variable in variables)),
         "variables": [_row(v) for v in variables if _is_wanted(v, everything, pattern)],
     }
+
+
+def _trial(fmu: FMU) -> dict[str, Any] | None:
+    """What the first meeting has shown on this machine; None if there was none yet."""
+    verdict = known_verdict(fmu)
+    if verdict is None:
+        return None
+    return {
+        "deterministic": verdict.deterministic,
+        "resets": {str(method): str(grade) for method, grade in verdict.resets.items()},
+        "reset_method": str(verdict.reset_method) if verdict.resets else None,
+        "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
+        "isolate": verdict.isolate,
+        "deaths": list(verdict.reasons),
+    }
+
+
+def _missing_libraries(fmu: FMU) -> tuple[str, ...]:
+    try:
+        return fmu.missing_libraries
+    except FMULoadError:  # the obstacles tell why
+        return ()
+
+
+def _library_row(name: str) -> dict[str, str]:
+    return {"name": name, **source_of(name)._asdict()}
+
+
+def _execution_tool(fmu: FMU) -> str | None:
+    """Name the tool that must be installed; the generation tool is the only hint at it."""
+    if not fmu.description.capabilities.needs_execution_tool:
+        return None
+    return fmu.description.generation_tool or "the tool that exported it"
 
 
 _TEXTS: Final = (
@@ -116,7 +157,7 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
     """Convert the start value, which the XML has as text, to the variable's type.
 
     Returns:
-        The value; the text itself for strings, arrays and whatever is not finite or malformed.
+        The value; the text itself for strings, arrays and what is not finite or malformed.
     """
     text = variable.start
     if text is None or variable.shape or variable.kind in {"string", "binary", "clock"}:
@@ -133,14 +174,14 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
 def plain(text: object) -> str:
     """Bring a text of a foreign file into one line of printable ASCII.
 
-    The rest is escaped: an old console cannot show it, and a terminal may obey it.
+    Other characters are escaped: an old console cannot show them, and a terminal may obey them.
     """
-    line = " ".join(str(text).split())
-    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in line)
+    line = printable(" ".join(str(text).split()))
+    return line.encode("ascii", "backslashreplace").decode()
 
 
 def as_text(facts: Mapping[str, Any]) -> str:
-    """Lay an overview out for the reader of a terminal.
+    """Format an overview for a terminal.
 
     Args:
         facts: What ``overview`` returned.
@@ -161,6 +202,7 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
         "interfaces": ", ".join(facts["interfaces"]),
         "platforms": ", ".join(facts["platforms"]) or "none",
         "this machine": _this_machine(facts),
+        "first meeting": _first_meeting(facts["trial"]),
         "default experiment": _experiment(facts),
         "capabilities": _capabilities(facts["capabilities"]),
     }
@@ -169,9 +211,41 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _this_machine(facts: Mapping[str, Any]) -> str:
-    if facts["runs_here"]:
-        return f"{facts['platform']}: runs here"
-    return f"{facts['platform']}: does NOT run here, there is no {facts['library']}"
+    platform, tool = facts["platform"], facts["execution_tool"]
+    if not facts["runs_here"]:
+        return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
+    return f"{platform}: runs here" + (f" if it is installed: {tool}" if tool else "")
+
+
+def _first_meeting(trial: Mapping[str, Any] | None) -> str:
+    if trial is None:
+        return "not yet, or exempt"
+    grades = ", ".join(f"{method} is {_GRADES[g]}" for method, g in trial["resets"].items())
+    parts = [grades] if grades else []
+    if trial["reset_method"]:
+        parts.append(f"episodes begin by {trial['reset_method']!r}")
+    if not trial["deterministic"]:
+        parts.append("fresh instances differ")
+    if trial["several_instances"]:
+        parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
+    if trial["isolate"]:
+        parts.append("it harms its process and is isolated")
+    return "; ".join([*parts, *trial["deaths"]]) or "it survived"
+
+
+_GRADES: Final = {
+    "bitwise": "right to the last bit",
+    "tolerance": "right within the solver's tolerance",
+    "wrong": "wrong",
+    "fails": "failing",
+    "absent": "not offered",
+}
+_NEEDS: Final = {
+    "independent": "independent",
+    "one thread": "one thread for all",
+    "libraries": "a copy of the library each",
+    "processes": "a process each",
+}
 
 
 def _experiment(facts: Mapping[str, Any]) -> str:
@@ -192,13 +266,15 @@ def _capabilities(flags: Mapping[str, bool]) -> str:
 
 def _findings(facts: Mapping[str, Any]) -> Iterator[str]:
     if facts["findings"]:
-        yield f"\nFindings in the model description ({len(facts['findings'])})"
-    for finding in facts["findings"]:
+        yield f"\nFindings ({len(facts['findings'])})"
+    for finding in facts["findings"][:_MOST_FINDINGS]:
         yield f"  - {plain(finding)}"
+    if len(facts["findings"]) > _MOST_FINDINGS:
+        yield "  - more are listed with --json"
 
 
 def _tables(facts: Mapping[str, Any]) -> Iterator[str]:
-    causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones come last
+    causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones last
     for causality in dict.fromkeys(causalities):
         rows = [v for v in facts["variables"] if v["causality"] == causality]
         if rows:

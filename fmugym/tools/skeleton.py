@@ -1,7 +1,7 @@
-"""The first lines of an environment for an FMU, written from its model description.
+"""A first version of an environment for an FMU, written from its model description.
 
-The FMU's names and texts come from a foreign file: they enter the program only as literals and
-in comments of one line, so that none of them can become code.
+The names and texts come from a foreign file. They enter the program only as literals and in
+comments of one line, so that none of them can become code.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from fmugym.tools.overview import plain, start_value
 __all__ = ["Skeleton"]
 
 MOST_PARAMETERS: Final = 40
-"""Parameters beyond this number are left to the reader of ``fmugym info``."""
+"""More parameters than this are left out; ``fmugym info`` lists them."""
 
 MOST_LOCALS: Final = 8
-"""Locals that stand in for outputs where the FMU has none."""
+"""Locals that replace outputs where the FMU has none."""
 
 _PROGRAM: Final = '''\
-"""An environment for the FMU {file}; what is marked with TODO is yours to decide.
+"""An environment for the FMU {file}. Decide what is marked with TODO.
 
 Running this file checks the environment.
 """
@@ -44,7 +44,7 @@ FMU_PATH = {path}  # a relative path is relative to this file
 
 
 class {name}(fmugym.FMI{version}CSEnv):
-    """TODO: what there is to be learnt."""
+    """TODO: what is there to learn?"""
 
     def __init__(self, log_level: int = logging.WARNING) -> None:
         config = {{
@@ -74,7 +74,7 @@ _IMPORT_WITHOUT_INPUT: Final = "from gymnasium import spaces\n\n"
 
 _HOOKS_WITHOUT_INPUT: Final = '''
     def _get_action_space(self) -> spaces.Space[Any]:
-        """The FMU has no input that a number can be written to: there is one action, to wait."""
+        """The FMU has no numeric input, so the only action is to wait."""
         return spaces.Discrete(1)  # TODO: or name a tunable parameter as an input
 
     def _get_inputs(self) -> Any:
@@ -83,13 +83,13 @@ _HOOKS_WITHOUT_INPUT: Final = '''
 
 
 class Skeleton:
-    """The Python file for one FMU, and what in it is a guess.
+    """The Python file for one FMU, with notes on what in it is a guess.
 
     Args:
         fmu: The FMU; nothing of it is executed.
 
     Raises:
-        ConfigError: If the FMU has nothing that a number can be read from.
+        ConfigError: If the FMU has no numeric variable to observe.
     """
 
     def __init__(self, fmu: FMU) -> None:
@@ -102,18 +102,18 @@ class Skeleton:
 
     @cached_property
     def inputs(self) -> list[Variable]:
-        """The inputs that a number can be written to."""
+        """The numeric inputs."""
         return [v for v in self._of("input") if v.numeric]
 
     @cached_property
     def outputs(self) -> list[Variable]:
-        """The outputs that a number can be read from, or else some locals."""
+        """The numeric outputs, or some locals if there are none."""
         outputs = [v for v in self._of("output") if v.numeric]
         return outputs or [v for v in self._of("local") if v.numeric][:MOST_LOCALS]
 
     @cached_property
     def parameters(self) -> list[Variable]:
-        """The parameters that can be set and whose value is known, at most ``MOST_PARAMETERS``."""
+        """The parameters that can be set and have a start value, at most ``MOST_PARAMETERS``."""
         return self._settable_parameters[:MOST_PARAMETERS]
 
     @cached_property
@@ -125,23 +125,23 @@ class Skeleton:
 
     @property
     def class_name(self) -> str:
-        """The last part of the model's name, as a name for a class."""
+        """A name for the class, made of the last part of the model's name."""
         words = re.findall(r"[A-Za-z0-9]+", self._description.model_name.split(".")[-1])
         name = "".join(word[0].upper() + word[1:] for word in words)
         return ("Model" if not name or name[0].isdigit() else "") + name + "Env"
 
     def notes(self) -> Iterator[str]:
-        """What the user has to know before the file is of use."""
+        """What the user has to decide before the file is useful."""
         for variable in filter(_needs_bounds, self.inputs):
             yield f"the FMU gives no limits of input {variable.name!r}; set them in 'bounds'"
         if not self.inputs:
-            yield "the FMU has no input that a number can be written to"
+            yield "the FMU has no numeric input"
         if not self._of("output"):
-            yield "the FMU has no outputs; locals stand in for them"
+            yield "the FMU has no outputs; locals replace them"
         if self._description.step_size is None:
             yield "the FMU gives no step size; set 'time_step'"
-        if not self._fmu.runs_here:
-            yield f"the FMU does not run on this machine: it has no {self._fmu.library}"
+        for obstacle in self._fmu.obstacles:
+            yield f"the FMU does not run on this machine: {obstacle}"
 
     def text(self) -> str:
         """The Python file, ASCII."""
@@ -187,7 +187,7 @@ class Skeleton:
         yield f'"max_episode_steps": {self._episode_steps(step)},'
 
     def _episode_steps(self, step: float) -> int:
-        """The steps of the FMU's default experiment, where it has one of sensible length."""
+        """The steps of the FMU's default experiment, or 200 if it has none of sensible length."""
         stop = self._description.stop_time
         steps = 0.0 if stop is None else (stop - self._description.start_time) / step
         return round(steps) if 1 <= steps <= 100_000 else 200
@@ -212,7 +212,7 @@ def _needs_bounds(variable: Variable) -> bool:
 
 
 def _bounds_line(variable: Variable) -> str:
-    """Guess the side that is missing by the nominal value, about which the variable is scaled."""
+    """Guess missing limits from the nominal value, which tells the scale of the variable."""
     low, high = variable.minimum, variable.maximum
     reach = abs(variable.nominal or 1.0)
     if not math.isfinite(low):
@@ -223,12 +223,12 @@ def _bounds_line(variable: Variable) -> str:
 
 
 def _literal(variable: Variable) -> str:
-    """The start value as the config takes it; empty if there is none that it takes."""
+    """The start value as the config takes it; empty if the config takes none."""
     value = start_value(variable)
     if variable.kind == "string" and not variable.shape and isinstance(value, str):
         return _quoted(value)
     if not variable.numeric or value is None or isinstance(value, str):
-        return ""  # a text here is malformed or not finite
+        return ""  # a text is malformed or not finite here
     names = [name for name, number in variable.items if number == value]
     if variable.items:
         return _quoted(names[0]) if names else ""

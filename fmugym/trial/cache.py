@@ -8,13 +8,21 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import stat
 import sys
 import tempfile
 from pathlib import Path
+from typing import Final
 
 __all__ = ["cache_folder", "recall", "remember"]
 
 logger = logging.getLogger(__name__)
+
+_LARGEST: Final = 2**20
+"""Bytes of a text."""
+
+_READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Neither follow a link nor wait for the other end of a pipe; Windows has no such flags."""
 
 
 def cache_folder() -> Path:
@@ -39,9 +47,18 @@ def _system_folder() -> Path:
 
 
 def recall(key: str) -> str | None:
-    """Find what was remembered under a key, or None."""
+    """Find what was remembered under a key, or None.
+
+    Nothing but a regular file of a sensible size is read: a pipe would never end, and a link may
+    lead anywhere.
+    """
     try:
-        return (cache_folder() / key).read_text(encoding="utf-8")
+        handle = os.open(cache_folder() / key, _READ)
+        with os.fdopen(handle, "rb") as file:
+            status = os.fstat(handle)
+            if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
+                return None
+            return file.read(_LARGEST).decode()
     except (OSError, RuntimeError, ValueError):
         return None
 

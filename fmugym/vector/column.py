@@ -11,6 +11,7 @@ from fmugym.archive.description import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["PoolColumn"]
 
@@ -97,6 +98,11 @@ class PoolColumn(Pool):
     def is_real(self) -> bool:
         """See ``Pool.is_real``."""
         return self._pool.is_real
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """See ``Pool.reset_method``."""
+        return self._pool.reset_method
 
     def halt(self) -> None:
         """See ``Pool.halt``; the other instances stop, too."""

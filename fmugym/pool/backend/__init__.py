@@ -1,1 +1,1 @@
-"""Pools of rigs that stand in for an FMU, and the clocks that pace them."""
+"""Rigs in the place of FMU instances, and the clocks that pace them."""

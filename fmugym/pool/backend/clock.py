@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final, Protocol
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_number
 
 __all__ = ["Clock", "ManualClock", "RealClock"]
 
@@ -43,13 +43,11 @@ class RealClock:
             0.1 ms are 1 ms of the clock's time at ``speed=10``.
 
     Raises:
-        ConfigError: If the speed is not positive.
+        ConfigError: If the speed is not a positive, finite number.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
-        if not speed > 0.0:
-            raise ConfigError(f"speed must be positive, not {speed!r}")
-        self.speed = speed
+        self.speed = check_number("speed", speed, positive=True)
         self._start = time.perf_counter()
 
     def time(self) -> float:
@@ -72,10 +70,13 @@ class ManualClock:
 
     Args:
         start: The time to begin with, in s.
+
+    Raises:
+        ConfigError: If it is not a finite number.
     """
 
     def __init__(self, start: float = 0.0) -> None:
-        self._now = start
+        self._now = check_number("start", start)
         self._changed = threading.Condition()
         self._crew: set[threading.Thread] = set()
         self._working_for: dict[threading.Thread, set[threading.Thread]] = {}
@@ -89,17 +90,20 @@ class ManualClock:
         """Move the time on, in s, and wake whoever slept until then.
 
         Raises:
-            ConfigError: If the time would go backwards.
+            ConfigError: If the time would go backwards, or is not a finite number.
         """
-        if not seconds >= 0.0:
-            raise ConfigError(f"time cannot be moved by {seconds!r} s")
+        step = check_number("the seconds to advance by", seconds, 0.0)
         with self._changed:
-            self._now += seconds
+            self._now += step
             self._changed.notify_all()
 
     def sleep(self, seconds: float) -> None:
-        """Wait for some time, in s; see the class for what moves the clock meanwhile."""
-        if not seconds > 0.0:
+        """Wait for some time, in s; see the class for what moves the clock meanwhile.
+
+        Raises:
+            ConfigError: If the time is not a finite number.
+        """
+        if check_number("the seconds to sleep", seconds) <= 0.0:
             return
         thread = threading.current_thread()
         with self._changed:

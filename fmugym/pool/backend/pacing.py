@@ -1,4 +1,4 @@
-"""Real time for pools: the schedule of the steps, and the order for one."""
+"""Steps in real time: how a user asks for them, and their schedule."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from fmugym.pool.base import FloatArray, MaskArray
 __all__ = ["Paced", "Schedule"]
 
 _TOLERANCE: Final = 0.1
-"""Lateness that is no miss, in periods."""
+"""How late a step may be without counting as a miss, in periods."""
 
 _PATIENCE: Final = 3
-"""Periods without a step after which a backend holds, if nothing else is asked for."""
+"""Periods without a step after which a backend holds, by default."""
 
 
 @dataclass(frozen=True)
 class Paced:
-    """A backend whose steps are paced: each waits for its tick, one time step after the last.
+    """A backend that is stepped in real time.
 
-    Pacing is elastic: what comes too late is not made up for, but shifts all ticks that follow.
+    Each step waits for its tick, one time step after the last tick. Pacing is elastic: a late step
+    shifts all ticks that follow.
 
     Args:
-        backend: One, a sequence, or a function; see ``BackendPool``.
-        clock: What tells the time; by default the machine's.
-        hold_after: Time without a step after which a backend is asked to ``hold``, and again after
-            the same time, in s; by default three time steps.
+        backend: One backend, a sequence, or a function; see ``BackendPool``.
+        clock: Tells the time; by default the machine's clock.
+        hold_after: Time without a step after which a backend is asked to ``hold``, and asked again
+            each time it has passed once more, in s. By default three time steps.
 
     Raises:
         ConfigError: If ``hold_after`` is not positive.
@@ -49,7 +50,7 @@ class Paced:
             object.__setattr__(self, "hold_after", number)
 
     def patience(self, period: float) -> float:
-        """Return ``hold_after`` or its default for a period, in s."""
+        """Return ``hold_after`` in s, or its default for a time step in s."""
         return _PATIENCE * period if self.hold_after is None else self.hold_after
 
 
@@ -58,11 +59,11 @@ class Schedule:
 
     Args:
         period: Time from one tick to the next, in s.
-        clock: What tells the time.
+        clock: Tells the time.
         count: N.
 
     Attributes:
-        misses: How many ticks of this episode came too late, by more than a tenth of the period,
+        misses: How many steps of this episode were late by more than a tenth of the period,
             shape (N,).
         worst: The largest lateness in this episode, in s, shape (N,).
     """
@@ -74,13 +75,13 @@ class Schedule:
         self.worst: FloatArray = np.zeros(count)
 
     def start(self, chosen: MaskArray) -> None:
-        """Begin an episode now, for some of them: the first tick is a period from now."""
+        """Begin an episode of some backends; their first tick is one period from now."""
         self._due[chosen] = self._clock.time() + self._period
         self.misses[chosen] = 0
         self.worst[chosen] = 0.0
 
     def wait(self, chosen: MaskArray) -> None:
-        """Wait for the next tick of some of them, at least one; not at all if it is over."""
+        """Wait for the next tick of some backends, at least one; return at once if it is over."""
         tick = float(self._due[chosen].max())
         self._clock.sleep(tick - self._clock.time())
         now = self._clock.time()

@@ -1,4 +1,4 @@
-"""Pools of what stands in for FMU instances: rigs, cells of a lab, other simulators."""
+"""A pool of rigs, lab cells or other simulators in the place of FMU instances."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,200 +19,37 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.backend.clock import Clock
 from fmugym.pool.backend.pacing import Paced, Schedule
+from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import Column, CountedPool, no_counts, note
 
-__all__ = ["Backend", "BackendPool", "Outputs"]
+__all__ = ["Backend", "BackendPool"]
 
 logger = logging.getLogger(__name__)
 
-Outputs = Mapping[str, float] | Sequence[float] | npt.NDArray[Any]
-"""The outputs (and monitored variables) by name, or in the order of the config."""
-
 _LONGEST_STOP: Final = 10.0
-"""How long a stop is waited for, in s; it goes on in its thread after that."""
-
-
-class Backend(Protocol):
-    """What stands in for one FMU instance.
-
-    What fails is raised: the step then fails as that of an FMU does, with the exception's text for
-    a reason, and no step follows before the next reset.
-
-    A backend may have two things more. ``hold()`` takes the safe action and lets the session live
-    on; it is called after a fault, and by `Paced` while nobody steps. A backend with it is only
-    called by a thread of its own, after construction. ``sample_time`` is the time at which the
-    newest outputs were measured, in s of the clock of `Paced`; without it they are taken to be of
-    the time of the call.
-    """
-
-    def reset(self, start_values: Mapping[str, Any]) -> Outputs:
-        """Start an episode.
-
-        Args:
-            start_values: The parameters of the config and of the options of ``reset``, by name;
-                a backend that cannot set one should raise.
-
-        Returns:
-            The outputs.
-        """
-        ...
-
-    def step(self, inputs: Mapping[str, float]) -> tuple[Outputs, int]:
-        """Apply inputs and read outputs.
-
-        Args:
-            inputs: The inputs by name, in the order of the config.
-
-        Returns:
-            The outputs, and a ``fmugym.Status``: ``Status.OK`` (0), or for example
-            ``Status.TERMINATED`` where the backend wants the episode to end.
-        """
-        ...
-
-    def stop(self) -> None:
-        """Come to a safe rest and end the session; ``reset`` may start another one.
-
-        It follows every reset, at the latest when the interpreter exits: also one that failed, and
-        also after exceptions and Ctrl-C.
-        """
-        ...
-
-
-class _Outcome(NamedTuple):
-    """What a call gave.
-
-    Attributes:
-        status: How it went.
-        values: The outputs where they are valid.
-        reason: Why it failed, or "".
-        sample_time: When the outputs were measured, in s of the clock; NaN if that is not known.
-    """
-
-    status: int
-    values: list[float] | None = None
-    reason: str = ""
-    sample_time: float = math.nan
-
-
-class _Rig:
-    """A backend, and what must be known to stop it. Its methods raise no Exception."""
-
-    def __init__(self, backend: Backend, spec: PoolSpec, now: Callable[[], float]) -> None:
-        self._backend, self._now = backend, now
-        self._hold: Callable[[], None] | None = getattr(backend, "hold", None)
-        self._input_names = [variable.name for variable in spec.inputs]
-        self._output_names = [variable.name for variable in spec.outputs]
-        self._is_running = False
-
-    @property
-    def can_hold(self) -> bool:
-        """Whether the backend has a safe action."""
-        return self._hold is not None
-
-    def reset(self, start_values: Mapping[str, Any]) -> _Outcome:
-        """Start an episode; a start that fails is stopped."""
-        self._is_running = True
-        outcome = self._try("reset", lambda: (self._backend.reset(start_values), Status.OK))
-        if outcome.values is None:
-            self.stop()
-        return outcome
-
-    def step(self, inputs: Sequence[float]) -> _Outcome:
-        """Do one step; a step that fails is followed by the safe action, or else by a stop."""
-        named = dict(zip(self._input_names, inputs, strict=True))
-        outcome = self._try("step", lambda: self._backend.step(named))
-        if outcome.values is None:
-            (self.hold if self.can_hold else self.stop)()
-        return outcome
-
-    def hold(self) -> None:
-        """Take the safe action, if an episode runs; the next step tells if that failed."""
-        if self._is_running and self._hold is not None:
-            try:
-                self._hold()
-            except Exception as error:
-                logger.debug("%s.hold failed: %s", type(self._backend).__name__, error)
-
-    def stop(self) -> None:
-        """End the session, if there is one."""
-        if self._is_running:
-            self._is_running = False
-            try:
-                self._backend.stop()
-            except Exception as error:
-                logger.warning("%s.stop failed: %s", type(self._backend).__name__, error)
-
-    def _try(self, method: str, call: Callable[[], Any]) -> _Outcome:
-        called_at = self._now()
-        try:
-            outputs, status = _pair(call())
-            outcome = self._judged(outputs, status)
-            measured = float(getattr(self._backend, "sample_time", called_at))
-        except Exception as error:
-            outcome, measured = _Outcome(Status.ERROR, None, _text(error)), called_at
-        if outcome.reason:
-            name = f"{type(self._backend).__name__}.{method}"
-            outcome = outcome._replace(reason=f"{name}: {outcome.reason}")
-        return outcome._replace(sample_time=measured)
-
-    def _judged(self, outputs: Any, status: int) -> _Outcome:
-        if status not in (Status.OK, Status.WARNING, Status.TERMINATED):
-            return _Outcome(status, None, f"it returned the status {Status(status).name}")
-        values = self._values(outputs)
-        bad = [
-            f"{name} = {value}"
-            for name, value in zip(self._output_names, values, strict=True)
-            if not math.isfinite(value)
-        ]
-        if bad:
-            reason = f"the outputs are not finite: {', '.join(bad)}"
-            return _Outcome(Status.NOT_FINITE, None, reason)
-        return _Outcome(status, values)
-
-    def _values(self, outputs: Any) -> list[float]:
-        names = self._output_names
-        if isinstance(outputs, Mapping):
-            missing = [name for name in names if name not in outputs]
-            if missing:
-                raise SimulationError(f"the outputs lack {', '.join(map(repr, missing))}")
-            outputs = [outputs[name] for name in names]
-        values: list[float] = np.ravel(np.asarray(outputs, np.float64)).tolist()
-        if len(values) != len(names):
-            raise SimulationError(
-                f"there are {len(values)} outputs, expected {len(names)} ({', '.join(names)})"
-            )
-        return values
-
-
-def _pair(result: Any) -> tuple[Any, int]:
-    if not isinstance(result, tuple) or len(result) != 2:
-        raise SimulationError(f"it returned {result!r}, expected outputs and a status")
-    return result[0], Status(result[1])
-
-
-def _text(error: Exception) -> str:
-    return f"{error}" if isinstance(error, SimulationError) else f"{type(error).__name__}: {error}"
+"""How long to wait for a stop, in s; its thread goes on with it after that."""
 
 
 class BackendPool(CountedPool):
     """N backends in the place of N FMU instances, stepped at the same time.
 
-    See ``Pool`` for the contract, apart from states: a backend has none to be saved. The FMU says
-    what the variables are; its code is not loaded. Several backends, and those with a ``hold``,
-    have a thread each.
+    ``Pool`` describes the contract. Backends have no states that could be saved. The FMU only
+    describes the variables; its code is not loaded. Each backend has a thread of its own, except a
+    single backend without ``hold``.
 
     Args:
         fmu: The FMU; closed with the pool.
-        spec: What to do at each reset and step; substeps are the backend's own affair.
+        spec: What to do at each reset and step, apart from substeps.
         num_instances: N.
         backend: A ``Backend``, a sequence of N, or a function of N that returns such a sequence;
-            or a `Paced` one. The function may have the methods ``open`` and ``close``, for what the
-            backends share: they are called before each reset and after all have stopped.
+            or a `Paced` one. The function may have the methods ``open`` and ``close`` for something
+            that the backends share. ``open`` is called before each reset, ``close`` after all
+            backends have stopped.
 
     Raises:
-        ConfigError: If that is none, or the number is not N.
+        ConfigError: If a backend lacks a method, or if there are not N of them.
     """
 
     def __init__(self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any) -> None:
@@ -241,13 +78,13 @@ class BackendPool(CountedPool):
         self._schedule = None
         if paced is not None:
             self._schedule = Schedule(spec.time_step, paced.clock, count)
-        self._rigs = [_Rig(one, spec, self._now) for one in _backends(backend, count)]
+        self._rigs = [Rig(one, spec, self._now) for one in _backends(backend, count)]
         self._threads = [self._thread(index, rig) for index, rig in enumerate(self._rigs)]
         shared = backend if _makes_backends(backend) else None
         self._open = getattr(shared, "open", _nothing)
         self._all = self._rigs, self._threads, self._clock, getattr(shared, "close", _nothing)
 
-    def _thread(self, index: int, rig: _Rig) -> Here | Worker:
+    def _thread(self, index: int, rig: Rig) -> Here | Worker:
         if self.num_instances == 1 and not rig.can_hold:
             return Here()
         paced, name = self._paced, f"backend-{index}"
@@ -288,12 +125,16 @@ class BackendPool(CountedPool):
             self._open()
         except Exception as error:
             for index in starts:
-                self._take(index, _Outcome(Status.ERROR, None, _text(error)))
+                self._take(index, Outcome(Status.ERROR, None, describe_error(error)))
         else:
             self._ask("reset", starts)
 
     def _stop_at_exit(self) -> None:
-        """At the interpreter's exit, come before the finalizers of what the backends have made."""
+        """Register the stop anew.
+
+        At the interpreter's exit it then comes before the finalizers of all that the backends have
+        made in their resets.
+        """
         alive = self._close.detach()
         if alive is not None:
             _, function, args, _ = alive
@@ -337,7 +178,7 @@ class BackendPool(CountedPool):
         self._ask("step", {index: inputs[index] for index in np.flatnonzero(chosen).tolist()})
 
     def _ask(self, method: str, arguments: Mapping[int, Any]) -> None:
-        """Call a method of some rigs at the same time, and take over what it gives."""
+        """Call a method of some rigs at the same time, and store the results."""
         self._counts[list(arguments), Column.RESETS if method == "reset" else Column.STEPS] += 1
         calls = [
             (self._threads[index], getattr(self._rigs[index], method), argument)
@@ -348,14 +189,14 @@ class BackendPool(CountedPool):
 
     @contextmanager
     def _halted_by_errors(self) -> Iterator[None]:
-        """Let nothing go on after an exception, Ctrl-C above all."""
+        """Stop all rigs after an exception, above all after Ctrl-C."""
         try:
             yield
         except BaseException:
             self.halt()
             raise
 
-    def _take(self, index: int, outcome: _Outcome) -> None:
+    def _take(self, index: int, outcome: Outcome) -> None:
         self.statuses[index] = note(self._counts[index], outcome.status)
         self._failures[index] = outcome.reason
         self._is_ready[index] = outcome.values is not None
@@ -369,13 +210,13 @@ class BackendPool(CountedPool):
         return int(np.count_nonzero(self.statuses > Status.WARNING))
 
     def save(self) -> Any:
-        """Refuse: what is real cannot be put back."""
+        """Refuse: a real system cannot return to a state."""
         raise SimulationError("a backend has no state that could be saved")
 
     def restore(
         self, snapshot: Any, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """Refuse: what is real cannot be put back."""
+        """Refuse: a real system cannot return to a state."""
         raise SimulationError("a backend has no state that could be restored")
 
     def failure(self, index: int) -> str:
@@ -402,10 +243,10 @@ class BackendPool(CountedPool):
         if not self._close.alive:
             raise SimulationError("the pool is closed")
 
-    # What is different where something is real.
+    # Abilities of a pool of real systems.
 
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """What paced steps tell of their time, each of shape (N,); nothing of others."""
+        """Return the timing of paced steps, each array of shape (N,); nothing for other steps."""
         if self._schedule is None:
             return {}
         return {
@@ -415,7 +256,7 @@ class BackendPool(CountedPool):
         }
 
     def halt(self) -> None:
-        """Stop all backends, whatever they are doing; the next reset starts them again."""
+        """Stop all backends, whatever they do; the next reset starts them again."""
         self._is_ready[:] = False
         _stop(*self._all)
 
@@ -425,7 +266,7 @@ def _no_time() -> float:
 
 
 def _nothing() -> None:
-    """What backends that share nothing open and close."""
+    """Stands in for ``open`` and ``close`` where the backends share nothing."""
 
 
 def _makes_backends(backend: Any) -> bool:
@@ -456,13 +297,13 @@ def _backends(backend: Any, count: int) -> list[Backend]:
 
 
 def _stop(
-    rigs: Sequence[_Rig],
+    rigs: Sequence[Rig],
     threads: Sequence[Here | Worker],
     clock: Clock | None,
     close: Callable[[], None],
 ) -> None:
-    """Stop rigs, each after what it is doing now, and close what they share."""
-    calls = [(thread, _Rig.stop, rig) for rig, thread in zip(rigs, threads, strict=True)]
+    """Stop rigs, each after its current call, and close what they share."""
+    calls = [(thread, Rig.stop, rig) for rig, thread in zip(rigs, threads, strict=True)]
     try:
         ask_all(calls, clock, _LONGEST_STOP)
         close()
@@ -474,7 +315,7 @@ def _stop(
 
 def _close(
     fmu: FMU,
-    rigs: Sequence[_Rig],
+    rigs: Sequence[Rig],
     threads: Sequence[Here | Worker],
     clock: Clock | None,
     close: Callable[[], None],

@@ -1,4 +1,4 @@
-"""Threads that do what they are asked to, and something else while nobody asks."""
+"""Threads that call functions on request, and do something else while there is no request."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from fmugym.pool.backend.clock import Clock
 __all__ = ["Here", "Idle", "Worker", "ask_all"]
 
 _LEAST_WAIT: Final = 0.1
-"""Share of the patience that a worker waits at the least before it looks at the clock again."""
+"""The least time between two looks at the clock, as a share of the patience."""
 
 
 _Order = tuple["Future[Any]", Callable[..., Any], Any]
-"""Where the result goes, the function, and its argument."""
+"""The future of the result, the function, and its argument."""
 
 _Orders = queue.SimpleQueue[_Order | None]
 
 
 class Idle(NamedTuple):
-    """What to do while nobody asks.
+    """What to do while there is no request.
 
     Attributes:
-        action: Called after each ``patience`` without a request; it must not raise.
+        action: Called whenever ``patience`` has passed without a request; it must not raise.
         patience: In s of the clock's time.
     """
 
@@ -36,10 +36,10 @@ class Idle(NamedTuple):
 
 
 class Here:
-    """Does in the caller's thread what it is asked to."""
+    """Calls functions in the caller's thread."""
 
     def ask(self, function: Callable[..., Any], argument: Any) -> Future[Any]:
-        """Call a function; it is done when this returns."""
+        """Call a function; the future is done when this method returns."""
         future: Future[Any] = Future()
         future.set_result(function(argument))
         return future
@@ -49,14 +49,14 @@ class Here:
 
 
 class Worker:
-    """Does in a thread of its own what it is asked to, one after another.
+    """Calls functions in a thread of its own, one after another.
 
     The thread does not keep the interpreter from ending.
 
     Args:
-        name: Of the thread.
-        clock: What tells the time to whatever it does, or None.
-        idle: What to do while nobody asks, or None.
+        name: The name of the thread.
+        clock: The clock that the functions use, or None.
+        idle: What to do while there is no request, or None.
 
     Attributes:
         thread: The thread.
@@ -69,9 +69,9 @@ class Worker:
         self.thread.start()
 
     def ask(self, function: Callable[..., Any], argument: Any) -> Future[Any]:
-        """Let the thread call a function after what it was asked before.
+        """Let the thread call a function after all earlier ones.
 
-        Asked by the thread itself, as a finalizer may be, it is done at once.
+        If the thread itself asks, as a finalizer in it may, the function is called at once.
         """
         if threading.current_thread() is self.thread:
             return Here().ask(function, argument)
@@ -80,7 +80,7 @@ class Worker:
         return future
 
     def end(self, timeout: float) -> None:
-        """Let the thread end after what it was asked before, and wait for that, in s."""
+        """Let the thread end after all earlier requests; wait at most ``timeout`` s for it."""
         self._orders.put(None)
         if threading.current_thread() is not self.thread:
             self.thread.join(timeout)
@@ -98,11 +98,11 @@ def _work(orders: _Orders, clock: Clock | None, idle: Idle | None) -> None:
         else:
             leave(me)
             future.set_result(result)
-        del order, future, function, argument  # waiting is to keep nothing alive
+        del order, future, function, argument  # so that the wait keeps none of them alive
 
 
 def _nobody_waits(thread: threading.Thread) -> None:
-    """What clocks that are not moved by hand are told at the end of an order."""
+    """Stands in for ``ManualClock.leave`` of other clocks."""
 
 
 def _next(orders: _Orders, clock: Clock | None, idle: Idle | None) -> _Order | None:
@@ -126,20 +126,20 @@ def ask_all(
     clock: Clock | None,
     timeout: float | None = None,
 ) -> list[Any]:
-    """Let several do something at the same time, and wait for all of them.
+    """Let several workers call functions at the same time, and wait for all of them.
 
-    A clock that is moved by hand then waits for their threads in the place of the caller's.
+    Meanwhile, a clock that is moved by hand waits for their threads instead of the caller's.
 
     Args:
-        calls: Who, the function, and its argument.
-        clock: What tells the time to them, or None.
-        timeout: How long to wait for one, in s of real time; None for as long as it takes.
+        calls: For each worker: the worker, the function, and its argument.
+        clock: The clock that the functions use, or None.
+        timeout: How long to wait for one of them, in s of real time; None for ever.
 
     Returns:
-        What the functions return.
+        The results of the functions, in the order of ``calls``.
 
     Raises:
-        TimeoutError: If one takes longer.
+        TimeoutError: If a function takes longer.
     """
     threads = [worker.thread for worker, *_ in calls if isinstance(worker, Worker)]
     handed_over = getattr(clock, "handed_over", None) if threads else None

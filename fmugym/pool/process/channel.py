@@ -22,7 +22,13 @@ __all__ = ["Channel", "Code"]
 _LENGTH: Final = struct.Struct("<Q")
 
 _LOOKS: Final = 60
-"""Before a process goes to sleep: together they take some 40 us."""
+"""How often a process looks before it goes to sleep; all looks together take some 40 us."""
+
+_LONGEST_WAIT: Final = 1e6
+"""Seconds of one wait: ``poll`` takes at most 2**31 ms."""
+
+_AT_ONCE: Final = getattr(socket, "MSG_DONTWAIT", 0)
+"""Lets a call fail that would have to wait."""
 
 _give_way: Final = getattr(os, "sched_yield", lambda: time.sleep(0.0))
 
@@ -54,19 +60,25 @@ class Code:
 class Channel:
     """One end of the pair.
 
+    A process that the other end's process has forked keeps the connection open. So the connection
+    alone does not tell whether the other process has ended; its sentinel does.
+
     Args:
         end: The socket, in blocking mode.
+        sentinel: A file descriptor that becomes readable when the other process has ended; None
+            where there is none.
 
     Attributes:
         end: The socket.
     """
 
-    def __init__(self, end: socket.socket) -> None:
+    def __init__(self, end: socket.socket, sentinel: int | None = None) -> None:
         self.end = end
         self._send, self._receive = end.send, end.recv
-        self._descriptor = end.fileno()
+        self._descriptor, self._sentinel = end.fileno(), sentinel
         self._lock = threading.Lock()
-        self._poll = _poller(end)
+        self._look = _poller(end.fileno())
+        self._poll = _poller(end.fileno(), sentinel)
 
     def send_code(self, code: bytes) -> None:
         """Send a bare code."""
@@ -74,27 +86,56 @@ class Channel:
             self._send(code)
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until there is something to receive, at most for some seconds.
+        """Wait until there is something to receive or the other process has ended.
 
-        To wake a process on an idle processor takes tens of microseconds, so that it does not go
-        to sleep at once; but it lets others have the processor.
+        Waking a process on an idle processor takes tens of microseconds. So this one does not go
+        to sleep at once, but it lets others have the processor.
+
+        Args:
+            seconds: How long to wait at most; None for ever. A wait of more than ten days may end
+                early.
+
+        Returns:
+            Whether something has come, or the process has ended.
         """
-        poll = self._poll
+        look, poll = self._look, self._poll
         for _ in range(_LOOKS):
-            if poll(0.0):
+            if look(0.0):
                 return True
             _give_way()
-        return bool(poll(None if seconds is None else max(0.0, 1e3 * seconds)))
+        if seconds is None:
+            return bool(poll(None))
+        return bool(poll(1e3 * min(max(0.0, seconds), _LONGEST_WAIT)))
 
     def receive_code(self) -> bytes:
-        """Receive the next code; nothing if the other end is gone."""
-        return self._receive(1)
+        """Receive the next code, after ``wait``.
+
+        Returns:
+            The code; nothing if the other end is closed.
+
+        Raises:
+            OSError: If the other process has ended, and left nothing to receive.
+        """
+        return self._receive(1, _AT_ONCE)
 
     def send_object(self, code: bytes, content: Any) -> None:
         """Send a code and an object; what several threads send does not mix."""
         data = pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
         with self._lock:
-            self.end.sendall(b"".join((code, _LENGTH.pack(len(data)), data)))
+            self._send_all(b"".join((code, _LENGTH.pack(len(data)), data)))
+
+    def _send_all(self, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            try:
+                view = view[self.end.send(view, _AT_ONCE) :]
+            except BlockingIOError:
+                if self._has_ended():
+                    raise BrokenPipeError("the other process has ended") from None
+                _wait_to_send(self._descriptor, self._sentinel)
+
+    def _has_ended(self) -> bool:
+        return self._sentinel is not None and bool(_poller(self._sentinel)(0.0))
 
     def receive_object(self) -> Any:
         """Receive the object that follows a code.
@@ -109,11 +150,22 @@ class Channel:
         data = bytearray(count)
         view = memoryview(data)
         while view:
-            received = self.end.recv_into(view)
+            received = self._receive_into(view)
             if not received:
                 raise EOFError
             view = view[received:]
         return data
+
+    def _receive_into(self, view: memoryview) -> int:
+        has_ended = False
+        while True:
+            try:
+                return self.end.recv_into(view, 0, _AT_ONCE)
+            except BlockingIOError:
+                if has_ended:  # and this attempt came after its last bytes
+                    return 0
+                self._poll(None)
+                has_ended = self._has_ended()
 
     def require_open(self) -> None:
         """Make sure that nobody has closed this end behind our back, as an FMU may.
@@ -128,10 +180,21 @@ class Channel:
         self.end.close()
 
 
-def _poller(end: socket.socket) -> Callable[[float | None], Any]:
-    """A function that waits for something to read, at most for some ms."""
+def _poller(*descriptors: int | None) -> Callable[[float | None], Any]:
+    """Make a function that waits for one of several to be readable, at most for some ms."""
+    known = [descriptor for descriptor in descriptors if descriptor is not None]
     if not hasattr(select, "poll"):
-        return lambda ms: select.select([end], [], [], None if ms is None else 1e-3 * ms)[0]
+        return lambda ms: select.select(known, [], [], None if ms is None else 1e-3 * ms)[0]
     poll = select.poll()
-    poll.register(end, select.POLLIN)
+    for descriptor in known:
+        poll.register(descriptor, select.POLLIN)
     return poll.poll
+
+
+def _wait_to_send(descriptor: int, sentinel: int | None) -> None:
+    """Wait until something can be sent, or the other process has ended."""
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    if sentinel is not None:
+        poll.register(sentinel, select.POLLIN)
+    poll.poll()

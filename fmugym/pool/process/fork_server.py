@@ -2,12 +2,18 @@
 
 It is started with an interpreter of its own: a fork of the user's process would copy its threads'
 locks, and a worker should not run the user's program again, as those of ``multiprocessing`` do. It
-ends as soon as its parent does, however that may come about, ends the workers and removes the
+ends as soon as its parent does, whatever the reason. Then it ends the workers and removes the
 folders they worked in.
+
+Each request comes with a socket, the worker's lifeline. The server answers through it with the
+worker's process number, and with its exit status when it has ended. The parent shuts the lifeline
+down to have the worker killed. An FMU may fork; each worker leads a process group of its own, and
+what is left of the group is killed with the worker.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -16,28 +22,31 @@ import select
 import shutil
 import signal
 import socket
+import struct
 import sys
-import time
-from typing import Any, Final, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
-__all__ = ["LARGEST_REQUEST", "main"]
+__all__ = ["ANSWER", "LARGEST_REQUEST", "main"]
 
 LARGEST_REQUEST: Final = 65536
 """In bytes; it is sent and received as a whole."""
 
+ANSWER: Final = struct.Struct("<q")
+"""A process number, or minus an error number; and an exit status, negative for a signal."""
+
 _PR_SET_PDEATHSIG: Final = 1
-_PATIENCE: Final = 0.05
-"""How long a worker that has closed its channel may take to end, in seconds."""
+_DESCRIPTORS: Final = 3
+"""Those of a request: the lifeline, the channel and the memory."""
 
 
 def main(descriptor: int, parent: int) -> NoReturn:
     """Serve the parent until it ends.
 
     Args:
-        descriptor: Of the socket from which requests come. Each comes with a socket for its reply.
+        descriptor: Of the socket from which requests come.
         parent: The parent's process number.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -52,77 +61,140 @@ def main(descriptor: int, parent: int) -> NoReturn:
         os._exit(0)
 
 
+def _kill_group(leader: int) -> None:
+    """Kill what is left of a worker's process group."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # nothing is left
+        os.killpg(leader, signal.SIGKILL)
+
+
+class _Worker(NamedTuple):
+    pid: int
+    lifeline: socket.socket
+
+    def kill(self) -> None:
+        _kill_group(self.pid)
+        os.kill(self.pid, signal.SIGKILL)  # it leads no group before it has begun
+
+
 class _Server:
     def __init__(self, requests: socket.socket, parent: int) -> None:
         self._requests = requests
-        self._folders: dict[int, str] = {}  # by worker
+        self._workers: dict[int, _Worker] = {}  # by the descriptor of the lifeline
+        self._folders: set[str] = set()
+        self._ended, self._wakeup = os.pipe()
+        for end in (self._ended, self._wakeup):
+            os.set_blocking(end, False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.set_wakeup_fd(self._wakeup, warn_on_full_buffer=False)
         self._poll = select.poll()
-        self._poll.register(requests, select.POLLIN)
         self._parent = -1
         if hasattr(os, "pidfd_open"):  # a fork of the parent may keep the socket open
             self._parent = os.pidfd_open(parent)
             self._poll.register(self._parent, select.POLLIN)
+        self._poll.register(requests, select.POLLIN)
+        self._poll.register(self._ended, select.POLLIN)
 
     def serve(self) -> None:
-        while all(which != self._parent for which, _ in self._poll.poll()):
-            data, descriptors, _, _ = socket.recv_fds(self._requests, LARGEST_REQUEST, 3)
-            if not data:
+        """Do what is asked for until the parent ends."""
+        while True:
+            # One event at a time: what comes next may concern a descriptor that this one closes.
+            descriptor, _ = self._poll.poll()[0]
+            if descriptor == self._ended:
+                self._bury()
+            elif descriptor in self._workers:
+                self._kill(descriptor)
+            elif descriptor == self._parent or not self._answer():
                 return
-            self._answer(pickle.loads(data), descriptors)
 
-    def _answer(self, request: tuple[str, Any, Any], descriptors: list[int]) -> None:
-        name, *arguments = request
-        with socket.socket(fileno=descriptors.pop(0)) as replies:
-            if name == "start":
-                result: int | None = self._start(replies, *arguments, *descriptors)
-            else:
-                result = self._wait(*arguments)
-            replies.sendall(pickle.dumps(result))
+    def _answer(self) -> bool:
+        """Answer a request; returns whether there was one."""
+        data, descriptors, _, _ = socket.recv_fds(self._requests, LARGEST_REQUEST, _DESCRIPTORS)
+        if not data:
+            return False
+        if len(descriptors) == _DESCRIPTORS:
+            self._start(*pickle.loads(data), *descriptors)
+        else:  # out of descriptors: the parent finds the lifeline cut
+            for descriptor in descriptors:
+                os.close(descriptor)
+        return True
 
-    def _start(
-        self, replies: socket.socket, folder: str, size: int, channel: int, memory: int
-    ) -> int:
-        """Fork a worker; returns its process number."""
+    def _start(self, folder: str, size: int, lifeline: int, channel: int, memory: int) -> None:
+        """Fork a worker and tell its process number."""
+        answers = socket.socket(fileno=lifeline)
         server = os.getpid()
-        worker = os.fork()
-        if worker == 0:
-            replies.close()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            pid = -(error.errno or 1)
+        if pid == 0:
+            answers.close()
             self._become_worker(server, channel, Memory(size, memory))
         os.close(channel)
         os.close(memory)
-        self._folders[worker] = folder
-        return worker
+        _send(answers, pid)
+        if pid < 0:
+            answers.close()
+            return
+        self._workers[lifeline] = _Worker(pid, answers)
+        self._folders = {folder, *filter(os.path.isdir, self._folders)}
+        self._poll.register(lifeline, select.POLLIN)
 
     def _become_worker(self, server: int, channel: int, memory: Memory) -> NoReturn:
         status = 1
         try:
-            self._requests.close()
-            if self._parent >= 0:
-                os.close(self._parent)
+            self._let_go()
             memory.close()
+            os.setpgid(0, 0)  # a session would have a share of the processor time of its own
             if _end_with_parent(server):
                 status = run_worker(socket.socket(fileno=channel), memory)
         finally:
             os._exit(status)
 
-    def _wait(self, worker: int) -> int | None:
-        """The exit status of a worker, negative for a signal, or None if it goes on."""
-        if worker not in self._folders:  # it went with the server before this one
-            return -signal.SIGKILL
-        deadline = time.monotonic() + _PATIENCE
-        while (ended := os.waitpid(worker, os.WNOHANG)) == (0, 0):
-            if time.monotonic() > deadline:
-                return None
-            time.sleep(1e-3)
-        del self._folders[worker]
-        return os.waitstatus_to_exitcode(ended[1])
+    def _let_go(self) -> None:
+        """Close what belongs to the server: this process is a fork of it."""
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        self._requests.close()
+        for worker in self._workers.values():
+            worker.lifeline.close()
+        for descriptor in (self._ended, self._wakeup, self._parent):
+            if descriptor >= 0:
+                os.close(descriptor)
+
+    def _kill(self, descriptor: int) -> None:
+        """The parent does not want a worker any more; its end will be told like any other."""
+        self._poll.unregister(descriptor)
+        self._workers[descriptor].kill()
+
+    def _bury(self) -> None:
+        """Tell the exit status of each worker that has ended."""
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._ended, 4096)
+        with contextlib.suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
+                self._tell_end(*ended)
+
+    def _tell_end(self, pid: int, status: int) -> None:
+        _kill_group(pid)
+        for descriptor, worker in list(self._workers.items()):
+            if worker.pid == pid:
+                del self._workers[descriptor]
+                with contextlib.suppress(KeyError):
+                    self._poll.unregister(descriptor)
+                _send(worker.lifeline, os.waitstatus_to_exitcode(status))
+                worker.lifeline.close()
 
     def clean_up(self) -> None:
         """End all workers and remove what they leave."""
-        for worker in self._folders:
-            os.kill(worker, signal.SIGKILL)
-        for folder in set(self._folders.values()):
+        for worker in self._workers.values():
+            worker.kill()
+        for folder in self._folders:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _send(lifeline: socket.socket, answer: int) -> None:
+    with contextlib.suppress(OSError):  # the parent may have closed it
+        lifeline.sendall(ANSWER.pack(answer))
 
 
 def _end_with_parent(parent: int) -> bool:

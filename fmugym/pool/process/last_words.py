@@ -7,6 +7,8 @@ import threading
 from collections import deque
 from typing import BinaryIO, Final
 
+from fmugym.errors import printable
+
 __all__ = ["OutputTail", "describe_exit"]
 
 _LINES: Final = 10
@@ -54,11 +56,11 @@ class OutputTail:
                     self._lines.append(line)
 
     def lines(self, timeout: float = 1.0) -> list[str]:
-        """The last lines, once the pipe has ended.
+        """The last lines, made printable, once the pipe has ended.
 
         Args:
             timeout: Seconds to wait for the end; a process that the dead one started may keep the
                 pipe open.
         """
         self._thread.join(timeout)
-        return [line.decode(errors="replace").strip() for line in tuple(self._lines)]
+        return [printable(line.decode(errors="replace").strip()) for line in tuple(self._lines)]

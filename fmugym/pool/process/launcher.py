@@ -8,6 +8,7 @@ import multiprocessing
 import multiprocessing.spawn
 import os
 import pickle
+import select
 import signal
 import socket
 import subprocess
@@ -16,19 +17,30 @@ import threading
 import weakref
 from multiprocessing.reduction import DupFd
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
-from fmugym.errors import FMULoadError
+from fmugym.pool.process.fork_server import ANSWER
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
 __all__ = ["Process", "launch"]
 
 
+_PATIENCE: Final = 0.05
+"""How long a worker that has closed its channel may take to end, in seconds."""
+
+
 class Process(Protocol):
-    """A worker's process."""
+    """A worker's process.
+
+    Attributes:
+        pid: Its number.
+        sentinel: A file descriptor that becomes readable when the process has ended; None where
+            there is none.
+    """
 
     pid: int
+    sentinel: int | None
 
     def kill(self) -> None:
         """End it at once, whatever it does."""
@@ -36,6 +48,10 @@ class Process(Protocol):
 
     def exit_status(self) -> int | None:
         """The exit status, negative for a signal; None if it has not ended after a moment."""
+        ...
+
+    def forget(self) -> None:
+        """Let go of it, without a word to it."""
         ...
 
 
@@ -48,14 +64,11 @@ def launch(end: socket.socket, memory: Memory, folder: Path) -> Process:
         folder: Where its FMU was extracted to; removed should this process be killed.
 
     Raises:
-        FMULoadError: If the system refuses.
+        OSError: If the system refuses.
     """
-    try:
-        if sys.platform == "win32":
-            return _SpawnedProcess(end, memory)
-        return _ForkedProcess(end, memory, folder)
-    except (OSError, EOFError) as error:
-        raise FMULoadError(f"no worker process can be started: {error!r}") from error
+    if sys.platform == "win32":
+        return _SpawnedProcess(end, memory)
+    return _start(folder, memory.size, (end.fileno(), memory.descriptor))
 
 
 class _ForkServer:
@@ -63,43 +76,50 @@ class _ForkServer:
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
-        self._requests = ours.detach()  # a socket would complain at the interpreter's end
-        program = (
-            f"import sys; sys.path[:] = {sys.path!r}; "
-            "from fmugym.pool.process.fork_server import main; "
-            f"main({theirs.fileno()}, {os.getpid()})"
-        )
-        with theirs:
-            process = subprocess.Popen(
-                [multiprocessing.spawn.get_executable(), "-c", program],
-                stdin=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                # A process that forks should have no threads.
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-            )
+        with ours, theirs:
+            process = _run_fork_server(theirs)
+            self._requests = ours.detach()  # a socket would complain at the interpreter's end
         self.pid = process.pid
         process.returncode = 0  # for Popen, it may outlive this object
         self._stop = weakref.finalize(self, _stop, self._requests, self.pid)
         self._stop.atexit = False  # pools may still want to end their workers in order then
 
-    def request(self, *request: Any, descriptors: tuple[int, ...] = ()) -> Any:
-        """Ask for something; each reply has a socket of its own, so that threads do not mix.
+    def start(self, folder: Path, size: int, descriptors: tuple[int, int]) -> _ForkedProcess:
+        """Start a worker; each has a lifeline of its own, so that threads do not mix.
 
         Raises:
             EOFError: If the server has ended.
+            OSError: If the system refuses.
         """
         ours, theirs = socket.socketpair()
-        with ours:
-            with theirs:
-                data, given = pickle.dumps(request), [theirs.fileno(), *descriptors]
-                with socket.socket(fileno=os.dup(self._requests)) as requests:
-                    socket.send_fds(requests, [data], given)
-            return pickle.loads(ours.recv(4096))
+        try:
+            with theirs, socket.socket(fileno=os.dup(self._requests)) as requests:
+                data = pickle.dumps((str(folder), size))
+                socket.send_fds(requests, [data], [theirs.fileno(), *descriptors])
+            return _ForkedProcess(ours)
+        except BaseException:
+            ours.close()
+            raise
 
     def forget(self) -> None:
         """Let go of the server: this process is a fork of the one that it belongs to."""
         self._stop.detach()
         os.close(self._requests)
+
+
+def _run_fork_server(requests: socket.socket) -> subprocess.Popen[bytes]:
+    program = (
+        f"import sys; sys.path[:] = {sys.path!r}; "
+        "from fmugym.pool.process.fork_server import main; "
+        f"main({requests.fileno()}, {os.getpid()})"
+    )
+    return subprocess.Popen(
+        [multiprocessing.spawn.get_executable(), "-c", program],
+        stdin=subprocess.DEVNULL,
+        pass_fds=[requests.fileno()],
+        # A process that forks should have no threads.
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+    )
 
 
 def _stop(requests: int, pid: int) -> None:
@@ -109,49 +129,93 @@ def _stop(requests: int, pid: int) -> None:
 
 
 @functools.cache
-def _fork_server() -> _ForkServer:
+def _cached_fork_server() -> _ForkServer:
     return _ForkServer()
 
 
-def _request(*request: Any, descriptors: tuple[int, ...] = ()) -> Any:
-    """Ask the fork server, or a new one if somebody has ended it."""
+_making = threading.Lock()
+
+
+def _fork_server() -> _ForkServer:
+    """The server of this process, whichever of its threads asks first."""
+    with _making:
+        return _cached_fork_server()
+
+
+def _start(folder: Path, size: int, descriptors: tuple[int, int]) -> _ForkedProcess:
+    """Start a worker by the fork server, or by a new one if somebody has ended it."""
     try:
-        return _fork_server().request(*request, descriptors=descriptors)
+        return _fork_server().start(folder, size, descriptors)
     except (EOFError, BrokenPipeError, ConnectionResetError):
-        _fork_server.cache_clear()
-        return _fork_server().request(*request, descriptors=descriptors)
+        _cached_fork_server.cache_clear()
+        return _fork_server().start(folder, size, descriptors)
 
 
 def _forget_fork_server() -> None:
-    if _fork_server.cache_info().currsize:
-        _fork_server().forget()
-        _fork_server.cache_clear()
+    if _cached_fork_server.cache_info().currsize:
+        _cached_fork_server().forget()
+        _cached_fork_server.cache_clear()
+    _making.release()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_fork_server)
+    os.register_at_fork(
+        before=_making.acquire,
+        after_in_parent=_making.release,
+        after_in_child=_forget_fork_server,
+    )
 
 
 class _ForkedProcess:
-    def __init__(self, end: socket.socket, memory: Memory, folder: Path) -> None:
-        descriptors = (end.fileno(), memory.descriptor)
-        self.pid: int = _request("start", str(folder), memory.size, descriptors=descriptors)
+    """A worker of the fork server.
+
+    Args:
+        lifeline: Tells its number and its exit status; closed with it.
+
+    Raises:
+        EOFError: If the server has ended.
+        OSError: If the server cannot fork.
+    """
+
+    def __init__(self, lifeline: socket.socket) -> None:
+        self._lifeline = lifeline
+        self.sentinel: int | None = lifeline.fileno()
+        pid = self._answer()
+        if pid is None:
+            raise EOFError("the fork server has ended")
+        if pid < 0:
+            raise OSError(-pid, os.strerror(-pid))
+        self.pid = pid
+
+    def _answer(self) -> int | None:
+        try:
+            data = self._lifeline.recv(ANSWER.size, socket.MSG_WAITALL)
+        except ConnectionResetError:
+            return None
+        return None if len(data) < ANSWER.size else int(ANSWER.unpack(data)[0])
 
     def kill(self) -> None:
-        try:
-            os.kill(self.pid, signal.SIGKILL)
-        except ProcessLookupError:  # it went with its fork server
-            return
+        with contextlib.suppress(OSError):  # the fork server has ended, and it has with it
+            self._lifeline.shutdown(socket.SHUT_WR)
 
     def exit_status(self) -> int | None:
-        try:
-            status: int | None = _request("wait", self.pid)
-        except (OSError, EOFError):  # it went with its fork server
-            return -signal.SIGKILL
-        return status
+        poll = select.poll()
+        poll.register(self._lifeline, select.POLLIN)
+        if not poll.poll(1e3 * _PATIENCE):
+            return None
+        status = self._answer()
+        self.forget()
+        return -signal.SIGKILL if status is None else status  # it went with its fork server
+
+    def forget(self) -> None:
+        self._lifeline.close()
 
 
 class _SpawnedProcess:
+    """A worker that ``multiprocessing`` has spawned."""
+
+    sentinel: int | None = None
+
     def __init__(self, end: socket.socket, memory: Memory) -> None:
         context = multiprocessing.get_context("spawn")
         shared = DupFd(memory.descriptor) if memory.descriptor >= 0 else memory.tag
@@ -164,8 +228,11 @@ class _SpawnedProcess:
         self._process.kill()
 
     def exit_status(self) -> int | None:
-        self._process.join(0.05)
+        self._process.join(_PATIENCE)
         return self._process.exitcode
+
+    def forget(self) -> None:
+        """Do nothing: ``multiprocessing`` itself forgets processes of another process."""
 
 
 def _run_spawned(end: socket.socket, size: int, shared: Any) -> None:

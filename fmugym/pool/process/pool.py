@@ -2,8 +2,8 @@
 
 Each worker process has a block of the instances in a pool of its own (``NativePool`` or
 ``PythonPool``) and shares its inputs and outputs through memory. A worker that dies or hangs is
-replaced: its instances have the status ``FATAL``, with the cause, until the next reset makes them
-anew. Those of other workers are not concerned.
+replaced. Its instances have the status ``FATAL``, with the cause, until the next reset makes them
+anew. The instances of other workers go on.
 """
 
 from __future__ import annotations
@@ -11,20 +11,19 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import os
-import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMUGymError, FMULoadError, SimulationError
+from fmugym.checks import check_count, check_number
+from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
@@ -34,18 +33,15 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.health import Column, CountedPool, HealthArray
+from fmugym.pool.health import CountedPool, HealthArray
 from fmugym.pool.process.channel import Code
-from fmugym.pool.process.shared_memory import Arrays, Memory, make_arrays, size_for
-from fmugym.pool.process.supervisor import LostError, Supervisor
+from fmugym.pool.process.crew import Crew
+from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
+from fmugym.pool.process.supervisor import Supervisor
 from fmugym.pool.process.worker import Setup
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["ProcessPool"]
-
-_CLOSING_TIME: Final = 5.0
-"""How long workers may take to free their instances, in seconds."""
-
-_pools: weakref.WeakSet[ProcessPool] = weakref.WeakSet()
 
 
 class ProcessPool(CountedPool):
@@ -59,8 +55,7 @@ class ProcessPool(CountedPool):
         native: Whether the workers have native pools, or Python ones.
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
-        threads: The most threads in each of them; by default so many that there is one for each
-            processor.
+        threads: The most threads in each of them; by default, together one for each processor.
         call_timeout: How long a call may take, in seconds of real time; None for ever. A worker
             that takes longer is ended, unless a debugger holds it.
 
@@ -68,7 +63,9 @@ class ProcessPool(CountedPool):
         workers: How many processes there are.
 
     Raises:
-        FMULoadError: If the FMU cannot be loaded or instantiated.
+        ConfigError: If ``workers``, ``threads`` or ``call_timeout`` is no positive number.
+        FMULoadError: If the FMU cannot be loaded or instantiated, or the system has no process,
+            memory or temporary folder left.
     """
 
     def __init__(
@@ -83,51 +80,26 @@ class ProcessPool(CountedPool):
         threads: int | None = None,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
     ) -> None:
-        processors = available_processors()
         self.num_instances = num_instances
-        self.workers = min(num_instances, processors if workers is None else max(1, workers))
-        self._call_timeout = math.inf if call_timeout is None else call_timeout
-        self._lock = RLock()
         self._spec = spec
-        self._refusal = ""
-        self._lost: MaskArray = np.zeros(num_instances, np.bool_)
+        self._lock = RLock()
         self._numbers: dict[tuple[Variable, ...], int] = {}
         try:
-            fmu.extract()
-            memory = Memory(size_for(spec, num_instances, self.workers))
+            _check_options(workers, threads, call_timeout)
+            self.workers = min(num_instances, workers or available_processors())
+            setup = Setup.of(fmu, spec, num_instances, log)
+            memory = _make_memory(size_for(spec, num_instances, self.workers))
         except BaseException:
             fmu.close()
             raise
-        self._share(make_arrays(memory, spec, num_instances))
-        setup = Setup.of(fmu, spec, num_instances, log)
-        setup = replace(setup, native=native, threads=threads or max(1, processors // self.workers))
-        blocks = _blocks(num_instances, self.workers)
-        setups = [replace(setup, block=b, number=i) for i, b in enumerate(blocks)]
-        self._supervisors = [Supervisor(one, memory, log) for one in setups]
-        self._note_lost()
-        patience = min(_CLOSING_TIME, self._call_timeout)
-        self._close = weakref.finalize(self, _close, self._supervisors, memory, fmu, patience)
-        _pools.add(self)
-        self._open()
-
-    def _share(self, arrays: Arrays) -> None:
+        arrays = make_arrays(memory, spec, num_instances)
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
-
-    def _open(self) -> None:
-        """Let all workers make their instances at the same time."""
-        try:
-            for supervisor in self._supervisors:
-                supervisor.start()
-            for supervisor in self._supervisors:
-                supervisor.finish_opening(self._deadline())
-        except LostError as lost:
-            self.close()
-            raise FMULoadError(str(lost)) from None
-        except BaseException:
-            self.close()
-            raise
+        threads = threads or max(1, available_processors() // self.workers)
+        setups = _share_out(replace(setup, native=native, threads=threads), self.workers)
+        timeout = math.inf if call_timeout is None else float(call_timeout)
+        self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
 
     # The contract of Pool.
 
@@ -136,14 +108,21 @@ class ProcessPool(CountedPool):
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``; a worker that dies of it is replaced, and has a second try."""
         values = np.asarray(values, np.float64)
-        mask = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+        mask = self._as_mask(mask)
         with self._lock:
-            concerned = [s for s in self._supervisors if mask[s.block].any()]
+            concerned = self._crew.of_any(mask)
+            if self._spec.reset_method is ResetMethod.PROCESS:
+                self._retire_used(concerned)
             self._retire_grown(concerned, mask)
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
-            self._note_lost()
+            self._crew.note_lost()
         return self.outputs, self.statuses
+
+    def _as_mask(self, mask: MaskArray | None) -> MaskArray:
+        if mask is None:
+            return np.ones(self.num_instances, np.bool_)
+        return np.asarray(mask, np.bool_)
 
     def _reset(
         self,
@@ -155,7 +134,7 @@ class ProcessPool(CountedPool):
         """Reset blocks; returns those that could be reset by a new worker."""
         number = self._numbers.setdefault(variables, len(self._numbers))
         used = [s for s in supervisors if not s.is_new]
-        alive = [s for s in supervisors if self._is_revived(s)]
+        alive = self._crew.revive(supervisors)
 
         def tell(supervisor: Supervisor) -> None:
             block = supervisor.block
@@ -163,35 +142,31 @@ class ProcessPool(CountedPool):
             supervisor.known.add(number)
             supervisor.tell("reset", number, told, values[:, block], mask[block])
 
-        for supervisor, growth in self._run("a reset", alive, tell).items():
+        for supervisor, growth in self._crew.run("a reset", alive, tell).items():
             supervisor.note_success()
             supervisor.growth = growth
             block = supervisor.block
-            self._lost[block] &= ~mask[block]
+            self._crew.lost[block] &= ~mask[block]
         return [s for s in used if s.is_new]
+
+    def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
+        """End the workers that have played an episode, so that each episode has a new process."""
+        for supervisor in supervisors:
+            if not supervisor.is_new:
+                self._crew.retire(supervisor, "each episode has a new process")
 
     def _retire_grown(self, supervisors: Sequence[Supervisor], mask: MaskArray) -> None:
         """Replace workers that leak, though their instances were recycled.
 
-        That is best done where all instances of a worker start anew. Otherwise the others lose
-        their episodes, so it is put off until twice as much is lost.
+        The best moment is when all instances of a worker start anew. At any other moment the others
+        lose their episodes, so the worker may first leak twice as much.
         """
         limit = math.inf if self._spec.leak_limit is None else 2 * self._spec.leak_limit
         for supervisor in supervisors:
-            block = supervisor.block
-            if supervisor.growth > (limit if mask[block].all() else 2 * limit):
+            if supervisor.growth > (limit if mask[supervisor.block].all() else 2 * limit):
                 grown = f"by {supervisor.growth / 2**20:.0f} MB"
                 reason = f"worker process {supervisor.pid} was replaced: it had grown {grown}"
-                supervisor.retire(reason, self._deadline())
-                self._lost[block] = True
-                self._counts[block, [[Column.REPLACEMENTS], [Column.RECYCLINGS]]] += 1
-
-    def _is_revived(self, supervisor: Supervisor) -> bool:
-        try:
-            supervisor.revive()
-        except LostError:
-            return False
-        return True
+                self._crew.retire(supervisor, reason)
 
     def step(
         self,
@@ -229,20 +204,24 @@ class ProcessPool(CountedPool):
 
     def _step(self, skip: MaskArray | None) -> int:
         code = Code.STEP
-        if skip is not None or self._any_lost:
+        if skip is not None or self._crew.any_lost:
             code = Code.STEP_SOME
-            np.logical_or(self._lost, False if skip is None else skip, out=self._mask)
-        replies = self._run("a step", self._able, lambda supervisor: supervisor.step(code))
-        if not self._any_lost and Code.TROUBLE not in replies.values():
+            np.logical_or(self._crew.lost, False if skip is None else skip, out=self._mask)
+        replies = self._crew.run(
+            "a step", self._crew.able, lambda supervisor: supervisor.step(code)
+        )
+        if not self._crew.any_lost and Code.TROUBLE not in replies.values():
             return 0
-        self._note_lost()
+        self._crew.note_lost()
         return int(np.count_nonzero(self.statuses > Status.WARNING))
 
     def save(self) -> _Snapshot:
         """See ``Pool.save``."""
         with self._lock:
             self._require_present()
-            numbers = self._run("saving a state", self._supervisors, lambda s: s.tell("save"))
+            numbers = self._crew.run(
+                "saving a state", self._crew.supervisors, lambda s: s.tell("save")
+            )
             self._require_present()
             return _Snapshot({s: (s.generation, number) for s, number in numbers.items()})
 
@@ -250,34 +229,32 @@ class ProcessPool(CountedPool):
         self, snapshot: _Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.restore``; a state goes with the process that it was saved in."""
-        mask = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+        mask = self._as_mask(mask)
         parts = snapshot.parts if isinstance(snapshot, _Snapshot) else {}
-        if parts.keys() != set(self._supervisors):
+        if parts.keys() != set(self._crew.supervisors):
             raise SimulationError("the snapshot was taken from another pool")
         with self._lock:
             self._require_present(mask)
-            concerned = [s for s in self._supervisors if mask[s.block].any()]
+            concerned = self._crew.of_any(mask)
             for supervisor in concerned:
-                if parts[supervisor][0] != supervisor.generation:
-                    raise SimulationError(
-                        "the snapshot is of instances whose process has been replaced since: "
-                        f"{supervisor.reason}"
-                    )
-            self._run(
+                _require_generation(supervisor, parts[supervisor][0])
+            self._crew.run(
                 "restoring a state",
                 concerned,
                 lambda s: s.tell("restore", parts[s][1], mask[s.block]),
             )
-            self._note_lost()
+            self._crew.note_lost()
         return self.outputs, self.statuses
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
         with self._lock:
-            supervisor = next(s for s in self._supervisors if index < s.block.stop)
-            if not self._lost[index]:
+            supervisor = self._crew.of(index)
+            if not self._crew.lost[index]:
                 within = index - supervisor.block.start
-                texts = self._run("a question", [supervisor], lambda s: s.tell("failure", within))
+                texts = self._crew.run(
+                    "a question", [supervisor], lambda s: s.tell("failure", within)
+                )
                 for text in texts.values():
                     return str(text)
             return supervisor.reason
@@ -285,12 +262,12 @@ class ProcessPool(CountedPool):
     def _count_steps(self) -> None:
         """A worker that dies does not tell of its last episode's steps."""
         with self._lock:
-            if not self._refusal:
-                self._run("a question", self._able, lambda s: s.tell("count_steps"))
+            if not self._crew.refusal:
+                self._crew.run("a question", self._crew.able, lambda s: s.tell("count_steps"))
 
     def _memory_growth(self) -> HealthArray:
         growth = np.zeros(self.num_instances, np.int64)
-        for supervisor in self._supervisors:
+        for supervisor in self._crew.supervisors:
             growth[supervisor.block] = supervisor.growth
         return growth
 
@@ -298,8 +275,8 @@ class ProcessPool(CountedPool):
         """See ``Pool.read``."""
         with self._lock:
             self._require_present()
-            parts = self._run(
-                "reading variables", self._supervisors, lambda s: s.tell("read", variables)
+            parts = self._crew.run(
+                "reading variables", self._crew.supervisors, lambda s: s.tell("read", variables)
             )
             self._require_present()
             return np.concatenate(list(parts.values()), axis=1)
@@ -307,87 +284,17 @@ class ProcessPool(CountedPool):
     def close(self) -> None:
         """See ``Pool.close``."""
         with self._lock:
-            self._refusal = self._refusal or "the pool is closed"
-            self._close()
-
-    # Processes.
+            self._crew.close()
 
     def processes(self) -> list[int]:
         """The process numbers of the workers; 0 where one was given up."""
-        return [supervisor.pid for supervisor in self._supervisors]
-
-    def _deadline(self) -> float:
-        return time.monotonic() + self._call_timeout
-
-    def _run(
-        self,
-        doing: str,
-        supervisors: Sequence[Supervisor],
-        tell: Callable[[Supervisor], None],
-    ) -> dict[Supervisor, Any]:
-        """Let workers do something at the same time.
-
-        Args:
-            doing: What, for the cause of deaths.
-            supervisors: Theirs.
-            tell: Tells one.
-
-        Returns:
-            What those reply that live. The instances of the others are lost.
-
-        Raises:
-            SimulationError: If a worker raises it, or the pool is closed.
-        """
-        if self._refusal:
-            raise SimulationError(self._refusal)
-        deadline = self._deadline()
-        replies: dict[Supervisor, Any] = {}
-        try:
-            for supervisor in supervisors:
-                tell(supervisor)
-            for supervisor in supervisors:
-                try:
-                    replies[supervisor] = supervisor.reply(deadline, doing)
-                except LostError:
-                    self._lose(supervisor)
-        except BaseException:  # such as KeyboardInterrupt: the replies would come in its place
-            self._stop_busy(supervisors)
-            raise
-        _raise_any(replies.values())
-        return replies
-
-    def _lose(self, supervisor: Supervisor) -> None:
-        """Note the loss of a block, and start its next worker before anybody waits for it."""
-        block = supervisor.block
-        self._counts[block, Column.DEATHS] += 1
-        self._lost[block] = True
-        np.copyto(self.observations[block], self.outputs[: self.observations.shape[1], block].T)
-        self._note_lost()
-        supervisor.start_ahead()
-
-    def _stop_busy(self, supervisors: Iterable[Supervisor]) -> None:
-        for supervisor in supervisors:
-            if supervisor.is_busy:
-                supervisor.bury("the call was interrupted")
-                self._lost[supervisor.block] = True
-        self._note_lost()
-
-    def _note_lost(self) -> None:
-        self._any_lost = bool(self._lost.any())
-        self._able = [s for s in self._supervisors if not self._lost[s.block].all()]
-        self.statuses[self._lost] = Status.FATAL
+        return [supervisor.pid for supervisor in self._crew.supervisors]
 
     def _require_present(self, mask: MaskArray | None = None) -> None:
-        lost = np.flatnonzero(self._lost if mask is None else self._lost & mask)
-        if lost.size:
-            raise SimulationError(self.failure(int(lost[0])))
-
-    def forget(self) -> None:
-        """Let go of the workers: this process is a fork of the one that they belong to."""
-        self._refusal = "the pool belongs to the process that this one was forked from"
-        self._close.detach()
-        for supervisor in self._supervisors:
-            supervisor.forget()
+        lost = self._crew.lost
+        missing = np.flatnonzero(lost if mask is None else lost & mask)
+        if missing.size:
+            raise SimulationError(self.failure(int(missing[0])))
 
 
 class _Snapshot:
@@ -398,36 +305,36 @@ class _Snapshot:
         weakref.finalize(self, _release, parts).atexit = False
 
 
+def _require_generation(supervisor: Supervisor, generation: int) -> None:
+    if supervisor.generation != generation:
+        raise SimulationError(
+            "the snapshot is of instances whose process has been replaced since: "
+            f"{supervisor.reason}"
+        )
+
+
 def _release(parts: dict[Supervisor, tuple[int, int]]) -> None:
     for supervisor, part in parts.items():
         supervisor.released.append(part)
 
 
-def _raise_any(replies: Iterable[Any]) -> None:
-    for reply in replies:
-        if isinstance(reply, FMUGymError):
-            raise SimulationError(str(reply))
+def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:
+    if call_timeout is not None:
+        check_number("call_timeout", call_timeout, positive=True)
+    for what, count in (("workers", workers), ("threads", threads)):
+        if count is not None:
+            check_count(what, count)
 
 
-def _blocks(num_instances: int, workers: int) -> list[slice]:
-    bounds = [num_instances * index // workers for index in range(workers + 1)]
-    return [slice(*pair) for pair in itertools.pairwise(bounds)]
+def _make_memory(size: int) -> Memory:
+    try:
+        return Memory(size)
+    except OSError as error:
+        raise FMULoadError(f"no memory can be shared with worker processes: {error}") from None
 
 
-def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, patience: float) -> None:
-    deadline = time.monotonic() + patience
-    for supervisor in supervisors:
-        supervisor.begin_closing()
-    for supervisor in supervisors:
-        supervisor.close(deadline)
-    memory.close()
-    fmu.close()
-
-
-def _forget_pools() -> None:
-    for pool in list(_pools):
-        pool.forget()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pools)
+def _share_out(setup: Setup, workers: int) -> list[Setup]:
+    """Give each worker a block of the instances, the blocks as equal as can be."""
+    bounds = [setup.num_instances * index // workers for index in range(workers + 1)]
+    blocks = itertools.starmap(slice, itertools.pairwise(bounds))
+    return [replace(setup, block=block, number=number) for number, block in enumerate(blocks)]

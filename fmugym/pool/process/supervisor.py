@@ -11,7 +11,6 @@ from collections import deque
 from pathlib import Path
 from typing import Any, Final
 
-from fmugym.errors import FMULoadError
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.last_words import describe_exit
 from fmugym.pool.process.launcher import Process, launch
@@ -79,21 +78,26 @@ class Supervisor:
         Raises:
             LostError: If there can be none.
         """
-        end, other_end = socket.socketpair()
         try:
-            with other_end:
-                self._process = launch(other_end, self._memory, self._setup.folder)
-        except FMULoadError as error:
-            end.close()
-            self.reason = str(error)
-            raise LostError(self.reason) from None
-        self._channel = Channel(end)
+            self._process, self._channel = self._launch()
+        except (OSError, EOFError) as error:
+            raise LostError(f"no worker process can be started: {error}") from None
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
         self.growth, self.is_new = 0, True
         self.known.clear()
-        self._channel.send_object(Code.REQUEST, ("open", (self._setup,)))
+        self.tell("open", self._setup)
         self._opening = True
+
+    def _launch(self) -> tuple[Process, Channel]:
+        end, other_end = socket.socketpair()
+        try:
+            with other_end:
+                process = launch(other_end, self._memory, self._setup.folder)
+        except BaseException:
+            end.close()
+            raise
+        return process, Channel(end, process.sentinel)
 
     def revive(self) -> None:
         """Start a process if there is none, later and later if one after the other dies.
@@ -107,12 +111,16 @@ class Supervisor:
             raise LostError(self.reason)
         if self._deaths > 1:
             time.sleep(_FIRST_PAUSE * 2 ** (self._deaths - 2))
-        self.start()
+        try:
+            self.start()
+        except LostError as error:
+            self.reason = str(error)
+            raise
 
     def start_ahead(self) -> None:
         """Start a process before it is needed, but not again and again."""
         if self._process is None and self._deaths == 1:
-            with contextlib.suppress(LostError):
+            with contextlib.suppress(LostError):  # there is time to try again
                 self.start()
 
     def bury(self, reason: str) -> None:
@@ -124,8 +132,7 @@ class Supervisor:
         self._forget_process(reason)
 
     def _forget_process(self, reason: str) -> None:
-        self._channel.close()
-        self._process = None
+        self.forget()
         self._opening = self._busy = False
         self.generation += 1
         self._deaths += 1
@@ -149,6 +156,7 @@ class Supervisor:
         """Let go of the worker: this process is a fork of the one that it belongs to."""
         if self._process is not None:
             self._channel.close()
+            self._process.forget()
             self._process = None
 
     def begin_closing(self) -> None:
@@ -236,7 +244,7 @@ class Supervisor:
         while True:
             left = deadline - time.monotonic() if deadline < math.inf else None
             if not self._channel.wait(left):
-                if not _is_debugged(self.pid):
+                if time.monotonic() >= deadline and not _is_debugged(self.pid):
                     self._end_hang(doing)
                 continue
             try:

@@ -35,8 +35,9 @@ from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
 
-_SIGNALS_OF_PARENT: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-"""Meant for the parent, and often sent to all of its processes; the workers end with it."""
+_IGNORED_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGTTIN", "SIGTTOU")
+"""The first are meant for the parent, and often sent to all of its processes; the workers end with
+it. The last two would stop a process in the background that uses the terminal."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ class BlockWorker:
         self._snapshots: dict[int, Any] = {}
         self._numbers = itertools.count()
         self._serving = True
+        self._process = os.getpid()
 
     def serve(self) -> None:
         """Do what comes through the channel until it says ``close`` or is closed."""
@@ -138,10 +140,11 @@ class BlockWorker:
         name, arguments = self._channel.receive_object()
         try:
             result = getattr(self, name)(*arguments)
+            code = Code.RESULT
         except FMUGymError as error:
-            self._channel.send_object(Code.ERROR, error)
-        else:
-            self._channel.send_object(Code.RESULT, result)
+            code, result = Code.ERROR, error
+        self._end_twin()
+        self._channel.send_object(code, result)
 
     def _step(self) -> None:
         np.copyto(self._pool.inputs, self._block.inputs)
@@ -152,12 +155,18 @@ class BlockWorker:
         pool.step(block.inputs, block.mask, pool.observations)
         self._note(int(np.count_nonzero(pool.statuses > Status.WARNING)))
 
+    def _end_twin(self) -> None:
+        """End this process if an FMU has made it by a fork and came back from its function."""
+        if os.getpid() != self._process:
+            os._exit(0)
+
     def _note(self, troubled: int) -> None:
         self._channel.require_open()  # else the outputs would be those of a step that is lost
         self._publish()
         self._channel.send_code(Code.TROUBLE if troubled else Code.FINE)
 
     def _publish(self) -> None:
+        self._end_twin()
         pool, block = self._pool, self._block
         np.copyto(block.outputs, pool.outputs)
         np.copyto(block.observations, pool.observations)
@@ -257,7 +266,7 @@ def run_worker(end: socket.socket, memory: Memory) -> int:
     Returns:
         The exit status of the process.
     """
-    for name in _SIGNALS_OF_PARENT:
+    for name in _IGNORED_SIGNALS:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     channel = Channel(end)

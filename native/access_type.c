@@ -1,0 +1,79 @@
+/* The type Access: a list of variables. */
+
+#include "python.h"
+
+PyTypeObject *access_type;
+
+const Fmi *fmi_of(int version) {
+    static const Fmi *const versions[] = {&fmi1, &fmi2, &fmi3};
+
+    if (version < 1 || version > 3) {
+        PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);
+        return NULL;
+    }
+    return versions[version - 1];
+}
+
+bool is_access(const PyPool *self, PyObject *object) {
+    if (!PyObject_TypeCheck(object, access_type) ||
+        ((PyAccess *)object)->access.fmi != self->pool.settings.fmi) {
+        PyErr_SetString(PyExc_TypeError, "expected an Access of this FMI version");
+        return false;
+    }
+    return true;
+}
+
+static bool check_types(const uint8_t *types, Py_ssize_t count, Py_ssize_t size) {
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (types[i] >= NUMBER_OF_TYPES) {
+            PyErr_SetString(PyExc_ValueError, "unknown C type");
+            return false;
+        }
+    }
+    if (size != count * (Py_ssize_t)sizeof(uint32_t)) {
+        PyErr_SetString(PyExc_ValueError, "types and references differ in length");
+        return false;
+    }
+    return true;
+}
+
+static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
+    const char *types, *references;
+    Py_ssize_t count, size;
+    int version;
+
+    (void)kwargs;
+    if (!PyArg_ParseTuple(args, "iy#y#", &version, &types, &count, &references, &size)) {
+        return NULL;
+    }
+    const Fmi *fmi = fmi_of(version);
+    if (fmi == NULL || !check_types((const uint8_t *)types, count, size)) {
+        return NULL;
+    }
+    allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
+    PyAccess *self = (PyAccess *)allocate(type, 0);
+    if (self != NULL &&
+        !access_open(&self->access, fmi, (const uint8_t *)types, references, (size_t)count)) {
+        Py_DECREF(self);
+        return PyErr_NoMemory();
+    }
+    return (PyObject *)self;
+}
+
+static void access_dealloc(PyObject *object) {
+    PyTypeObject *type = Py_TYPE(object);
+    freefunc release_memory = (freefunc)PyType_GetSlot(type, Py_tp_free);
+
+    access_close(&((PyAccess *)object)->access);
+    release_memory(object);
+    Py_DECREF(type);
+}
+
+static PyType_Slot slots[] = {
+    {Py_tp_new, (void *)access_new},
+    {Py_tp_dealloc, (void *)access_dealloc},
+    {0, NULL},
+};
+
+PyType_Spec access_spec = {"fmugym._native.Access", sizeof(PyAccess), 0, Py_TPFLAGS_DEFAULT,
+                           slots};

@@ -1,0 +1,130 @@
+/* The floating-point environment: rounding mode, treatment of denormal numbers, traps.
+ *
+ * An FMU that leaves another one behind would change the last bits of whatever its thread computes
+ * next. So it is put back before the next instance has its turn. To read the control register takes as
+ * long as a tenth of a small FMU's step, because the processor finishes all pending arithmetic first.
+ * Between the instances of a run it is therefore enough to see that sums are rounded as before; what
+ * no sum can tell (traps, the registers of the x87) is put back at the end of the run. */
+
+#ifndef FMUGYM_FLOATS_H
+#define FMUGYM_FLOATS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#if (defined __x86_64__ || defined _M_X64 || (defined __i386__ && defined __SSE2__)) &&           \
+    !defined FMUGYM_PORTABLE_FLOATS
+#define FMUGYM_FLOATS_X86
+#include <emmintrin.h>
+#elif defined __aarch64__ && defined __GNUC__ && !defined FMUGYM_PORTABLE_FLOATS
+#define FMUGYM_FLOATS_ARM
+#else
+#include <fenv.h>
+#endif
+
+#if defined FMUGYM_FLOATS_X86
+
+typedef struct {
+    __m128i sums; /* what the processor makes of sums that every mode rounds in another way */
+    uint32_t sse;
+    uint16_t x87;
+} Floats;
+
+/* Sums that come out differently rounded upwards (the first) and downwards or towards zero (the
+ * second), and where denormal numbers count as zero (the others). */
+static inline __m128i floats_sums(void) {
+    __m128 a = _mm_set_ps(0x1p-140f, 0x1p-140f, 1.0f, 1.0f);
+    __m128 b = _mm_set_ps(0x1p-140f, 0x1p-141f, 0x1.8p-24f, 0x1p-26f);
+#if defined __GNUC__
+    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* here and now */
+#else
+    volatile __m128 first = a;
+    a = _mm_add_ps(first, b);
+#endif
+    return _mm_castps_si128(a);
+}
+
+static inline uint16_t floats_x87(void) {
+    uint16_t control = 0;
+#if defined __GNUC__
+    __asm__ volatile("fnstcw %0" : "=m"(control));
+#endif
+    return control;
+}
+
+static inline Floats floats_now(void) {
+    const uint32_t sticky = 0x3f; /* exceptions seen, which are no modes */
+    return (Floats){floats_sums(), _mm_getcsr() & ~sticky, floats_x87()};
+}
+
+static inline bool floats_seem_same(const Floats *before) {
+    const __m128i same = _mm_cmpeq_epi32(floats_sums(), before->sums);
+    return _mm_movemask_epi8(same) == 0xffff;
+}
+
+static inline void floats_restore(const Floats *before) {
+    if ((_mm_getcsr() & ~(uint32_t)0x3f) != before->sse) {
+        _mm_setcsr(before->sse);
+    }
+#if defined __GNUC__
+    if (floats_x87() != before->x87) {
+        __asm__ volatile("fldcw %0" : : "m"(before->x87));
+    }
+#endif
+}
+
+#elif defined FMUGYM_FLOATS_ARM
+
+typedef struct {
+    uint64_t control;
+} Floats;
+
+static inline Floats floats_now(void) {
+    Floats now;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(now.control));
+    return now;
+}
+
+static inline bool floats_seem_same(const Floats *before) {
+    return floats_now().control == before->control;
+}
+
+static inline void floats_restore(const Floats *before) {
+    if (!floats_seem_same(before)) {
+        __asm__ volatile("msr fpcr, %0" : : "r"(before->control));
+    }
+}
+
+#else
+
+typedef struct {
+    fenv_t environment;
+    int rounding;
+} Floats;
+
+static inline Floats floats_now(void) {
+    Floats now;
+    fegetenv(&now.environment);
+    now.rounding = fegetround();
+    return now;
+}
+
+/* As much as the language can tell without a look at the whole environment. */
+static inline bool floats_seem_same(const Floats *before) {
+    return fegetround() == before->rounding;
+}
+
+static inline void floats_restore(const Floats *before) {
+    fesetenv(&before->environment);
+}
+
+#endif
+
+/* Between the instances of a run. */
+static inline void floats_restore_if_seen(const Floats *before) {
+    if (!floats_seem_same(before)) {
+        floats_restore(before);
+    }
+}
+
+#endif

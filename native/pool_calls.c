@@ -1,0 +1,288 @@
+/* The methods of the type Pool that step, reset and read instances. */
+
+#include <stdlib.h>
+
+#include "python.h"
+
+bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
+    if (given != expected) {
+        PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", expected, given);
+    }
+    return given == expected;
+}
+
+/* A call, the arrays that it holds on to, and what comes of it. Arrays that are the pool's own need no
+ * new buffer. */
+typedef struct {
+    int operation;
+    Call call;
+    Py_buffer inputs, mask, observations, values;
+    size_t troubled;
+} PyCall;
+
+static void release_views(PyCall *c) {
+    release_buffer(&c->inputs);
+    release_buffer(&c->mask);
+    release_buffer(&c->observations);
+    release_buffer(&c->values);
+}
+
+static Matrix matrix_of(const Py_buffer *buffer) {
+    return (Matrix){buffer->buf, buffer->strides[0], buffer->strides[1]};
+}
+
+static bool view_inputs(PyPool *self, PyObject *object, PyCall *c) {
+    const Settings *s = &self->pool.settings;
+    Py_buffer *buffer = &self->buffers[INPUTS];
+
+    if (object != self->arrays[INPUTS] && object != Py_None) {
+        buffer = &c->inputs;
+        if (!take_matrix(object, buffer, COPIED, "inputs", ITEM_FLOAT64,
+                         (Py_ssize_t)s->inputs->count, (Py_ssize_t)s->count)) {
+            return false;
+        }
+    }
+    c->call.inputs = matrix_of(buffer);
+    return true;
+}
+
+static bool view_mask(PyPool *self, PyObject *object, PyCall *c) {
+    if (object == Py_None) {
+        return true;
+    }
+    if (!take_vector(object, &c->mask, COPIED, "the mask", ITEM_BOOLEAN,
+                     (Py_ssize_t)self->pool.settings.count)) {
+        return false;
+    }
+    c->call.mask = (Mask){c->mask.buf, c->mask.strides[0]};
+    return true;
+}
+
+static bool view_observations(PyPool *self, PyObject *object, PyCall *c) {
+    const Settings *s = &self->pool.settings;
+    Py_buffer *buffer = &self->buffers[OBSERVATIONS];
+
+    if (object == Py_None) {
+        return true;
+    }
+    if (object != self->arrays[OBSERVATIONS]) {
+        buffer = &c->observations;
+        if (!take_matrix(object, buffer, WRITTEN, "observations", ITEM_FLOAT32,
+                         (Py_ssize_t)s->count, (Py_ssize_t)s->num_observed)) {
+            return false;
+        }
+    }
+    c->call.observations = buffer->buf;
+    return true;
+}
+
+static bool view_start(PyPool *self, PyObject *access, PyObject *values, PyCall *c) {
+    if (!is_access(self, access)) {
+        return false;
+    }
+    c->call.start = &((PyAccess *)access)->access;
+    if (!take_matrix(values, &c->values, COPIED, "values", ITEM_FLOAT64,
+                     (Py_ssize_t)c->call.start->count, (Py_ssize_t)self->pool.settings.count)) {
+        return false;
+    }
+    c->call.start_values = matrix_of(&c->values);
+    return true;
+}
+
+static void do_call(PyPool *self, bool alone, void *context) {
+    static size_t (*const functions[])(Pool *, const Call *) = {
+        [STEP] = pool_step, [RESET] = pool_reset, [MIXED] = pool_step_or_reset};
+    PyCall *c = context;
+
+    c->call.alone = alone;
+    c->troubled = functions[c->operation](&self->pool, &c->call);
+}
+
+static PyObject *finish(PyPool *self, PyCall *c) {
+    const bool done = perform(self, c->operation, do_call, c);
+
+    release_views(c);
+    return done && report_messages(self) ? PyLong_FromSize_t(c->troubled) : NULL;
+}
+
+static PyObject *give_up(PyCall *c) {
+    release_views(c);
+    return NULL;
+}
+
+PyObject *py_step_own(PyObject *object, PyObject *unused) {
+    PyPool *self = (PyPool *)object;
+    PyCall c = {.operation = STEP,
+                .call = {.inputs = matrix_of(&self->buffers[INPUTS]),
+                         .observations = self->buffers[OBSERVATIONS].buf}};
+
+    (void)unused;
+    return finish(self, &c);
+}
+
+PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    PyCall c = {.operation = STEP};
+
+    if (has_arguments(nargs, 3) && view_inputs(self, args[0], &c) &&
+        view_mask(self, args[1], &c) && view_observations(self, args[2], &c)) {
+        return finish(self, &c);
+    }
+    return give_up(&c);
+}
+
+PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    PyCall c = {.operation = RESET};
+
+    if (has_arguments(nargs, 4) && view_inputs(self, Py_None, &c) &&
+        view_start(self, args[0], args[1], &c) && view_mask(self, args[2], &c) &&
+        view_observations(self, args[3], &c)) {
+        return finish(self, &c);
+    }
+    return give_up(&c);
+}
+
+PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    PyCall c = {.operation = MIXED};
+
+    if (has_arguments(nargs, 5) && view_inputs(self, args[0], &c) &&
+        view_start(self, args[1], args[2], &c) && view_mask(self, args[3], &c) &&
+        view_observations(self, args[4], &c)) {
+        return finish(self, &c);
+    }
+    return give_up(&c);
+}
+
+typedef struct {
+    const Access *access;
+    double *values;
+    ptrdiff_t failed;
+} Reading;
+
+static void do_read(PyPool *self, bool alone, void *context) {
+    Reading *r = context;
+    (void)alone;
+    r->failed = pool_read(&self->pool, r->access, r->values);
+}
+
+PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    Py_buffer values;
+
+    if (!has_arguments(nargs, 2) || !is_access(self, args[0])) {
+        return NULL;
+    }
+    const Access *access = &((PyAccess *)args[0])->access;
+    if (!take_matrix(args[1], &values, WRITTEN, "values", ITEM_FLOAT64, (Py_ssize_t)access->count,
+                     (Py_ssize_t)self->pool.settings.count)) {
+        return NULL;
+    }
+    Reading reading = {access, values.buf, -1};
+    const bool done = perform(self, NEVER_SHORT, do_read, &reading);
+    PyBuffer_Release(&values);
+    return done && report_messages(self) ? PyLong_FromSsize_t(reading.failed) : NULL;
+}
+
+/* Small questions */
+
+typedef struct {
+    size_t index;
+    bool found;
+    Failure failure;
+} Asking;
+
+static void do_ask(PyPool *self, bool alone, void *context) {
+    Asking *a = context;
+    (void)alone;
+    a->found = pool_failure(&self->pool, a->index, &a->failure);
+}
+
+static PyObject *values_of(const Failure *f) {
+    if (f->values == NULL) {
+        Py_RETURN_NONE;
+    }
+    return PyBytes_FromStringAndSize((const char *)f->values,
+                                     (Py_ssize_t)(f->number_of_values * sizeof *f->values));
+}
+
+PyObject *py_failure(PyObject *object, PyObject *argument) {
+    PyPool *self = (PyPool *)object;
+    const Py_ssize_t index = PyNumber_AsSsize_t(argument, PyExc_IndexError);
+
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    if (index < 0 || (size_t)index >= self->pool.settings.count) {
+        PyErr_Format(PyExc_IndexError, "there is no instance %zd", index);
+        return NULL;
+    }
+    Asking asking = {.index = (size_t)index};
+    if (!perform(self, ALWAYS_SHORT, do_ask, &asking)) {
+        return NULL;
+    }
+    if (!asking.found) {
+        Py_RETURN_NONE;
+    }
+    const Failure *f = &asking.failure;
+    PyObject *result = Py_BuildValue("sOidINN", f->doing, f->in_warm_up ? Py_True : Py_False,
+                                     f->status, f->time, (unsigned)f->string_reference,
+                                     decode(f->said), values_of(f));
+    free(f->said);
+    free(f->values);
+    return result;
+}
+
+static void do_count_steps(PyPool *self, bool alone, void *context) {
+    (void)alone;
+    (void)context;
+    pool_count_steps(&self->pool);
+}
+
+PyObject *py_count_steps(PyObject *object, PyObject *unused) {
+    (void)unused;
+    if (!perform((PyPool *)object, NEVER_SHORT, do_count_steps, NULL)) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+static void do_recycle(PyPool *self, bool alone, void *context) {
+    (void)alone;
+    (void)context;
+    pool_recycle(&self->pool);
+}
+
+PyObject *py_recycle(PyObject *object, PyObject *unused) {
+    (void)unused;
+    if (!perform((PyPool *)object, NEVER_SHORT, do_recycle, NULL)) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+static void do_copy_costs(PyPool *self, bool alone, void *context) {
+    double *means = context;
+    (void)alone;
+    for (int i = 0; i < OPERATIONS; i++) {
+        means[i] = self->pool.costs[i].mean;
+    }
+}
+
+PyObject *py_costs(PyObject *object, PyObject *unused) {
+    double means[OPERATIONS];
+
+    (void)unused;
+    if (!perform((PyPool *)object, ALWAYS_SHORT, do_copy_costs, means)) {
+        return NULL;
+    }
+    return Py_BuildValue("(ddd)", means[STEP], means[RESET], means[MIXED]);
+}
+
+PyObject *py_uses_states(PyObject *object, PyObject *unused) {
+    PyPool *self = (PyPool *)object;
+    (void)unused;
+    return PyBool_FromLong(self->pool.settings.restores &&
+                           !atomic_get(&self->pool.states_too_large));
+}

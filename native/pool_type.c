@@ -1,0 +1,429 @@
+/* The type Pool: how one is made and closed, entered, and how its FMUs' messages come out. */
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "python.h"
+
+PyObject *decode(const char *text) {
+    return PyUnicode_DecodeUTF8(text == NULL ? "" : text,
+                                text == NULL ? 0 : (Py_ssize_t)strlen(text), "replace");
+}
+
+/* Messages go to Python after a call, on the thread that made it. */
+
+/* An exception that is an error of the receiver's must not stop the pool; any other, as of Ctrl-C or
+ * sys.exit, is for the caller. Signals are looked at before: what a handler of theirs raises would
+ * else be taken for the receiver's. */
+static bool report(PyPool *self, const Message *message) {
+    PyObject *result =
+        PyObject_CallFunction(self->callback, "niNN", (Py_ssize_t)message->index, message->status,
+                              decode(message->category), decode(message->text));
+
+    if (result == NULL && PyErr_ExceptionMatches(PyExc_Exception)) {
+        PyErr_WriteUnraisable(self->callback);
+    }
+    Py_XDECREF(result);
+    return !PyErr_Occurred();
+}
+
+static bool report_dropped(PyPool *self) {
+    static char category[] = "fmugym", text[] = "later messages were dropped: too many at once";
+    const Message message = {.status = STATUS_WARNING, .category = category, .text = text};
+    return report(self, &message);
+}
+
+/* What is left when an exception comes is for the next call. */
+static bool drain(PyPool *self) {
+    size_t dropped;
+    Message *left = log_take(&self->pool.log, &dropped);
+    bool good = PyErr_CheckSignals() == 0;
+
+    while (good && left != NULL) {
+        Message *message = left;
+        left = message->next;
+        good = report(self, message) && PyErr_CheckSignals() == 0;
+        message_free(message);
+    }
+    if (good && dropped > 0) {
+        dropped = 0;
+        good = report_dropped(self);
+    }
+    if (left != NULL || dropped > 0) {
+        log_give_back(&self->pool.log, left, dropped);
+    }
+    return good;
+}
+
+bool report_messages(PyPool *self) {
+    return !atomic_get(&self->pool.log.pending) || drain(self);
+}
+
+/* Entering */
+
+/* Getting the GIL back may take milliseconds where other Python threads are busy: work so short that
+ * nobody notices is done without letting go of it. */
+static bool is_short(const PyPool *self, int length) {
+    return length == ALWAYS_SHORT || (length >= 0 && pool_is_quick(&self->pool, length));
+}
+
+static bool explain(Entry entry) {
+    if (entry == ENTRY_CLOSED) {
+        PyErr_SetString(closed_error, "the pool is closed");
+    } else if (entry == ENTRY_INSIDE) {
+        PyErr_SetString(PyExc_RuntimeError, "an FMU has called the pool that it is in");
+    }
+    return entry == ENTRY_ENTERED;
+}
+
+bool perform(PyPool *self, int length, Work *work, void *context) {
+    Entry entry = pool_try_enter(&self->pool);
+
+    if (entry == ENTRY_ENTERED && is_short(self, length)) {
+        work(self, true, context);
+        pool_leave(&self->pool);
+    } else if (entry == ENTRY_ENTERED || entry == ENTRY_BUSY) {
+        Py_BEGIN_ALLOW_THREADS
+        entry = entry == ENTRY_BUSY ? pool_enter(&self->pool) : entry;
+        if (entry == ENTRY_ENTERED) {
+            work(self, false, context);
+            pool_leave(&self->pool);
+        }
+        Py_END_ALLOW_THREADS
+    }
+    return explain(entry);
+}
+
+/* Closing */
+
+/* Returns false with an exception if reporting the last messages was interrupted, or if an FMU closes
+ * its own pool. */
+static bool close_pool(PyPool *self) {
+    Entry entry;
+
+    Py_BEGIN_ALLOW_THREADS
+    entry = pool_enter(&self->pool);
+    if (entry == ENTRY_ENTERED) {
+        pool_close(&self->pool);
+        pool_leave(&self->pool);
+    }
+    Py_END_ALLOW_THREADS
+    if (entry != ENTRY_ENTERED) {
+        return entry == ENTRY_CLOSED || explain(entry);
+    }
+    const bool reported = report_messages(self);
+    log_close(&self->pool.log);
+    return reported;
+}
+
+PyObject *py_close(PyObject *object, PyObject *unused) {
+    (void)unused;
+    if (!close_pool((PyPool *)object)) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* An error may be on its way when this is called; another one cannot be raised here. */
+static void close_at_the_end(PyPool *self) {
+    PyObject *type, *value, *traceback;
+
+    PyErr_Fetch(&type, &value, &traceback);
+    if (!close_pool(self)) {
+        PyErr_WriteUnraisable(NULL);
+    }
+    pool_dispose(&self->pool);
+    PyErr_Restore(type, value, traceback);
+}
+
+static void pool_dealloc(PyObject *object) {
+    PyPool *self = (PyPool *)object;
+    PyTypeObject *type = Py_TYPE(object);
+    freefunc release_memory = (freefunc)PyType_GetSlot(type, Py_tp_free);
+
+    if (self->opened) {
+        close_at_the_end(self);
+    }
+    for (int i = 0; i < BUFFERS; i++) {
+        release_buffer(&self->buffers[i]);
+    }
+    free(self->paths);
+    free(self->strings);
+    Py_XDECREF(self->playing);
+    Py_XDECREF(self->streams);
+    Py_XDECREF(self->arguments);
+    release_memory(object);
+    Py_DECREF(type);
+}
+
+/* Making: each argument is a group of named values */
+
+typedef struct {
+    PyObject *paths, *stop_time, *tolerance, *strings;
+    PyAccess *inputs, *outputs;
+    Py_ssize_t num_observed, count, threads;
+    int version, private_libraries, logging, can_save;
+    int restores, rebuilds, reloads;
+    long long substeps, warm_up_steps, retries;
+} Arguments;
+
+bool parse_group(PyObject *group, const char *format, char **names, ...) {
+    PyObject *nothing = PyTuple_New(0);
+    va_list places;
+
+    va_start(places, names);
+    const bool parsed = nothing != NULL && PyArg_VaParseTupleAndKeywords(nothing, group, format,
+                                                                         names, places);
+    va_end(places);
+    Py_XDECREF(nothing);
+    return parsed;
+}
+
+static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
+    static char *names[] = {"version", "model",   "token",  "resources", "paths",
+                            "private", "logging", "states", NULL};
+    Settings *s = &self->pool.settings;
+    return parse_group(group, "$iyyyO!ppp:library", names, &a->version, &s->model, &s->token,
+                       &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries,
+                       &a->logging, &a->can_save);
+}
+
+static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
+    static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
+                            "substeps",   "warm_up_steps", "retries",   "restores",
+                            "rebuilds",   "reloads",       NULL};
+    Settings *s = &self->pool.settings;
+    return parse_group(group, "$dOOdLLLppp:experiment", names, &s->experiment.start_time,
+                       &a->stop_time, &a->tolerance, &s->time_step, &a->substeps,
+                       &a->warm_up_steps, &a->retries, &a->restores, &a->rebuilds, &a->reloads);
+}
+
+static bool parse_variables(PyObject *group, Arguments *a) {
+    static char *names[] = {"inputs", "outputs", "num_observed", "strings", NULL};
+    return parse_group(group, "$O!O!nO!:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &PyTuple_Type, &a->strings);
+}
+
+static bool parse_arrays(PyPool *self, PyObject *group) {
+    static char *names[] = {"inputs", "outputs", "statuses", "observations", "health", NULL};
+    PyObject **arrays = self->arrays;
+    return parse_group(group, "$OOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
+                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH]);
+}
+
+static bool parse(PyPool *self, PyObject *args, PyObject *kwargs, Arguments *a) {
+    static char *names[] = {"library", "experiment", "variables", "arrays",
+                            "count",   "threads",    "callback",  NULL};
+    PyObject *library, *experiment, *variables, *arrays;
+
+    return PyArg_ParseTupleAndKeywords(args, kwargs, "$O!O!O!O!nnO:Pool", names, &PyDict_Type,
+                                       &library, &PyDict_Type, &experiment, &PyDict_Type,
+                                       &variables, &PyDict_Type, &arrays, &a->count, &a->threads,
+                                       &self->callback) &&
+           parse_library(self, library, a) && parse_experiment(self, experiment, a) &&
+           parse_variables(variables, a) && parse_arrays(self, arrays);
+}
+
+static bool check_numbers(const Arguments *a) {
+    const bool sound = a->count >= 1 && a->count <= INT32_MAX && a->threads >= 1 &&
+                       a->substeps >= 1 && a->warm_up_steps >= 0 && a->num_observed >= 0 &&
+                       a->retries >= 0 && a->retries < 31 && (a->retries == 0 || a->can_save) &&
+                       (size_t)a->num_observed <= a->outputs->access.count;
+    if (!sound) {
+        PyErr_SetString(PyExc_ValueError, "a number is out of range");
+    }
+    return sound;
+}
+
+static bool check_accesses(const Arguments *a) {
+    const Fmi *fmi = fmi_of(a->version);
+
+    if (fmi == NULL) {
+        return false;
+    }
+    if (a->inputs->access.fmi != fmi || a->outputs->access.fmi != fmi) {
+        PyErr_SetString(PyExc_TypeError, "expected an Access of this FMI version");
+        return false;
+    }
+    return true;
+}
+
+static bool take_optional(PyObject *object, bool *given, double *value) {
+    *given = object != Py_None;
+    *value = *given ? PyFloat_AsDouble(object) : 0.0;
+    return !PyErr_Occurred();
+}
+
+static bool take_paths(PyPool *self, PyObject *paths, Py_ssize_t wanted) {
+    const Py_ssize_t count = PyTuple_Size(paths);
+
+    self->paths = calloc((size_t)count + 1, sizeof *self->paths);
+    if (self->paths == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        self->paths[i] = PyBytes_AsString(PyTuple_GetItem(paths, i));
+        if (self->paths[i] == NULL) {
+            return false;
+        }
+    }
+    if (count != wanted) {
+        PyErr_Format(PyExc_ValueError, "%zd libraries are wanted, not %zd", wanted, count);
+    }
+    return count == wanted;
+}
+
+static bool take_string(PyObject *pair, StringValue *string) {
+    if (!PyTuple_Check(pair)) {
+        PyErr_SetString(PyExc_TypeError, "a String must be a tuple of reference and text");
+        return false;
+    }
+    return PyArg_ParseTuple(pair, "Iy", &string->reference, &string->text);
+}
+
+static bool take_strings(PyPool *self, PyObject *strings) {
+    const Py_ssize_t count = PyTuple_Size(strings);
+
+    self->strings = calloc((size_t)count + 1, sizeof *self->strings);
+    if (self->strings == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (!take_string(PyTuple_GetItem(strings, i), &self->strings[i])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static bool take_arrays(PyPool *self, const Arguments *a) {
+    PyObject *const *arrays = self->arrays;
+    Py_buffer *buffers = self->buffers;
+    const Py_ssize_t n = a->count;
+    const Py_ssize_t in = (Py_ssize_t)a->inputs->access.count;
+    const Py_ssize_t out = (Py_ssize_t)a->outputs->access.count;
+
+    return take_matrix(arrays[INPUTS], &buffers[INPUTS], WRITTEN, "inputs", ITEM_FLOAT64, in, n) &&
+           take_matrix(arrays[OUTPUTS], &buffers[OUTPUTS], WRITTEN, "outputs", ITEM_FLOAT64, out,
+                       n) &&
+           take_vector(arrays[STATUS], &buffers[STATUS], WRITTEN, "statuses", ITEM_INT8, n) &&
+           take_matrix(arrays[OBSERVATIONS], &buffers[OBSERVATIONS], WRITTEN, "observations",
+                       ITEM_FLOAT32, n, a->num_observed) &&
+           take_matrix(arrays[HEALTH], &buffers[HEALTH], WRITTEN, "health", ITEM_INT64, n,
+                       HEALTH_COUNTS);
+}
+
+static bool settle(PyPool *self, const Arguments *a) {
+    Settings *s = &self->pool.settings;
+
+    s->fmi = fmi_of(a->version);
+    s->private_libraries = a->private_libraries;
+    s->logging = a->logging;
+    s->can_save = a->can_save && s->fmi->get_state != NULL;
+    s->substeps = a->substeps;
+    s->warm_up_steps = a->warm_up_steps;
+    s->retries = s->can_save ? a->retries : 0;
+    s->restores = s->can_save && a->restores;
+    s->rebuilds = a->rebuilds;
+    s->reloads = a->reloads;
+    s->inputs = &a->inputs->access;
+    s->outputs = &a->outputs->access;
+    s->num_observed = (size_t)a->num_observed;
+    s->count = (size_t)a->count;
+    s->threads = (size_t)a->threads;
+    s->paths = self->paths;
+    s->strings = self->strings;
+    s->number_of_strings = (size_t)PyTuple_Size(a->strings);
+    s->output_values = self->buffers[OUTPUTS].buf;
+    s->status = self->buffers[STATUS].buf;
+    s->health = self->buffers[HEALTH].buf;
+    return take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
+           take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
+}
+
+static bool open_pool(PyPool *self) {
+    const Settings settings = self->pool.settings;
+    char error[2048];
+    bool opened;
+
+    self->opened = true;
+    Py_BEGIN_ALLOW_THREADS
+    opened = pool_open(&self->pool, &settings, error, sizeof error);
+    Py_END_ALLOW_THREADS
+    if (!report_messages(self)) {
+        return false;
+    }
+    if (!opened) {
+        PyObject *text = decode(error);
+        PyErr_SetObject(PyExc_OSError, text);
+        Py_XDECREF(text);
+    }
+    return opened;
+}
+
+/* The dicts are copied: nobody shall take out of them what the settings point to. */
+static PyObject *copy_of_groups(PyObject *kwargs) {
+    PyObject *copy = PyDict_New(), *name, *group;
+    Py_ssize_t place = 0;
+
+    while (copy != NULL && kwargs != NULL && PyDict_Next(kwargs, &place, &name, &group)) {
+        PyObject *value = PyDict_Check(group) ? PyDict_Copy(group) : Py_NewRef(group);
+        if (value == NULL || PyDict_SetItem(copy, name, value) < 0) {
+            Py_CLEAR(copy);
+        }
+        Py_XDECREF(value);
+    }
+    return copy;
+}
+
+static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
+    allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
+    PyPool *self = (PyPool *)allocate(type, 0);
+    Arguments a;
+
+    if (self == NULL) {
+        return NULL;
+    }
+    self->arguments = copy_of_groups(kwargs);
+    if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
+        check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
+        take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
+        open_pool(self)) {
+        return (PyObject *)self;
+    }
+    Py_DECREF(self);
+    return NULL;
+}
+
+static PyMethodDef methods[] = {
+#define FAST(name, function) {name, (PyCFunction)(void (*)(void))function, METH_FASTCALL, NULL}
+    {"step_own", py_step_own, METH_NOARGS, NULL},
+    FAST("step", py_step),
+    FAST("reset", py_reset),
+    FAST("step_or_reset", py_step_or_reset),
+    {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
+     NULL},
+    {"set_streams", py_set_streams, METH_O, NULL},
+    FAST("play", py_play),
+    {"save", py_save, METH_NOARGS, NULL},
+    FAST("restore", py_restore),
+    FAST("read", py_read),
+    {"failure", py_failure, METH_O, NULL},
+    {"count_steps", py_count_steps, METH_NOARGS, NULL},
+    {"recycle", py_recycle, METH_NOARGS, NULL},
+    {"close", py_close, METH_NOARGS, NULL},
+    {"costs", py_costs, METH_NOARGS, NULL},
+    {"uses_states", py_uses_states, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyType_Slot slots[] = {
+    {Py_tp_new, (void *)pool_new},
+    {Py_tp_dealloc, (void *)pool_dealloc},
+    {Py_tp_methods, methods},
+    {0, NULL},
+};
+
+PyType_Spec pool_spec = {"fmugym._native.Pool", sizeof(PyPool), 0, Py_TPFLAGS_DEFAULT, slots};

@@ -1,0 +1,90 @@
+/* What the files with Python's view of the pool share. Nothing else includes Python.h. */
+
+#ifndef FMUGYM_PYTHON_H
+#define FMUGYM_PYTHON_H
+
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include "buffers.h"
+#include "pool.h"
+
+enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
+
+typedef struct {
+    PyObject_HEAD
+    Access access;
+} PyAccess;
+
+typedef struct {
+    PyObject_HEAD
+    Snapshot *snapshot;
+    PyObject *pool; /* keeps the memory of the pool, not its instances */
+} PySnapshot;
+
+typedef struct {
+    PyObject_HEAD
+    Pool pool;
+    bool opened;         /* whether the pool may need closing */
+    PyObject *arguments; /* keeps alive what the settings point to */
+    PyObject *callback;  /* borrowed from arguments, as are the arrays */
+    PyObject *arrays[BUFFERS];
+    Py_buffer buffers[BUFFERS];
+    const char **paths;
+    StringValue *strings;
+    PyObject *playing; /* capsules, as a call holds on to those that it has begun with */
+    PyObject *streams;
+} PyPool;
+
+extern PyTypeObject *access_type, *snapshot_type;
+extern PyObject *closed_error; /* raised by calls of a closed pool */
+
+extern PyType_Spec access_spec, snapshot_spec, pool_spec;
+
+/* The table of an FMI version; NULL with an exception if there is none. */
+const Fmi *fmi_of(int version);
+/* Whether an object is an access for this pool; else there is an exception. */
+bool is_access(const PyPool *self, PyObject *object);
+
+PyObject *decode(const char *text);
+/* Takes the values of a dict by their names, as PyArg_ParseTupleAndKeywords does. */
+bool parse_group(PyObject *group, const char *format, char **names, ...);
+bool has_arguments(Py_ssize_t given, Py_ssize_t expected);
+
+/* Calls. Work is done inside the pool, with the GIL (alone) or without. Nobody waits for the pool
+ * with the GIL: who is inside may need it. */
+
+typedef void Work(PyPool *self, bool alone, void *context);
+
+enum { ALWAYS_SHORT = -1, NEVER_SHORT = -2 };
+
+/* Does some work; length is one of the operations of pool.h, for which the pool knows its length, or
+ * one of the above. Returns false with an exception if the pool cannot be entered. */
+bool perform(PyPool *self, int length, Work *work, void *context);
+
+/* Hands over the messages of FMUs. Returns false if that was interrupted, with the exception. */
+bool report_messages(PyPool *self);
+
+/* The methods of a pool */
+
+PyObject *py_close(PyObject *object, PyObject *unused);
+
+PyObject *py_step_own(PyObject *object, PyObject *unused);
+PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_failure(PyObject *object, PyObject *argument);
+PyObject *py_count_steps(PyObject *object, PyObject *unused);
+PyObject *py_recycle(PyObject *object, PyObject *unused);
+PyObject *py_costs(PyObject *object, PyObject *unused);
+PyObject *py_uses_states(PyObject *object, PyObject *unused);
+
+PyObject *py_save(PyObject *object, PyObject *unused);
+PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+
+PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
+PyObject *py_set_streams(PyObject *object, PyObject *generators);
+PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+
+#endif

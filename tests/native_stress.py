@@ -1,0 +1,281 @@
+"""All calls of native pools against each other, from many threads, for some seconds.
+
+    python tests/native_stress.py SECONDS [SEED] [python]
+
+Threads close pools while others use them, and replace what ``play`` uses while it runs. FMUs log. The
+receiver of their messages raises, and so do signal handlers. The interpreter ends while threads still
+call. With ``python``, one of the FMUs is written in Python and so needs the GIL; the process then
+ends early, because ``pythonfmu`` frees the same memory twice when its library is unloaded.
+
+Prints how often each call came through. The exit status is 0 if all is well. ``sanitize.py`` runs
+this with sanitizers.
+"""
+
+import collections
+import contextlib
+import faulthandler
+import json
+import logging
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+
+import numpy as np
+from fmugym.vector.trace import OPERATIONS, Program
+
+from fmugym import FMU, SimulationError, bundled_fmu
+from fmugym.pool import PoolSpec
+from fmugym.pool.native import NativePool
+
+THREADS = 6
+PATIENCE = 120.0
+"""Seconds after which a call counts as one that never returns."""
+
+counts = collections.Counter()
+
+
+def instruction(operation, *operands):
+    return [OPERATIONS.index(operation), *operands, *[0] * (3 - len(operands))]
+
+
+INPUTS = Program(
+    np.array(
+        [instruction("action"), instruction("constant"), instruction("multiply", 0, 1)], np.uint16
+    ),
+    np.array([3.0]),
+    np.array([2], np.uint16),
+)
+JUDGEMENT = Program(
+    np.array(
+        [
+            instruction("output", 0),
+            instruction("absolute", 0),
+            instruction("constant", 0),
+            instruction("greater", 1, 2),
+            instruction("constant", 1),
+        ],
+        np.uint16,
+    ),
+    np.array([0.2, 0.0]),
+    np.array([3, 4, 2], np.uint16),
+)
+
+
+class Receiver(logging.Handler):
+    """Raises now and then, as receivers may, and calls the pool back."""
+
+    def __init__(self, rng):
+        super().__init__()
+        self._rng = rng
+        self.pool = None
+
+    def emit(self, record):
+        dice = self._rng.random()
+        if dice < 0.05:
+            raise RuntimeError("a receiver fails")
+        if dice < 0.1:
+            raise KeyboardInterrupt
+        if dice < 0.3 and self.pool is not None:
+            self.pool.failure(0)
+        counts["message"] += 1
+
+
+class Subject:
+    """A pool over one of the FMUs, and the arrays for its calls."""
+
+    def __init__(self, path, names, start, rng):
+        log = logging.Logger("stress")
+        receiver = Receiver(rng)
+        log.addHandler(receiver)
+        inputs, outputs = names
+        fmu = FMU(path)
+        self.n = int(rng.choice([1, 3, 40, 300] if "m_cart" in start else [1, 3]))
+        spec = PoolSpec(
+            tuple(map(fmu.variable, inputs)),
+            tuple(map(fmu.variable, outputs)),
+            0.05,
+            num_observed=len(outputs),
+        )
+        self.pool = NativePool(fmu, spec, self.n, log, threads=int(rng.integers(1, 5)))
+        receiver.pool = self.pool
+        self.rng = rng
+        self.start = tuple(map(fmu.variable, start))
+        self.values = np.ones((len(start), self.n))
+        self.outputs = tuple(map(fmu.variable, outputs))
+        self.used = np.full(self.n, 4)
+        self.block = np.zeros((self.n, 4, 1))
+        self.snapshot = None
+        self.reset()
+
+    def mask(self):
+        return self.rng.random(self.n) < 0.3
+
+    def step_own(self):
+        self.pool.step_own()
+
+    def step(self):
+        self.pool.step(np.zeros((len(self.pool.inputs), self.n)), self.mask(), None)
+
+    def reset(self):
+        values = self.values.copy()
+        values[0, :: int(self.rng.integers(2, 9))] = -1.0  # what the cart-pole refuses, aloud
+        self.pool.reset_into(self.start, values, self.mask() if self.rng.random() < 0.7 else None)
+
+    def step_or_reset(self):
+        observations = np.empty((self.n, len(self.outputs)), np.float32)
+        self.pool.step_or_reset(None, self.start, self.values, self.mask(), observations)
+
+    def prepare_play(self):
+        ends = np.zeros(1), np.ones(1), np.zeros(1, np.int64)
+        self.pool.prepare_play(
+            self.start,
+            (INPUTS, JUDGEMENT),
+            (0, 1),
+            self.values,
+            (self.block, self.used, *ends),
+            (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
+        )
+
+    def set_streams(self):
+        self.pool.set_streams([np.random.PCG64(i) for i in range(self.n)])
+
+    def play(self):
+        flags = np.empty(self.n, np.bool_), np.empty(self.n, np.bool_)
+        observations = np.empty((self.n, len(self.outputs)), np.float32)
+        actions = self.rng.integers(0, 2, self.n)
+        with contextlib.suppress(ValueError):  # there may be nothing prepared
+            self.pool._pool.play(
+                actions, observations, np.empty(self.n), *flags, np.empty((1, self.n))
+            )
+            counts["played"] += 1
+
+    def save(self):
+        self.snapshot = self.pool.save()
+
+    def restore(self):
+        if self.snapshot is not None:
+            self.pool.restore(self.snapshot, self.mask())
+
+    def forget(self):
+        self.snapshot = None
+
+    def failure(self):
+        self.pool.failure(int(self.rng.integers(self.n)))
+
+    def read(self):
+        self.pool.read(self.outputs)
+
+    def health(self):
+        self.pool.health()
+
+    def recycle(self):
+        self.pool.recycle()
+
+    def costs(self):
+        return self.pool.costs, self.pool.uses_states
+
+    def close(self):
+        if self.rng.random() < 0.05:
+            self.pool.close()
+
+
+ACTIONS = (
+    *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "set_streams"),
+    *("play", "play", "play", "save", "restore", "forget", "failure", "read", "health"),
+    *("recycle", "costs", "close"),
+)
+
+
+class Ring:
+    """The subjects, of which closed ones are replaced."""
+
+    def __init__(self, recipes, seed):
+        self.recipes, self.seed = recipes, seed
+        self.subjects = [self._make(recipe) for recipe in recipes]
+
+    def _make(self, recipe):
+        while True:
+            self.seed += 1
+            with contextlib.suppress(KeyboardInterrupt, SimulationError):
+                return Subject(*recipe, np.random.default_rng(self.seed))
+
+    def act(self, rng):
+        index, name = int(rng.integers(len(self.subjects))), str(rng.choice(ACTIONS))
+        try:
+            getattr(self.subjects[index], name)()
+        except SimulationError as error:
+            if "closed" in str(error):
+                self.subjects[index] = self._make(self.recipes[index])
+                counts["closed"] += 1
+        except KeyboardInterrupt:
+            counts["interrupted"] += 1
+        counts[name] += 1
+
+
+def recipes(folder, with_python):
+    """What there are pools of."""
+    for version in ("2.0", "3.0"):
+        path = bundled_fmu("CartPole", version)
+        yield path, (["f"], ["x", "theta"]), ["m_cart"]
+    if with_python:
+        import foreign_tank
+        from pythonfmu.builder import FmuBuilder
+
+        path = FmuBuilder.build_FMU(foreign_tank.__file__, folder)
+        yield path, (["inflow"], ["level"]), ["area"]
+
+
+def on_alarm(*_):
+    raise KeyboardInterrupt
+
+
+def main():
+    seconds, seed = float(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
+    with_python = "python" in sys.argv
+    faulthandler.enable()
+    sys.setswitchinterval(1e-4)  # many changes of threads, without waiting for them
+    faulthandler.dump_traceback_later(seconds + PATIENCE, exit=True)
+    sys.unraisablehook = lambda _: counts.update(["unraisable"])
+    folder = tempfile.TemporaryDirectory()
+    ring = Ring(list(recipes(folder.name, with_python)), seed)
+    end = time.monotonic() + seconds
+    trouble, ending = [], threading.Event()
+
+    def loop(number):
+        rng = np.random.default_rng([seed, number])
+        try:
+            while True:  # on to the very end of the interpreter
+                ring.act(rng)
+                if number % 2 and time.monotonic() > end:
+                    return
+        except BaseException as error:
+            if not ending.is_set():  # temporary files go at the end
+                trouble.append(repr(error))
+
+    threads = [threading.Thread(target=loop, args=[i], daemon=True) for i in range(THREADS)]
+    for thread in threads:
+        thread.start()
+    signal.signal(signal.SIGALRM, on_alarm)
+    rng = np.random.default_rng(seed)
+    while time.monotonic() < end:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-3, 20e-3)))
+            while time.monotonic() < end:
+                ring.act(rng)
+    signal.signal(signal.SIGALRM, signal.SIG_IGN)
+    for thread in threads[1::2]:
+        thread.join()
+    ending.set()
+    print(json.dumps(counts), flush=True)
+    missing = {*ACTIONS, "played", "message", "interrupted", "unraisable", "closed"} - {*counts}
+    if missing or trouble:
+        sys.exit(f"never done: {sorted(missing)}; trouble: {trouble}")
+    if with_python:
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    main()
