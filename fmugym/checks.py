@@ -103,10 +103,10 @@ def float_or_nan(value: Any) -> float:
 
 
 def _is_real(value: Any) -> bool:
-    if isinstance(value, np.ndarray | np.generic):
+    if issubclass(type(value), np.ndarray | np.generic):
         return value.ndim == 0 and value.dtype.kind in "fiubO"
-    return isinstance(value, Real) or (
-        hasattr(type(value), "__float__") and not isinstance(value, str | bytes)
+    return issubclass(type(value), Real) or (
+        hasattr(type(value), "__float__") and not issubclass(type(value), str | bytes)
     )
 
 
@@ -226,7 +226,7 @@ def check_dict(what: str, value: Any) -> dict[Any, Any]:
     Raises:
         ConfigError: If it is none.
     """
-    if isinstance(value, Mapping):
+    if issubclass(type(value), Mapping):
         with suppress(Exception):  # a mapping of the caller's whose methods fail
             return dict(value)
     raise ConfigError(f"{what} must be a dict, got {shown(value)}")

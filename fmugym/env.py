@@ -56,6 +56,7 @@ _WARNING: Final = int(Status.WARNING)
 _TERMINATED: Final = int(Status.TERMINATED)
 _ARGUMENTS: Final = ("fmu_path", "config", "log_level", "render_mode", "backend", "isolation")
 _FASTEST_FPS: Final = 1_000_000
+_FLOATS: Final = frozenset({float, np.float64})
 
 
 class FMUEnv(Pictured):
@@ -157,6 +158,7 @@ class FMUEnv(Pictured):
         self._spec = self._interface.pool_spec()
         self._warn_of_peculiarities()
         self._prepare_values()
+        self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
         self._pool = open_pool(
@@ -197,7 +199,8 @@ class FMUEnv(Pictured):
             self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
 
     def _prepare_values(self) -> None:
-        interface, config = self._interface, self.config
+        """Set what hooks may read to what it is before the first reset."""
+        interface = self._interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
         fps = min(1 / interface.time_step, _FASTEST_FPS)
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
@@ -212,17 +215,17 @@ class FMUEnv(Pictured):
         self.action = None
         self.previous_action = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
-        self.variables = EpisodeVariables(config.episode_variables)
-        self._plan = self._plan_episode({})
-        self._step_limit = _step_limit(config, self._spec)
+        self.variables = EpisodeVariables(self.config.episode_variables)
         self.step_count = 0
         self.done = False
         self.after_end = False
+
+    def _prepare_episodes(self) -> None:
+        self._plan = self._plan_episode({})
+        self._step_limit = _step_limit(self.config, self._spec)
         self._ended = True
         self._in_hooks = False
         self._was_reset = False
-        self._last_reward: float | None = None
-        self._return = 0.0
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -429,13 +432,13 @@ class FMUEnv(Pictured):
             self._write_inputs(self._get_inputs())
         except BaseException as error:  # the FMU was not touched: a better action may follow
             self.action, self.previous_action, self.previous_state = before
-            if self._is_to_blame(action, error):
+            if self._blames_action(action, error):
                 raise ConfigError(
                     f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
                 ) from error
             raise
 
-    def _is_to_blame(self, action: Any, error: BaseException) -> bool:
+    def _blames_action(self, action: Any, error: BaseException) -> bool:
         """Whether ``_get_inputs`` failed because of an action outside of the action space."""
         if isinstance(error, FMUGymError) or not isinstance(error, Exception):
             return False
@@ -444,7 +447,7 @@ class FMUEnv(Pictured):
         return is_misfit(action, self.action_space, error)
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and isinstance(values, float) and math.isfinite(values):
+        if self._takes_one_real and type(values) in _FLOATS and math.isfinite(values):
             self._input_row[0] = values
             self.inputs = (float(values),)
             return

@@ -116,7 +116,11 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     Returns:
         The error. It suggests the nearest known name, or lists known names if none is near.
     """
-    return ConfigError(f"unknown {kind} {shown(name)}; {_hint(name, list(known))}")
+    names = list(known)
+    near = _nearest(name, names)
+    if near is not None:
+        return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near!r}?")
+    return ConfigError(f"unknown {kind} {shown(name)}; known are: {_listing(names)}")
 
 
 def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentError:
@@ -127,14 +131,18 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentErr
         name: The argument as it was given.
         known: All arguments that the class has.
     """
-    hint = _hint(name, list(known))
+    names = list(known)
+    near = _nearest(name, names)
+    hint = f"known are: {_listing(names)}" if near is None else f"did you mean {near!r}?"
     return ArgumentError(f"{owner} got an unexpected keyword argument {shown(name)}; {hint}")
 
 
-def _hint(name: object, known: list[str]) -> str:
+def _nearest(name: object, known: list[str]) -> str | None:
     text = name if isinstance(name, str) else shown(name)
     near = difflib.get_close_matches(text[:_LONGEST], known, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    listing = ", ".join(map(repr, known[:12])) + (", ..." if len(known) > 12 else "")
-    return f"known are: {listing or 'none'}"
+    return near[0] if near else None
+
+
+def _listing(names: list[str]) -> str:
+    """The first of the names, as text."""
+    return ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "") or "none"

@@ -16,6 +16,7 @@ import pytest
 import fmugym
 import fmugym.lab
 from fmugym.config import EnvConfig
+from fmugym.task.hooks import Hooks
 from fmugym.tools.cli import main
 from fmugym.trial.opening import make_pool
 
@@ -188,10 +189,10 @@ def test_table_of_health_is_what_is_counted():
 
 def test_table_of_vector_arguments_has_every_argument():
     documented = set(rows_of(CONFIG, "Vector environments"))
-    own = inspect.signature(fmugym.FMUVectorEnv).parameters
+    own = inspect.signature(fmugym.FMUVectorEnv.__init__).parameters
     pool = inspect.signature(make_pool).parameters
     pool_options = {name for name, p in pool.items() if p.kind is p.KEYWORD_ONLY} | {"backend"}
-    assert documented == set(own) - {"make_env", "pool_options"} | pool_options
+    assert documented == set(own) - {"self", "make_env", "pool_options"} | pool_options
 
 
 def test_table_of_shapes_is_what_hooks_see():
@@ -239,7 +240,7 @@ def table(heading):
 
 
 def test_hook_table_has_every_hook():
-    hooks = {name for name in vars(fmugym.FMUEnv) if re.match(r"_(get|is)_", name)}
+    hooks = {name for name in vars(Hooks) if re.match(r"_(get|is)_", name)}
     assert hooks | {"_update", "_reward_policy", "_goal_reward"} <= table("All hooks")
     for name in table("All hooks"):
         assert callable(getattr(fmugym.FMUEnv, name)), name

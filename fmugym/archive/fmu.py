@@ -364,11 +364,17 @@ def _check_probe_timeout(timeout: float | None) -> None:
 def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
     """A bare name is left to the system's loader."""
     try:
-        paths = [] if isinstance(libraries, str) else [os.fsdecode(one) for one in libraries]
+        paths = [] if isinstance(libraries, str) else [_file_name(one) for one in libraries]
     except Exception:  # a TypeError; or an object whose own methods fail
         paths = []
-    if any("\0" in path for path in paths):
-        raise ConfigError(f"preload: no file can have the path {shown(libraries)}")
     if not paths and not (isinstance(libraries, list | tuple) and len(libraries) == 0):
         raise ConfigError(f"preload must be a list of paths, got {shown(libraries)}")
     return tuple(os.path.abspath(path) if os.path.dirname(path) else path for path in paths)
+
+
+def _file_name(path: str | os.PathLike[str]) -> str:
+    """The text of a path that a file can have."""
+    encoded = os.fsencode(path)
+    if b"\0" in encoded:
+        raise ValueError
+    return os.fsdecode(encoded)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import Variable
+from fmugym.errors import SimulationError
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 
 __all__ = [
@@ -27,6 +28,9 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Pool(ABC):
@@ -161,6 +165,34 @@ class Pool(ABC):
     def can_play(self) -> bool:
         """Whether the pool can run compiled hooks in its own pass (``NativePool.prepare_play``)."""
         return False
+
+    def prepare_play(
+        self,
+        variables: tuple[Variable, ...],
+        programs: Any,
+        actions: tuple[int, int],
+        start_values: FloatArray,
+        draws: Any,
+        episodes: Any,
+    ) -> Callable[..., tuple[int, int]]:
+        """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool cannot; ``can_play`` tells.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+
+    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
+        """Set what the function of ``prepare_play`` draws episodes from.
+
+        Raises:
+            SimulationError: If the pool cannot; ``can_play`` tells.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
+
+    def watched(self, function: Callable[P, R]) -> Callable[P, R]:
+        """Add the memory that a reset function allocates to the growth counter."""
+        return function
 
     def halt(self) -> None:
         """Stop at once what goes on without being stepped; the next reset starts it again."""

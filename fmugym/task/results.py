@@ -55,10 +55,10 @@ def as_flag(hook: str, value: Any) -> bool:
         ConfigError: If it is something else.
     """
     flag = _single(given(value, hook))
-    if isinstance(flag, bool | np.bool_):
-        return bool(flag)
-    if isinstance(flag, int | float | np.number) and flag in (0, 1):
-        return bool(flag)
+    if issubclass(type(flag), int | float | np.bool_ | np.number):
+        number = number_of(f"what {hook} returned", flag)
+        if number in (0.0, 1.0):
+            return bool(number)
     raise ConfigError(f"{hook} returned {shown(value)}, expected True or False")
 
 
@@ -84,7 +84,8 @@ def as_info(value: Any) -> dict[str, Any]:
 
 def _single(value: Any) -> Any:
     """The element of an array of one; anything else as it is."""
-    return value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    is_array = issubclass(type(value), np.ndarray)  # isinstance may call the object's own methods
+    return value.reshape(-1)[0] if is_array and value.size == 1 else value
 
 
 def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
@@ -112,7 +113,8 @@ def _of_floats(space: spaces.Box) -> Finiteness:
 
     def is_finite(observation: Any) -> bool:
         if type(observation) is not np.ndarray or observation.dtype is not dtype:
-            observation = _numbers(observation, "fiub")
+            with np.errstate(over="ignore", invalid="ignore"):
+                observation = _numbers(observation, "fiub").astype(dtype)
         if observation.shape != shape:
             _refuse_shape(observation, shape)
         if is_short and math.isfinite(math.hypot(*observation.tolist())):
@@ -134,7 +136,7 @@ def _of_integers(space: Any) -> Finiteness:
 
 def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
-        if not isinstance(observation, Mapping) or observation.keys() != parts.keys():
+        if not issubclass(type(observation), Mapping) or observation.keys() != parts.keys():
             raise ConfigError(
                 f"{_OBSERVE} returned {shown(observation)}, expected a dict with the keys "
                 f"{', '.join(map(repr, parts))}"
@@ -146,7 +148,7 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
 
 def _of_tuple(parts: list[Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
-        if not isinstance(observation, tuple) or len(observation) != len(parts):
+        if not issubclass(type(observation), tuple) or len(observation) != len(parts):
             raise ConfigError(
                 f"{_OBSERVE} returned {shown(observation)}, expected a tuple of {len(parts)}"
             )

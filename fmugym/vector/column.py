@@ -1,4 +1,4 @@
-"""One instance of a pool, in the form of a pool of one."""
+"""One instance of a pool, as a pool of one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["PoolColumn"]
 
 
 class PoolColumn(Pool):
-    """See ``Pool``; steps and resets leave the other instances alone.
+    """See ``Pool``. Steps and resets do not touch the other instances.
 
     Args:
         pool: The pool of N instances.
@@ -118,4 +118,4 @@ class PoolColumn(Pool):
         return {name: row[column] for name, row in self._pool.info().items()}
 
     def close(self) -> None:
-        """The pool is the vector environment's to close."""
+        """Do nothing: the vector environment closes the pool."""

@@ -8,16 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, FMUGymError
-from fmugym.pool import Pool
-from fmugym.pool.base import MaskArray
+from fmugym.errors import ConfigError, FMUGymError, shown
+from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.task.values import EpisodeVariables
+from fmugym.vector.actions import checked_actions, is_array_space
+from fmugym.vector.calls import attribute
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.engines.batch import Engine, StepResult
+from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.views import copied_attributes, light_copy
 
 __all__ = ["PerEnvEngine"]
@@ -28,7 +28,7 @@ AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
 class PerEnvEngine(Engine):
     """Calls the hooks of light copies of a prototype, which share its pool.
 
-    The FMUs step together all the same, on all threads, unless the class has a ``step`` of its own.
+    The FMUs still step together on all threads, unless the class has its own ``step``.
 
     Args:
         env: The prototype, made with a pool of N instances.
@@ -48,7 +48,7 @@ class PerEnvEngine(Engine):
     ) -> None:
         super().__init__(num_envs)
         self._pool = pool = env._open_pool("a vector environment")
-        self.envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
+        self._envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
         self._together = type(env).step is FMUEnv.step
         self._limit = max_episode_steps
         self._action_space = action_space
@@ -56,9 +56,33 @@ class PerEnvEngine(Engine):
         self._space = env.observation_space
         self._observations: list[Any] = [None] * num_envs
 
-    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+    def seed_of(self, index: int) -> int | None:
+        """See ``Engine.seed_of``."""
+        return self._envs[index].np_random_seed
+
+    def single(self, index: int) -> FMUEnv:
+        """See ``Engine.single``."""
+        return self._envs[index]
+
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """See ``Engine.call``."""
+        values = [attribute(self._envs[index], name) for index in indices]
+        return [v(*arguments, **keywords) if callable(v) else v for v in values]
+
+    def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """See ``Engine.set_attribute``; here the values may be anything."""
+        for index, value in values.items():
+            setattr(self._envs[index], name, value)
+
+    def set_parameter(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_parameter``."""
-        for env, value in zip(self.envs, values.tolist(), strict=True):
+        for env, value in zip(self._envs, values.tolist(), strict=True):
             parameters = {**env._interface.parameters, name: value}
             env._interface = replace(env._interface, parameters=parameters)
             env._plan = env._plan_episode({})
@@ -70,13 +94,13 @@ class PerEnvEngine(Engine):
         infos: dict[str, Any] = {}
         for index in np.flatnonzero(mask).tolist():
             self._observations[index], info = self._reset(index, seeds[index], options)
-            infos = self._add_info(infos, info, index)
+            infos = self._with_info(infos, info, index)
         self.note_starts(mask)
         return self._stacked(), infos
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
-        count = len(self.envs)
+        count = len(self._envs)
         rewards = np.zeros(count)
         terminated, truncated = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         infos: dict[str, Any] = {}
@@ -89,9 +113,9 @@ class PerEnvEngine(Engine):
             else:
                 result = self._stepped(index, action)
                 self._observations[index], rewards[index], terminated[index] = result[:3]
-                truncated[index] = result[3] or self._reached_limit(self.envs[index])
+                truncated[index] = result[3] or self._reached_limit(self._envs[index])
                 info = result[4]
-            infos = self._add_info(infos, info, index)
+            infos = self._with_info(infos, info, index)
         self.note_ends(terminated, truncated)
         return StepResult(self._stacked(), rewards, terminated, truncated, infos)
 
@@ -99,22 +123,22 @@ class PerEnvEngine(Engine):
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         try:
-            return self.envs[index].reset(seed=seed, options=dict(options))
+            return self._envs[index].reset(seed=seed, options=dict(options))
         except FMUGymError as error:
             raise _located(error, index) from error
 
     def _stepped(self, index: int, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        env = self.envs[index]
+        env = self._envs[index]
         try:
             return _concluded(env) if self._together else env.step(action)
         except FMUGymError as error:
             raise _located(error, index) from error
 
-    def _step_pool(self, actions: list[Any], resetting: MaskArray | None) -> None:
-        """Step those FMUs whose episodes go on, once all of their actions are known to be good."""
+    def _step_pool(self, actions: Sequence[Any], resetting: MaskArray | None) -> None:
+        """Step the FMUs whose episodes go on, once all of their actions are known to be good."""
         taken: list[tuple[FMUEnv, tuple[Any, ...]]] = []
         try:
-            for index, env in enumerate(self.envs):
+            for index, env in enumerate(self._envs):
                 if resetting is None or not resetting[index]:
                     taken.append((env, _moment(env)))
                     _take_action(env, actions[index])
@@ -126,22 +150,46 @@ class PerEnvEngine(Engine):
             raise
         self._pool.step(None, resetting, self._pool.observations)
 
-    def _actions(self, actions: Any) -> list[Any]:
-        items = list(iterate(self._action_space, copy.deepcopy(actions)))  # hooks keep them
-        if len(items) != len(self.envs):
-            raise ConfigError(f"there are {len(items)} actions, expected {len(self.envs)}")
+    def _actions(self, actions: Any) -> Sequence[Any]:
+        """The action of each environment, as copies: hooks keep them."""
+        space = self._envs[0].action_space
+        if self._together and is_array_space(space):
+            return list(checked_actions(space, len(self._envs), actions))
+        try:
+            items = list(iterate(self._action_space, copy.deepcopy(actions)))
+        except Exception:  # the actions are the user's
+            raise ConfigError(
+                f"the actions do not make one of {space} for each environment: {shown(actions)}"
+            ) from None
+        if len(items) != len(self._envs):
+            raise ConfigError(f"there are {len(items)} actions, expected {len(self._envs)}")
         return items
 
     def _reached_limit(self, env: FMUEnv) -> bool:
         return self._limit is not None and env.step_count >= self._limit
 
+    def _with_info(self, infos: dict[str, Any], info: Any, index: int) -> dict[str, Any]:
+        """Merge the info of one environment; Gymnasium does so for what its types can hold."""
+        try:
+            return self._add_info(infos, info, index)
+        except Exception:  # the info is the user's
+            raise ConfigError(
+                f"environment {index}: its info does not fit those of the others: {shown(info)}"
+            ) from None
+
     def _stacked(self) -> Any:
-        empty: Any = create_empty_array(self._space, n=len(self.envs), fn=np.zeros)
-        return concatenate(self._space, self._observations, empty)
+        empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)
+        try:
+            return concatenate(self._space, self._observations, empty)
+        except Exception:  # the observations are the user's
+            raise ConfigError(
+                f"_get_observation returned {shown(self._observations[0])}, which is no element of "
+                f"{self._space}"
+            ) from None
 
 
 def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
-    """Share what is costly, and copy whatever else the subclass has put into its attributes."""
+    """Share what is costly to make, and copy all other attributes of the subclass."""
     single = light_copy(env)
     single.__dict__.update(copied_attributes(env))
     single.variables = EpisodeVariables(env.config.episode_variables)
@@ -150,7 +198,7 @@ def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     single._output_row = single._pool.outputs[:, 0]
     single._observation_row = single._pool.observations[0]
     single._step_pool = single._pool.step_own
-    single._np_random = None
+    single._np_random = single._np_random_seed = None
     return single
 
 
@@ -159,7 +207,7 @@ def _located(error: FMUGymError, index: int) -> FMUGymError:
 
 
 def _moment(env: FMUEnv) -> tuple[Any, ...]:
-    """What taking an action changes."""
+    """The attributes that taking an action changes."""
     return env.action, env.previous_action, env.previous_state, env.inputs
 
 

@@ -1,1 +1,1 @@
-"""Whether hooks work on arrays, and hooks turned into programs."""
+"""The check whether hooks work on arrays, their results there, and their programs."""

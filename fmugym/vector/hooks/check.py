@@ -1,14 +1,14 @@
-"""The probe: are a class's hooks the same on arrays as one environment at a time?
+"""The hook check: do hooks give the same on arrays as one environment at a time?
 
-``if abs(x) > 2.4`` raises on arrays, but ``np.any`` and ``norm`` without an axis answer silently
-for all environments at once. So every hook is evaluated on some distinct states in both ways.
+``if abs(x) > 2.4`` raises on arrays, but ``np.any`` and ``norm`` without an axis silently give one
+answer for all environments. So the check evaluates every hook on some distinct states both ways.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -17,7 +17,8 @@ from fmugym.env import FMUEnv
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.task.values import EpisodeVariables
-from fmugym.vector.views import batched, column, copied_attributes, light_copy
+from fmugym.vector.actions import is_array_space
+from fmugym.vector.views import batched, column, copied_attributes, differs, light_copy
 
 __all__ = ["CURE", "find_difference", "sample_states"]
 
@@ -25,7 +26,7 @@ CURE = (
     "Write hooks element-wise: & and | for 'and' and 'or', numpy.where for 'if', no reduction over "
     "all values"
 )
-"""What to do about a difference."""
+"""The advice that follows a difference."""
 
 _HOOKS = (
     "_get_inputs",
@@ -39,31 +40,33 @@ _HOOKS = (
 _READ_ONLY = ("state", "previous_state", "inputs", "action", "previous_action", "_values")
 
 _EPISODES, _STEPS = 2, 3
-"""Distinct states that the FMU is brought to; each is also tried at other magnitudes."""
+"""How many states of the FMU are tried; each is tried at other magnitudes, too."""
 
 _TOLERANCE = 1e-6
-"""numpy's loops over arrays may differ from its scalars in the last bit of a float32."""
+"""numpy's results on arrays may differ from those on scalars in the last bit of a float32."""
 
 _SCALES = (1.0, -0.3, 10.0)
 _WILD_SCALES = (300.0, -1e5)
-"""Hooks may fail there, but limits that the FMU keeps far from are passed."""
+"""Hooks may fail at these. They reach limits that the FMU's own states are far from."""
 
 
 def find_difference(env: FMUEnv) -> str | None:
-    """Look for a reason to call an environment's hooks one by one.
+    """Look for a reason to call hooks one environment at a time.
 
     Args:
-        env: A prototype whose pool nobody has used yet.
+        env: A prototype whose pool has not been used yet.
 
     Returns:
-        What differs, with the name of the hook, or None if the hooks work on arrays.
+        The hook and how it differs on arrays, or None if all hooks work on arrays.
     """
     cls = type(env)
     for method in ("step", "reset"):
         if getattr(cls, method) is not getattr(FMUEnv, method):
             return f"{method} is overridden, which is for one environment only"
-    if not _is_array_space(env.action_space):
+    if not is_array_space(env.action_space):
         return f"actions of {env.action_space} do not make one array"
+    if not _makes_arrays(env.observation_space):
+        return f"observations of {env.observation_space} do not make arrays"
     scales = (_SCALES[:1], _SCALES[1:], _WILD_SCALES)
     kinds = [sample_states(env, some) for some in scales]
     with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -81,13 +84,15 @@ def _does_something(cls: type[FMUEnv], hook: str) -> bool:
     return not idle or getattr(cls, hook) is not getattr(FMUEnv, hook)
 
 
-def _is_array_space(space: spaces.Space[Any]) -> bool:
-    kinds = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
-    return isinstance(space, kinds)
+def _makes_arrays(space: spaces.Space[Any]) -> bool:
+    """Whether observations of N environments are an array, or a dict of arrays."""
+    if isinstance(space, spaces.Dict):
+        return all(map(_makes_arrays, space.values()))
+    return is_array_space(space)
 
 
 def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> FMUEnv:
-    """A batch of states that the FMU takes, each in several magnitudes.
+    """Make a batch of states that the FMU takes, each in several magnitudes.
 
     Args:
         env: A prototype; the first instance of its pool is used.
@@ -122,8 +127,8 @@ _Visited = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
-    """Run short episodes with small inputs; a slow FMU should not be kept busy for long."""
-    pool, plan = env._open_pool("the probe"), env._plan
+    """Run short episodes with small inputs; a slow FMU would take long for more."""
+    pool, plan = env._open_pool("the hook check"), env._plan
     if pool.is_real:
         return _imagine_states(pool, rng)
     mask = np.zeros(pool.num_instances, np.bool_)
@@ -142,7 +147,7 @@ def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
 
 
 def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[_Visited]:
-    """Draw states: nothing real is to be moved to try hooks."""
+    """Draw states: the check must not move anything real."""
     sizes = (len(pool.outputs), len(pool.outputs), len(pool.inputs))
     return [
         (rng.normal(size=sizes[0]), rng.normal(size=sizes[1]), rng.normal(size=sizes[2]))
@@ -178,14 +183,14 @@ def _sample(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
 
 
 def _compare(name: str, batch: FMUEnv, is_natural: bool) -> str | None:
-    """Say how a hook's results on arrays differ from those one by one, or None."""
+    """Say how a hook's results on arrays differ from those of single environments, or None."""
     count = len(batch.step_count)
     singles = [_single(batch, index) for index in range(count)]
     before = [single.__dict__ | copied_attributes(single) for single in singles if is_natural]
     one_by_one = [_call(single, name) for single in singles]
-    failures = sum(isinstance(result, Exception) for result in one_by_one)
+    failures = sum(type(result) is _Failure for result in one_by_one)
     if failures == count or (failures and not is_natural):
-        return None  # it fails in every way of calling it: that is for the first step to tell
+        return None  # it fails either way: the first step will tell
     for single, attributes in zip(singles, before, strict=is_natural):
         changed = _changed(attributes, single)
         if changed:
@@ -193,13 +198,13 @@ def _compare(name: str, batch: FMUEnv, is_natural: bool) -> str | None:
     many = _independent(batch)
     together = _call(many, name)
     for attribute in _READ_ONLY:
-        if _differs(getattr(batch, attribute), getattr(many, attribute)):
+        if differs(getattr(batch, attribute), getattr(many, attribute)):
             shown = "out" if attribute == "_values" else attribute
             return f"changes the arrays in self.{shown} in place"
-    if isinstance(together, Exception):
-        return f"fails on arrays ({type(together).__name__}: {together})"
+    if type(together) is _Failure:
+        return f"fails on arrays ({together.text})"
     for index, expected in enumerate(one_by_one):
-        if not isinstance(expected, Exception) and not _same(expected, together, index, count):
+        if type(expected) is not _Failure and not _same(expected, together, index, count):
             return "gives other values on arrays than one environment at a time"
     return None
 
@@ -224,38 +229,34 @@ def _independent(batch: FMUEnv) -> FMUEnv:
 def _changed(before: Mapping[str, Any], single: FMUEnv) -> str | None:
     """The name of an attribute that a hook has changed."""
     for name, value in single.__dict__.items():
-        if name != "variables" and (name not in before or _differs(before[name], value)):
+        if name != "variables" and (name not in before or differs(before[name], value)):
             return name
     return None
 
 
-def _differs(before: Any, after: Any) -> bool:
-    """Whether a value was changed, as far as can be told."""
-    if before is after:
-        return False
-    if type(before) is not type(after):
-        return True
-    if isinstance(before, np.random.Generator):
-        return bool(before.bit_generator.state != after.bit_generator.state)
-    if isinstance(before, np.ndarray):
-        return not np.array_equal(before, after, equal_nan=before.dtype.kind == "f")
-    if isinstance(before, list | tuple):
-        return len(before) != len(after) or any(map(_differs, before, after))
-    if isinstance(before, dict):
-        return before.keys() != after.keys() or any(_differs(before[k], after[k]) for k in before)
-    return isinstance(before, bool | int | float | str | np.generic) and bool(before != after)
+class _Failure(NamedTuple):
+    """Stands for the result of a hook that has raised an exception."""
+
+    text: str
 
 
 def _call(env: FMUEnv, name: str) -> Any:
     try:
         result = getattr(env, name)()
     except Exception as error:
-        return error
+        return _Failure(f"{type(error).__name__}: {error}")
     return dict(env.variables) if name == "_update" else result
 
 
 def _same(expected: Any, together: Any, index: int, count: int) -> bool:
-    """Whether one environment's part of a result on arrays is what it gets alone."""
+    """Whether one environment's part of a result on arrays is its result alone; NaNs are equal."""
+    try:
+        return _equal(expected, together, index, count)
+    except Exception:  # the results are the user's, and may be anything
+        return False
+
+
+def _equal(expected: Any, together: Any, index: int, count: int) -> bool:
     if isinstance(expected, Mapping):
         if not isinstance(together, Mapping) or expected.keys() != together.keys():
             return False
@@ -266,7 +267,7 @@ def _same(expected: Any, together: Any, index: int, count: int) -> bool:
         )
     alone, batch = np.asarray(expected), np.asarray(together)
     if isinstance(together, np.bool_) or (isinstance(together, np.ndarray) and batch.ndim == 0):
-        return False  # what numpy has reduced is not a constant
+        return False  # numpy has reduced the array: this is no constant
     if batch.ndim == 0:  # a constant, the same for all
         part = batch[()]
     elif batch.shape[-1] != count:

@@ -1,4 +1,4 @@
-"""Programs: hooks in the form in which the native pool runs them, and numpy's reading of them.
+"""Programs: hooks in the form that the native pool runs.
 
 A program is a list of instructions on registers. The native pool runs it in the same pass as the
 FMU's step; ``evaluate`` runs it with numpy, so that the two can be compared.
@@ -6,6 +6,7 @@ FMU's step; ``evaluate`` runs it with numpy, so that the two can be compared.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -16,7 +17,14 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray
 
-__all__ = ["MOST_INSTRUCTIONS", "OPERATIONS", "Program", "UntraceableError", "evaluate"]
+__all__ = [
+    "MOST_INSTRUCTIONS",
+    "OPERATIONS",
+    "Program",
+    "UntraceableError",
+    "evaluate",
+    "is_always_finite",
+]
 
 OPERATIONS: Final = (
     "output",
@@ -48,19 +56,20 @@ OPERATIONS: Final = (
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
 MOST_INSTRUCTIONS: Final = 128
-"""What the native pool has registers for."""
+"""The native pool has this many registers."""
 
 
 class UntraceableError(Exception):
-    """A hook does what a program cannot; it is then evaluated with numpy."""
+    """A hook does what a program cannot do."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """Instructions for the native pool: each writes the register of its own number.
+    """Instructions for the native pool. Instruction number i writes register i.
 
     Attributes:
-        code: Operation and three operands (registers, or indices of what is loaded), shape (n, 4).
+        code: The operation and three operands (registers, or the index of the value to load),
+            shape (n, 4).
         constants: What the instructions of the operation ``constant`` refer to, shape (c,).
         results: The registers of the results, shape (r,).
     """
@@ -70,8 +79,33 @@ class Program:
     results: npt.NDArray[np.uint16]
 
 
+def is_always_finite(program: Program, result: int) -> bool:
+    """Whether a result can be neither infinite nor NaN, whatever the program loads.
+
+    What a program loads is finite: the pool does not step with inputs that are not, and an FMU
+    whose outputs are not has failed. Only arithmetic may overflow, or divide by zero.
+    """
+    finite: list[bool] = []
+    for number, *operands in program.code.tolist():
+        operation = OPERATIONS[number]
+        if operation == "constant":
+            finite.append(math.isfinite(program.constants[operands[0]]))
+        elif operation in _CHOICES:
+            used = operands[1:] if operation == "where" else operands[:2]
+            finite.append(all(finite[operand] for operand in used))
+        else:
+            finite.append(operation not in _MAY_OVERFLOW)
+    return finite[int(program.results[result])]
+
+
+_CHOICES: Final = frozenset({"absolute", "maximum", "minimum", "negative", "where"})
+"""Operations whose result is finite if their operands are."""
+
+_MAY_OVERFLOW: Final = frozenset({"add", "subtract", "multiply", "divide", "square_root"})
+
+
 def evaluate(program: Program, batch: FMUEnv) -> list[FloatArray]:
-    """Evaluate a program with numpy, as the native pool does, to check it.
+    """Evaluate a program with numpy, to compare it with the hooks.
 
     Args:
         program: The program.

@@ -1,10 +1,9 @@
-"""Hooks written as arithmetic, turned into a program that the native pool runs by itself.
+"""Tracing: hooks that are plain arithmetic become programs for the native pool.
 
-A hook that is called with symbols in place of numbers leaves behind what it computes, as long as
-it consists of arithmetic, comparisons and a few of numpy's functions. The native pool evaluates
-that in the same pass as the FMU step, without a call into Python. The operations are those of
-IEEE arithmetic that numpy does in the same way, so that the results are the same to the last bit;
-a hook that does anything else (sines, powers, branches) stays with numpy.
+A hook is called with symbols instead of numbers. The symbols record what the hook computes with
+arithmetic, comparisons and a few functions of numpy. Only operations whose results are the same in
+C and in numpy to the last bit are recorded. A hook that does anything else (sines, powers,
+branches) cannot be traced, and is called on arrays.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ __all__ = ["trace_hooks"]
 
 
 class Symbol:
-    """A number that is not known yet: what is done with it is noted.
+    """Stands for a number that is not known yet, and records what is done with it.
 
     Args:
         operation: One of ``OPERATIONS``.
-        operands: Symbols, or the index of what is loaded, or the constant.
+        operands: Symbols; or the index of the value to load; or the constant.
         is_bool: Whether it stands for a Boolean.
     """
 
@@ -123,8 +122,10 @@ class Symbol:
 
 
 def _symbol(value: Any) -> Symbol:
-    """A constant becomes a symbol; anything that is no plain number cannot be traced."""
-    if isinstance(value, np.ndarray) and value.ndim == 0:  # numpy wraps scalars and symbols so
+    """Make a symbol of a constant; only plain numbers can be traced."""
+    if (
+        isinstance(value, np.ndarray) and value.ndim == 0
+    ):  # numpy wraps scalars and symbols like this
         value = value.item()
     if isinstance(value, Symbol):
         return value
@@ -198,14 +199,14 @@ def trace_hooks(env: FMUEnv) -> tuple[Program, Program]:
         truncated and reward.
 
     Raises:
-        UntraceableError: If the hooks do what a program cannot; the text says what.
+        UntraceableError: If the hooks do what a program cannot do; the text names it.
     """
     _require_simple(env)
     try:
         return _traced(_symbolic(env))
     except UntraceableError:
         raise
-    except Exception as error:  # whatever else numbers can do, symbols cannot
+    except Exception as error:  # hooks do with numbers what symbols cannot do
         raise UntraceableError(f"it fails on symbols: {error}") from error
 
 
@@ -235,6 +236,7 @@ def _require_simple(env: FMUEnv) -> None:
         "environments have attributes of their own": env._per_env_attributes,
         "it has episode variables": env.config.episode_variables,
         "it has inputs that are not Real": not env._real_inputs,
+        "it has no inputs": not env._interface.inputs,
     }
     for obstacle, is_there in obstacles.items():
         if is_there:
@@ -242,7 +244,7 @@ def _require_simple(env: FMUEnv) -> None:
 
 
 def _symbolic(env: FMUEnv) -> FMUEnv:
-    """A copy in which everything that programs can load is a symbol, and the rest is missing."""
+    """Copy an environment: symbols replace what programs can load, and the rest is missing."""
     symbolic = light_copy(env)
     names = list(env._interface.parameters)
     values = tuple(Symbol("output", index) for index in range(len(env.out)))
@@ -262,7 +264,7 @@ def _symbolic(env: FMUEnv) -> FMUEnv:
 
 
 class _Missing:
-    """Stands for what programs cannot load."""
+    """Stands for values that programs cannot load."""
 
     def __getattr__(self, name: str) -> Any:
         raise UntraceableError("it looks at the step before")
@@ -310,7 +312,7 @@ def _compile(results: Sequence[Symbol]) -> Program:
 
 
 def _in_order(results: Sequence[Symbol]) -> list[Symbol]:
-    """All symbols that results are made of, each after its operands."""
+    """All symbols that the results need, each after its operands."""
     order: list[Symbol] = []
     seen: set[int] = set()
     waiting = [(symbol, False) for symbol in reversed(results)]
@@ -326,7 +328,7 @@ def _in_order(results: Sequence[Symbol]) -> list[Symbol]:
 
 
 def _place(operand: float, constants: dict[str, int]) -> int:
-    """An index as it is; for a constant its place, told by all its bits: 0.0 is not -0.0."""
+    """Return an index as it is, but a constant's place; 0.0 and -0.0 are two constants."""
     if isinstance(operand, float):
         return constants.setdefault(operand.hex(), len(constants))
     return int(operand)
