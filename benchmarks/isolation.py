@@ -18,7 +18,7 @@ from busy import BusyEnv, build
 from measure import Effort, MissingError
 from tables import Table, duration, share
 
-from fmugym.env import request_pool
+from fmugym.task.opening import request_pool
 from fmugym.envs import CartPoleEnv
 
 __all__ = ["tables"]

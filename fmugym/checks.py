@@ -22,12 +22,14 @@ from fmugym.errors import ConfigError, shown, unknown_name
 __all__ = [
     "LARGEST_COUNT",
     "check_count",
+    "check_flag",
     "check_mapping",
     "check_name",
     "check_number",
     "check_option",
     "check_path",
     "check_seed",
+    "has_method",
     "integer_of",
     "number_of",
 ]
@@ -118,6 +120,28 @@ def integer_of(value: Any) -> int | None:
         return int(operator.index(value))
     except Exception:  # a TypeError; or the object's own method fails
         return None
+
+
+def check_flag(what: str, value: Any) -> bool:
+    """Return a value as True or False; 0 and 1 will do.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    number = integer_of(value)
+    if number not in {0, 1}:
+        raise ConfigError(f"{what} must be True or False, got {shown(value)}")
+    return bool(number)
+
+
+def has_method(value: object, name: str) -> bool:
+    """Whether a value has a method of this name; one that answers no question has none."""
+    try:
+        return callable(getattr(value, name, None))
+    except Exception:  # the object's own method fails
+        return False
 
 
 def check_name(what: str, value: Any) -> str:

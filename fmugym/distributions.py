@@ -4,8 +4,8 @@ Wherever a config takes a number for a start value, a parameter or an episode va
 takes a distribution. The environment then draws from it with its own seeded generator.
 
 A distribution may be written as a dict: ``{"distribution": "uniform", "low": 0, "high": 1}`` is
-``Uniform(0, 1)``. That is the form which a JSON or YAML file can hold, and which ``EnvSpec.to_json``
-of Gymnasium writes. All numbers become Python floats, whatever type they were given in.
+``Uniform(0, 1)``. JSON and YAML files can hold this form, and Gymnasium's ``EnvSpec.to_json``
+writes it. All numbers become Python floats, whatever type they were given in.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from fmugym.checks import check_mapping, check_number, check_option, number_of
+from fmugym.checks import check_mapping, check_number, check_option, has_method, number_of
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
@@ -111,6 +111,7 @@ class Normal:
         _take(self, "low", "high")
         if self.std < 0:
             raise ConfigError(f"{self}: std must not be negative")
+        object.__setattr__(self, "std", abs(self.std))  # numpy refuses -0.0
         if not self.low <= self.mean <= self.high:
             raise ConfigError(f"{self}: mean must lie between low and high")
         if self._probability_within() < 0.01:
@@ -212,14 +213,7 @@ def is_distribution(value: object) -> bool:
     """Whether a value of a config is to be drawn anew at each reset."""
     if isinstance(value, type):
         return False
-    return isinstance(value, _OURS) or _has(value, "sample") or _has(value, "rvs")
-
-
-def _has(value: object, method: str) -> bool:
-    try:
-        return callable(getattr(value, method, None))
-    except Exception:  # an object that answers no question has no such method
-        return False
+    return isinstance(value, _OURS) or has_method(value, "sample") or has_method(value, "rvs")
 
 
 def draw(value: Any, rng: np.random.Generator) -> Any:
@@ -240,7 +234,7 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
     if not is_distribution(value):
         return value
     try:
-        drawn = value.sample(rng) if _has(value, "sample") else value.rvs(random_state=rng)
+        drawn = value.sample(rng) if has_method(value, "sample") else value.rvs(random_state=rng)
     except Exception as error:
         raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
     return drawn if isinstance(drawn, str) else check_number(f"what {shown(value)} draws", drawn)

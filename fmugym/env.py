@@ -19,6 +19,7 @@ from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution
 from fmugym.errors import (
     ConfigError,
+    FMUGymError,
     SimulationError,
     shown,
     unknown_argument,
@@ -28,7 +29,14 @@ from fmugym.fmi.status import Status
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.health import fault_rates
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.actions import elements_of, flat_inputs, has_nan, is_element, no_action
+from fmugym.task.actions import (
+    elements_of,
+    flat_inputs,
+    has_nan,
+    is_element,
+    is_misfit,
+    no_action,
+)
 from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import checked, output_variable, resolve, start_variable
 from fmugym.task.opening import open_fmu, open_pool
@@ -60,10 +68,12 @@ class FMUEnv(Pictured):
     the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
-    an observation that is not finite is a fault of the episode, like a failure of the FMU. An
-    exception of a hook reaches the caller of ``step`` unchanged. If the FMU has stepped already, the
-    episode is over then, and ``reset`` must follow; an exception of ``_get_inputs`` leaves the
-    episode as it was.
+    an observation that is not finite is a fault of the episode, like a failure of the FMU.
+
+    An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
+    already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
+    the episode as it was; it becomes a ``ConfigError`` if it comes from an action that is not in
+    the action space.
 
     Args:
         fmu_path: The FMU; a relative path is relative to the file of the class.
@@ -147,6 +157,7 @@ class FMUEnv(Pictured):
         self._spec = self._interface.pool_spec()
         self._warn_of_peculiarities()
         self._prepare_values()
+        self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
         self._pool = open_pool(self.fmu, self._spec, self.config, self.logger, backend, isolation)
@@ -180,7 +191,8 @@ class FMUEnv(Pictured):
             self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
 
     def _prepare_values(self) -> None:
-        interface, config = self._interface, self.config
+        """Set what hooks may read to what it is before the first reset."""
+        interface = self._interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
         fps = min(1 / interface.time_step, _FASTEST_FPS)
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
@@ -195,17 +207,17 @@ class FMUEnv(Pictured):
         self.action = None
         self.previous_action = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
-        self.variables = EpisodeVariables(config.episode_variables)
-        self._plan = self._plan_episode({})
-        self._step_limit = _step_limit(config, self._spec)
+        self.variables = EpisodeVariables(self.config.episode_variables)
         self.step_count = 0
         self.done = False
         self.after_end = False
+
+    def _prepare_episodes(self) -> None:
+        self._plan = self._plan_episode({})
+        self._step_limit = _step_limit(self.config, self._spec)
         self._ended = True
         self._in_hooks = False
         self._was_reset = False
-        self._last_reward: float | None = None
-        self._return = 0.0
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -410,14 +422,26 @@ class FMUEnv(Pictured):
         self.previous_action, self.action, self.previous_state = self.action, action, self.state
         try:
             self._write_inputs(self._get_inputs())
-        except BaseException:  # the FMU was not touched: a better action may follow
+        except BaseException as error:  # the FMU was not touched: a better action may follow
             self.action, self.previous_action, self.previous_state = before
+            if self._is_to_blame(action, error):
+                raise ConfigError(
+                    f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
+                ) from error
             raise
+
+    def _is_to_blame(self, action: Any, error: BaseException) -> bool:
+        """Whether ``_get_inputs`` failed because of an action outside of the action space."""
+        if isinstance(error, FMUGymError) or not isinstance(error, Exception):
+            return False
+        if type(self).step is not FMUEnv.step:  # then its actions may be others
+            return False
+        return is_misfit(action, self.action_space, error)
 
     def _write_inputs(self, values: Any) -> None:
         if self._takes_one_real and issubclass(type(values), float) and math.isfinite(values):
             self._input_row[0] = values
-            self.inputs = (float(values),)
+            self.inputs = (self._input_row.item(0),)
             return
         inputs = tuple(flat_inputs(values, self._interface.inputs, self._source).tolist())
         if not all(map(math.isfinite, inputs)):
@@ -455,16 +479,14 @@ class FMUEnv(Pictured):
         reward = self._reward_policy()
         if type(reward) is not float:
             reward = as_reward(reward)
-        if not math.isfinite(reward):
-            return self._fault_of_hook(f"_reward_policy returned {reward}", before)
         if self._pool_observes:
             observation: Any = self._observation_row.copy()
             is_finite = math.hypot(*self.state) <= FLOAT32_LIMIT or self._is_finite(observation)
         else:
             observation = self._get_observation()
             is_finite = self._is_finite(observation)
-        if not is_finite:
-            return self._fault_of_hook(f"the observation is {shown(observation)}", before)
+        if not (is_finite and math.isfinite(reward)):
+            return self._fault_of_hooks(reward, observation, before)
         info = self._info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
@@ -487,11 +509,14 @@ class FMUEnv(Pictured):
         steps = self._spec.warm_up_steps + self.step_count
         return self._spec.communication_point(steps * self._spec.substeps)
 
-    def _fault_of_hook(
-        self, reason: str, before: tuple[Any, dict[str, Any]]
+    def _fault_of_hooks(
+        self, reward: float, observation: Any, before: tuple[Any, dict[str, Any]]
     ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """End the episode because of a number that is not finite, in the state before the step."""
-        reason = f"{reason} at t = {self.time:g} s"
+        if math.isfinite(reward):
+            reason = f"the observation is {shown(observation)} at t = {self.time:g} s"
+        else:
+            reason = f"_reward_policy returned {reward} at t = {self.time:g} s"
         self._values, variables = before
         self.state = self.previous_state
         self.variables.update(variables)

@@ -1,12 +1,12 @@
-"""The errors that fmugym raises for mistakes and faults it can name.
+"""The errors of fmugym.
 
 ::
 
     FMUGymError
     ├── ConfigError       a name, number or type that the user gave does not fit the FMU
-    │   └── ArgumentError an argument that a constructor does not have; a ``TypeError`` as well
+    │   └── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
     ├── FMULoadError      an archive, a model description or a library cannot be used
-    ├── SimulationError   an FMI call failed, or a call came out of its order
+    ├── SimulationError   an FMI call failed, or a method was called out of order
     └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
 Every error takes one argument, its text, and so survives pickling between processes.
@@ -30,8 +30,8 @@ __all__ = [
     "unknown_name",
 ]
 
-_LONGEST: Final = 200
-"""Characters of a value that an error shows."""
+_LONGEST: Final = 120
+"""Characters of a value that an error shows, at most."""
 
 
 class FMUGymError(Exception):
@@ -39,13 +39,13 @@ class FMUGymError(Exception):
 
 
 class ConfigError(FMUGymError):
-    """A configuration, an option or an action does not fit the FMU or the environment."""
+    """A config, an option or an action does not fit the FMU or the environment."""
 
 
 class ArgumentError(ConfigError, TypeError):
     """A constructor does not have this argument.
 
-    Callers that try arguments, as Stable-Baselines3 does, expect a ``TypeError`` here.
+    It is a ``TypeError`` for callers that try arguments, as Stable-Baselines3 does.
     """
 
 
@@ -54,22 +54,30 @@ class FMULoadError(FMUGymError):
 
 
 class SimulationError(FMUGymError):
-    """An FMI function failed, or a method was called at a time when it has no meaning."""
+    """An FMI function failed, or a method was called out of order."""
 
 
 class ContractError(FMUGymError):
-    """An environment does not keep what every environment of this package promises."""
+    """An environment breaks the contract of all environments of this package."""
 
 
 def shown(value: object) -> str:
-    """Return the ``repr`` of any value for an error, shortened where it is long.
+    """Return the text that stands for a value in an error.
 
-    A value whose own ``repr`` fails is shown by its type.
+    Args:
+        value: Any object, even one whose ``repr`` fails.
+
+    Returns:
+        One printable line of at most 120 characters.
     """
     try:
         text = repr(value)
-    except Exception:  # it is not ours, and an error is being reported already
-        return f"an object of type {type(value).__name__}"
+    except Exception:  # an error is being reported already
+        text = f"<{type(value).__name__} without a repr>"
+    if "\n" in text:  # an array
+        text = " ".join(text.split())
+    if not text.isprintable():
+        text = text.encode("unicode_escape").decode()
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 

@@ -4,10 +4,10 @@
 
 Each case is a call of the public face with one to three odd values: in the config, as arguments of
 constructors, as seeds, options and actions, in distributions, as attributes, and as results of
-hooks. Either the value is accepted and the environment works with it, or it is refused with an error
-of ``FMUGymError``. A case fails if it raises anything else, if it leaves a folder, if an environment
-does not work after it has refused a value, or if it takes more than ``SLOW`` seconds of processor
-time. A crash, or a hang of ``HANG`` seconds, ends the program with the Python stack.
+hooks. Either the value is accepted and the environment works with it, or it is refused with an
+error of ``FMUGymError``. A case fails if it raises anything else, if it leaves a folder, if an
+environment does not work after it has refused a value, or if it takes more than ``SLOW`` seconds of
+processor time. A crash, or a hang of ``HANG`` seconds, ends the program with the Python stack.
 
 Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
 """
@@ -32,7 +32,8 @@ import numpy as np
 from fuzz import temporary_folder
 
 import fmugym
-from fmugym import Choice, FMUGymError, FMUVectorEnv, LogUniform, Normal, Uniform
+from fmugym import Choice, FMUGymError, FMUVectorEnv, LogUniform, Normal, Uniform, testing
+from fmugym.checks import integer_of
 from fmugym.config import EnvConfig
 
 SLOW, HANG = 5.0, 60.0
@@ -196,7 +197,6 @@ MAKERS = (
     lambda: hostile("__getattr__"),
     lambda: hostile("__getitem__", "__len__"),
     lambda: hostile("__fspath__"),
-    lambda: hostile("__call__"),
     lambda: hostile("__deepcopy__"),
     lambda: hostile("__eq__", "__bool__", "__repr__", "__array__", "__float__", "__len__"),
     lambda: hostile("__repr__", base=float),
@@ -219,7 +219,7 @@ def odd(rng):
 
 def describe(value):
     try:
-        text = repr(value)
+        text = " ".join(repr(value).split())
     except Exception:
         text = f"<{type(value).__name__} that raises in its repr>"
     return text if len(text) < 80 else f"{text[:60]}..."
@@ -286,7 +286,7 @@ def use(env, seed=0):
     space = getattr(env, "action_space", None)
     env.reset(seed=seed)
     space.seed(0)
-    for _ in range(2):
+    for _ in range(3):
         *_, terminated, truncated, _ = env.step(space.sample())
         if np.any(terminated) or np.any(truncated):
             env.reset()
@@ -437,7 +437,6 @@ def of_reading(rng, stage):
         lambda: env.out[name],
         lambda: env.out.get(name),
         lambda: name in env.out,
-        lambda: env.variables[name],
         lambda: env.variables.__setitem__(name, value),
         lambda: env.variables.update(name),
         lambda: env.fmu.variable(name),
@@ -476,7 +475,7 @@ VECTOR_ARGUMENTS = (
 def is_costly(name, value):
     """Whether a sound value would take too much of the machine."""
     if name == "num_envs":
-        return isinstance(value, int | np.integer) and 100 < int(value) < 2**62
+        return 100 < (integer_of(value) or 0) < 2**62
     return is_text(value, "process", "human")
 
 
@@ -547,8 +546,8 @@ def of_functions(rng):
         "ArchiveLimits": lambda: fmugym.ArchiveLimits(max_ratio=value),
         "EnvConfig": lambda: EnvConfig.from_dict(value),
         "Paced": lambda: fmugym.Paced(other, hold_after=value),
-        "check_fmu_env": lambda: fmugym.testing.check_fmu_env(value),
-        "check_hooks": lambda: fmugym.testing.check_hooks(value),
+        "check_fmu_env": lambda: testing.check_fmu_env(value),
+        "check_hooks": lambda: callable(value) or testing.check_hooks(value),
         "register": lambda: register(rng.choice((value, "fuzz/Odd-v0")), other),
     }
     kind = rng.choice(list(calls))
@@ -562,6 +561,48 @@ def register(env_id, env):
         gymnasium.registry.pop("fuzz/Odd-v0", None)
 
 
+HOOK_NAMES = (
+    *("_get_inputs", "_update", "_is_done", "_is_truncated", "_reward_policy"),
+    *("_get_observation", "_get_info", "_goal_reward", "_get_episode_parameters"),
+    *("_get_action_space", "_get_observation_space"),
+)
+
+
+def odd_class(rng):
+    """A class of which one hook returns an odd value, in all steps or in some."""
+    name, value, late = rng.choice(HOOK_NAMES), odd(rng), rng.random() < 0.5
+    original = getattr(Tracking, name)
+
+    def hook(self, *arguments):
+        if late and not np.all(self.step_count == 2):
+            return original(self, *arguments)
+        return value
+
+    return (name, value, late), type("Odd", (Tracking,), {name: hook})
+
+
+def of_hook(rng):
+    values, cls = odd_class(rng)
+
+    def call():
+        with closing(cls()) as env:
+            use(env)
+            env.reset(options={"model_parameters": {}})
+
+    return values, call
+
+
+def of_vector_hook(rng):
+    values, cls = odd_class(rng)
+    way = rng.choice(HOOKS)
+
+    def call():
+        with closing(FMUVectorEnv(cls, 2, hooks=way)) as env:
+            use(env)
+
+    return (way, *values), call
+
+
 WHOLE = {
     in_config: 6,
     nested_in_config: 3,
@@ -571,6 +612,8 @@ WHOLE = {
     of_distribution: 3,
     as_vector_argument: 4,
     of_functions: 2,
+    of_hook: 4,
+    of_vector_hook: 3,
 }
 STAGED = {of_seed: 1, of_options: 2, of_action: 3, of_reading: 1, of_vector: 4, of_attribute: 1}
 KINDS = WHOLE | STAGED

@@ -37,19 +37,25 @@ HOOKS = (
 )
 
 
+def one_step(env):
+    env.reset(options={"model_parameters": {}})
+    env.step(0.0)
+
+
 @pytest.mark.parametrize("value", ODD, ids=lambda value: repr(value)[:30])
 @pytest.mark.parametrize("name", HOOKS)
 def test_what_is_of_no_use_is_refused_with_the_name_of_the_hook(make_env, name, value):
     method = f"_{name}"
     cls = type("Odd", (PlainEnv,), {method: lambda self, *options: value})
     env = make_env(cls=cls)
-    if isinstance(value, dict) and (name == "get_info" or name.endswith("parameters") and not value):
+    if isinstance(value, dict) and (
+        name == "get_info" or (name.endswith("parameters") and not value)
+    ):
         env.reset()
         env.step(0.0)
         return
     with pytest.raises(ConfigError, match=method):
-        env.reset(options={"model_parameters": {}})
-        env.step(0.0)
+        one_step(env)
 
 
 @pytest.mark.parametrize(
@@ -382,3 +388,29 @@ class TestPictures:
         scene = fmugym.rendering.PendulumScene(torque_limit=1.0)
         with pytest.raises(ConfigError, match="_describe_action"):
             self.draw(make_env, get_scene=lambda env: scene, describe_action=text)
+
+
+class TestActionsOutsideOfTheSpace:
+    def inputs(self, error):
+        def get_inputs(env):
+            if error:
+                raise error
+            return env.action[0]
+
+        return get_inputs
+
+    @pytest.mark.parametrize("action", [0.5, "left", {"a": 1.0}, None, object()])
+    def test_of_no_use_to_the_hook(self, make_env, action):
+        env = make_env(cls=with_hooks(get_inputs=self.inputs(None)))
+        env.reset()
+        with pytest.raises(ConfigError, match=r"action .* not"):
+            env.step(action)
+        env.step(np.array([0.5], np.float32))
+
+    def test_errors_that_an_action_does_not_cause(self, make_env):
+        for error, action in ((OwnError(), 0.5), (TypeError(), np.array([0.5], np.float32))):
+            env = make_env(cls=with_hooks(get_inputs=self.inputs(error)))
+            env.reset()
+            with pytest.raises(type(error)) as caught:
+                env.step(action)
+            assert caught.value is error

@@ -12,8 +12,8 @@ from test_foreign_fmu import TankEnv
 
 import fmugym
 from fmugym.archive.bundled import FMI_VERSIONS
-from fmugym.env import request_pool
 from fmugym.envs import CartPoleEnv, PendulumEnv
+from fmugym.task.opening import request_pool
 
 NUM_ENVS = 3
 STEPS = 60

@@ -139,3 +139,22 @@ def test_thousands_in_one_call():
     assert observations.shape == (4096, 4)
     assert rewards.shape == (4096,)
     vector.close()
+
+
+@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+def test_the_seeds_can_be_read(hooks):
+    """As in Gymnasium's SyncVectorEnv; after a reset without a seed they stay."""
+    envs = gym.make_vec("fmugym/CartPole-v0", num_envs=3, hooks=hooks)
+    envs.reset(seed=9)
+    assert envs.np_random_seed == (9, 10, 11)
+    envs.reset()
+    assert envs.np_random_seed == (9, 10, 11)
+    envs.reset(seed=[4, None, 6])
+    assert envs.np_random_seed == (4, 10, 6)
+    envs.close()
+    fresh = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks)
+    first = fresh.np_random_seed
+    fresh.reset()
+    assert fresh.np_random_seed == first
+    assert first[0] != first[1]
+    fresh.close()

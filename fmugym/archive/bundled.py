@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.checks import check_option, number_of
+from fmugym.errors import ConfigError
 
 __all__ = ["BUNDLED", "FMI_VERSIONS", "MODELS", "bundled_fmu", "is_bundled"]
 
@@ -42,11 +43,10 @@ def bundled_fmu(model: str, fmi_version: str | float = "2.0") -> Path:
     Raises:
         ConfigError: If there is no such model or version, or the model not in this version.
     """
-    version = str(float(fmi_version)) if isinstance(fmi_version, int | float) else fmi_version
-    if model not in MODELS:
-        raise unknown_name("bundled model", model, MODELS)
-    if version not in FMI_VERSIONS:
-        raise unknown_name("FMI version", version, FMI_VERSIONS)
+    is_number = isinstance(fmi_version, int | float)
+    version = str(number_of("fmi_version", fmi_version)) if is_number else fmi_version
+    model = check_option("bundled model", model, MODELS)
+    version = check_option("FMI version", version, FMI_VERSIONS)
     if version not in _VERSIONS[model]:
         there = " and ".join(_VERSIONS[model])
         raise ConfigError(f"there is no bundled {model} for FMI {version}, only for {there}")

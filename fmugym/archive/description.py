@@ -176,7 +176,7 @@ class ModelDescription:
         """
         try:
             return self.variables[name]
-        except (KeyError, TypeError):
+        except Exception:  # a KeyError; or something that is no key at all
             raise unknown_name(
                 f"variable of {self.model_name}", name, list(self.variables)
             ) from None

@@ -24,7 +24,8 @@ from fmugym.archive.description import ModelDescription, Variable, read_model_de
 from fmugym.archive.safe_zip import ZIP_ERRORS, ArchiveLimits, checked_entries
 from fmugym.archive.shared_library import check_library, load_globally, missing_libraries
 from fmugym.archive.temporary import make_folder, remove_folder
-from fmugym.errors import ConfigError, FMULoadError
+from fmugym.checks import check_path
+from fmugym.errors import ConfigError, FMULoadError, shown
 
 __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
 
@@ -149,10 +150,10 @@ class FMU(LoadableFMU):
         preload: Sequence[str | os.PathLike[str]] = (),
         probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT,
     ) -> None:
-        file = Path(path).absolute()
+        file = check_path("the path of an FMU", path).absolute()
         self.limits = ArchiveLimits() if limits is None else limits
         if not isinstance(self.limits, ArchiveLimits):
-            raise ConfigError(f"limits must be ArchiveLimits, got {limits!r}")
+            raise ConfigError(f"limits must be ArchiveLimits, got {shown(limits)}")
         _check_probe_timeout(probe_timeout)
         self.probe_timeout = probe_timeout
         libraries = _absolute(preload)
@@ -259,12 +260,25 @@ class FMU(LoadableFMU):
 def _check_probe_timeout(timeout: float | None) -> None:
     number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
     if timeout is not None and not (number and 0 < timeout < math.inf):
-        raise ConfigError(f"probe_timeout must be positive and finite, or None, got {timeout!r}")
+        raise ConfigError(
+            f"probe_timeout must be positive and finite, or None, got {shown(timeout)}"
+        )
 
 
 def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
     """A bare name is left to the system's loader."""
-    if isinstance(libraries, str):
-        raise ConfigError(f"preload must be a list of paths, got {libraries!r}")
-    paths = [os.fspath(library) for library in libraries]
+    try:
+        paths = [] if isinstance(libraries, str) else [_file_name(one) for one in libraries]
+    except Exception:  # a TypeError; or an object whose own methods fail
+        paths = []
+    if not paths and not (isinstance(libraries, list | tuple) and len(libraries) == 0):
+        raise ConfigError(f"preload must be a list of paths, got {shown(libraries)}")
     return tuple(os.path.abspath(path) if os.path.dirname(path) else path for path in paths)
+
+
+def _file_name(path: str | os.PathLike[str]) -> str:
+    """The text of a path that a file can have."""
+    encoded = os.fsencode(path)
+    if b"\0" in encoded:
+        raise ValueError
+    return os.fsdecode(encoded)

@@ -20,7 +20,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final
 
-from fmugym.errors import ConfigError, FMULoadError
+from fmugym.checks import check_count
+from fmugym.errors import FMULoadError
 
 __all__ = ["ZIP_ERRORS", "ArchiveLimits", "checked_entries", "over_limit"]
 
@@ -70,8 +71,7 @@ class ArchiveLimits:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ConfigError(f"{field.name} must be a positive integer, got {value!r}")
+            object.__setattr__(self, field.name, check_count(field.name, value, sys.maxsize))
 
 
 def checked_entries(path: Path, limits: ArchiveLimits) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -15,7 +16,10 @@ from fmugym.archive.description import Variable
 from fmugym.errors import ConfigError
 from fmugym.task.spaces import to_input_types
 
-__all__ = ["elements_of", "flat_inputs", "has_nan", "is_element", "no_action"]
+__all__ = ["elements_of", "flat_inputs", "has_nan", "is_element", "is_misfit", "no_action"]
+
+_OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
+"""What indexing and arithmetic raise for values of another kind or shape."""
 
 _FEW: Final = 64
 """Up to so many elements Python's floats are faster than numpy."""
@@ -53,18 +57,36 @@ def has_nan(action: Any) -> bool:
         return math.isnan(action)
     if isinstance(action, np.ndarray):
         return action.dtype.kind == "f" and _holds_nan(action)
-    if isinstance(action, list | tuple):
-        return any(map(has_nan, action))
-    if isinstance(action, Mapping):
-        return any(map(has_nan, action.values()))
-    return False
+    if not isinstance(action, list | tuple | Mapping):
+        return False
+    try:
+        return any(map(has_nan, action.values() if isinstance(action, Mapping) else action))
+    except Exception:  # a list that holds itself, or an object whose own methods fail
+        return False
+
+
+def is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
+    """Whether an exception of a hook comes from an action that is not in the action space.
+
+    Hooks may take more than the elements of the space, a bare number for an array of one, say. So
+    exceptions of other kinds than a misfit raises are the hook's own.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium warns of actions that are no arrays
+            if space.contains(action):
+                return False
+        is_numeric = np.asarray(action).dtype.kind in "biuf"
+    except Exception:  # an object whose own methods fail
+        return True
+    return not is_numeric or isinstance(error, _OF_MISFITS)
 
 
 def _holds_nan(array: npt.NDArray[np.floating[Any]]) -> bool:
-    is_short = array.ndim == 1 and array.size <= _FEW
+    is_short = type(array) is np.ndarray and array.ndim == 1 and array.size <= _FEW
     if is_short and math.isfinite(math.hypot(*array.tolist())):
         return False
-    return bool(np.isnan(array).any())
+    return bool(np.isnan(np.asarray(array)).any())
 
 
 def flat_inputs(

@@ -92,7 +92,14 @@ def _find_file(cls: type, path: Path) -> Path:
     own = takewhile(lambda c: c.__module__ != "fmugym.env", cls.__mro__)
     folders = [Path(inspect.getfile(c)).parent for c in own if _has_file(c)] or [Path.cwd()]
     candidates = [folder / path for folder in folders]
-    return next((c for c in candidates if c.exists()), candidates[0])
+    return next((c for c in candidates if _exists(c)), candidates[0])
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # no file can have this path
+        return False
 
 
 def _has_file(cls: type) -> bool:

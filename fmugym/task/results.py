@@ -1,7 +1,7 @@
 """Checks of what hooks return: of a kind that the environment can use, and finite.
 
-What is of the wrong kind is a mistake in the class: ``ConfigError`` names the hook. Numbers that are
-not finite are a fault of the episode, like a failure of the FMU.
+A result of the wrong kind is a mistake in the class, and ``ConfigError`` names the hook. Numbers
+that are not finite are a fault of the episode, like a failure of the FMU.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def as_flag(hook: str, value: Any) -> bool:
         ConfigError: If it is something else.
     """
     flag = _single(given(value, hook))
-    if issubclass(type(flag), bool | np.bool_):
-        return bool(flag)
-    if issubclass(type(flag), int | float | np.number) and flag in (0, 1):
-        return bool(flag)
+    if issubclass(type(flag), int | float | np.bool_ | np.number):
+        number = number_of(f"what {hook} returned", flag)
+        if number in (0.0, 1.0):
+            return bool(number)
     raise ConfigError(f"{hook} returned {shown(value)}, expected True or False")
 
 

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["EpisodeVariables", "LateDict", "NamedValues"]
 
@@ -76,7 +76,10 @@ class EpisodeVariables(dict[str, Any]):
 
     def update(self, *args: Any, **kwargs: Any) -> None:
         """Write several variables, as in a dict; none is written if a name is unknown."""
-        new = dict(*args, **kwargs)
+        try:
+            new = dict(*args, **kwargs)
+        except Exception:  # no dict at all, or one whose own methods fail
+            raise ConfigError(f"{shown(args)} are no values by name") from None
         for name in new:
             if name not in self:
                 raise unknown_name("episode variable", name, self)

@@ -45,6 +45,7 @@ def attribute(env: FMUEnv, name: Any) -> Any:
     """
     if not isinstance(name, str):
         raise ConfigError(f"the name of an attribute must be text, got {shown(name)}")
+    name = str.__str__(name)  # a subclass may have odd methods
     if not hasattr(env, name) and name in env.parameters:
         return env.parameters[name]
     try:

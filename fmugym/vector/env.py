@@ -303,14 +303,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _by_index(self, name: str, values: Any) -> dict[int, Any]:
         """The values by the number of the environment."""
-        is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
-        if not is_row and not issubclass(type(values), list | tuple):
+        if not issubclass(type(values), list | tuple | np.ndarray):
             return dict.fromkeys(range(self.num_envs), values)
-        if len(values) != self.num_envs:
+        if isinstance(values, np.ndarray) and values.ndim == 0:
+            return dict.fromkeys(range(self.num_envs), values[()])
+        try:
+            each = list(values)
+        except Exception:  # a list of the caller's whose methods fail
+            raise ConfigError(f"{shown(values)} are no values of {shown(name)}") from None
+        if len(each) != self.num_envs:
             raise ConfigError(
-                f"there are {len(values)} values of {shown(name)}, expected {self.num_envs}"
+                f"there are {len(each)} values of {shown(name)}, expected {self.num_envs}"
             )
-        return dict(enumerate(values))
+        return dict(enumerate(each))
 
     def _is_parameter(self, name: Any) -> bool:
         if not isinstance(name, str):
@@ -334,6 +339,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             raise UnknownAttributeError(str(unknown_name("attribute or parameter", name, names)))
         require_settable(name)
         self._engine.set_attribute(name, values)
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
+        return tuple(self._engine.seed_of(index) for index in range(self.num_envs))
 
     @property
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
@@ -365,9 +375,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> list[Any]:
         """Call a method of some environments."""
         self._open_pool("call")
-        if name in TOGETHER:
+        if isinstance(name, str) and name in TOGETHER:
             raise ConfigError(f"{name!r} cannot be called on single environments of many")
-        if name == "render":
+        if isinstance(name, str) and name == "render":
             pictures = self.render() or [None] * self.num_envs
             return [pictures[index] for index in indices]
         return self._engine.call(name, indices, args, kwargs)

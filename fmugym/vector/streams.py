@@ -42,6 +42,7 @@ class EpisodeStreams:
 
     def __init__(self, num_envs: int, plan: EpisodePlan) -> None:
         self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._seeds = [0] * num_envs
         self.version = 0
         self.num_draws = plan.num_uniform
         self._draws = plan.num_uniform or 0
@@ -64,10 +65,16 @@ class EpisodeStreams:
         return self._renew(index, None)
 
     def _renew(self, index: int, seed: int | None) -> np.random.Generator:
-        generator, _ = seeding.np_random(seed)
+        generator, self._seeds[index] = seeding.np_random(seed)
         self._generators[index] = generator
         self.version += 1
         return generator
+
+    def seed_of(self, index: int) -> int:
+        """The seed that an environment's generator was made with."""
+        if self._generators[index] is None:
+            self._unseeded(index)
+        return self._seeds[index]
 
     def bit_generators(self) -> list[np.random.BitGenerator]:
         """The bit generators of all environments."""

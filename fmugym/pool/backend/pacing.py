@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.checks import number_of
 from fmugym.errors import ConfigError
 from fmugym.pool.backend.clock import Clock, RealClock
 from fmugym.pool.base import FloatArray, MaskArray
@@ -41,8 +42,11 @@ class Paced:
     hold_after: float | None = None
 
     def __post_init__(self) -> None:
-        if self.hold_after is not None and not self.hold_after > 0.0:
-            raise ConfigError(f"hold_after must be positive, not {self.hold_after!r}")
+        if self.hold_after is not None:
+            number = number_of("hold_after", self.hold_after)
+            if not number > 0.0:
+                raise ConfigError(f"hold_after must be positive, not {number}")
+            object.__setattr__(self, "hold_after", number)
 
     def patience(self, period: float) -> float:
         """Return ``hold_after`` or its default for a period, in s."""

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
-from fmugym.errors import ConfigError, SimulationError
+from fmugym.checks import has_method
+from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.backend.clock import Clock
 from fmugym.pool.backend.pacing import Paced, Schedule
@@ -428,19 +429,23 @@ def _nothing() -> None:
 
 
 def _makes_backends(backend: Any) -> bool:
-    return callable(backend) and not hasattr(backend, "step")
+    return callable(backend) and not has_method(backend, "step")
 
 
 def _backends(backend: Any, count: int) -> list[Backend]:
     if _makes_backends(backend):
         backend = backend(count)
-    several = isinstance(backend, Iterable) and not hasattr(backend, "step")
-    backends = list(backend) if several else [backend]
+    several = isinstance(backend, Iterable) and not has_method(backend, "step")
+    try:
+        backends = list(backend) if several else [backend]
+    except Exception:  # an iterable whose own methods fail
+        backends = [backend]
     for one in backends:
         for method in ("reset", "step", "stop"):
-            if not callable(getattr(one, method, None)):
+            if not has_method(one, method):
                 raise ConfigError(
-                    f"a backend needs the methods reset, step and stop; {one!r} has no {method}"
+                    "a backend needs the methods reset, step and stop; "
+                    f"{shown(one)} has no {method}"
                 )
     if len(backends) != count:
         raise ConfigError(

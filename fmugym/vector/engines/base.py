@@ -57,6 +57,10 @@ class Engine(ABC):
         """Step the environments; those in the mask start an episode instead."""
 
     @abstractmethod
+    def seed_of(self, index: int) -> int | None:
+        """Return the seed of an environment's generator."""
+
+    @abstractmethod
     def single(self, index: int) -> FMUEnv:
         """Return an environment as a single one, for reading it and for calling its methods."""
 

@@ -77,6 +77,10 @@ class BatchEngine(Engine):
             self._parameters[known][:] = before[known]
         self._note_foreign(slice(None), True)
 
+    def seed_of(self, index: int) -> int | None:
+        """See ``Engine.seed_of``."""
+        return self._streams.seed_of(index)
+
     def single(self, index: int) -> FMUEnv:
         """See ``Engine.single``; the environment is a view."""
         return column(self.env, index)

@@ -56,6 +56,10 @@ class PerEnvEngine(Engine):
         self._space = env.observation_space
         self._observations: list[Any] = [None] * num_envs
 
+    def seed_of(self, index: int) -> int | None:
+        """See ``Engine.seed_of``."""
+        return self._envs[index].np_random_seed
+
     def single(self, index: int) -> FMUEnv:
         """See ``Engine.single``."""
         return self._envs[index]
@@ -194,7 +198,7 @@ def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
     single._output_row = single._pool.outputs[:, 0]
     single._observation_row = single._pool.observations[0]
     single._step_pool = single._pool.step_own
-    single._np_random = None
+    single._np_random = single._np_random_seed = None
     return single
 
 
