@@ -14,8 +14,9 @@ WINDOWS = sys.platform == "win32"
 # Results must not depend on the compiler: no contraction, no relaxed floating-point arithmetic.
 native = Extension(
     "fmugym._native",
-    sources=sorted(str(path) for path in Path("native").glob("*.c")),
-    depends=sorted(str(path) for path in Path("native").glob("*.h")),
+    sources=sorted(str(path) for path in Path("native").glob("**/*.c")),
+    depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
+    include_dirs=["native"],
     define_macros=[("Py_LIMITED_API", "0x030B0000")],
     extra_compile_args=["/std:c11", "/fp:precise"]
     if WINDOWS

@@ -22,6 +22,9 @@
 #include <stdatomic.h>
 #endif
 
+/* In bytes. What several threads write lies on lines of its own. */
+enum { CACHE_LINE = 64 };
+
 /* For loops that gain by wider vector instructions, where the processor has them; what they compute is
  * the same, as nothing is fused. */
 #if defined __x86_64__ && defined __linux__ && defined __GLIBC__

@@ -69,8 +69,8 @@ def build(sanitizer, folder):
     command = ["gcc", "-std=gnu11", "-O1", "-g", "-fno-omit-frame-pointer", "-shared", "-fPIC"]
     command += [f"-fsanitize={sanitizer.flags}", "-fno-sanitize-recover=undefined"]
     command += ["-ffp-contract=off", "-fvisibility=hidden", "-DPy_LIMITED_API=0x030B0000"]
-    command += ["-DFMUGYM_SANITIZED", f"-I{sysconfig.get_path('include')}"]
-    command += [*map(str, sorted((TOP / "native").glob("*.c")))]
+    command += [f"-I{TOP / 'native'}", f"-I{sysconfig.get_path('include')}"]
+    command += [*map(str, sorted((TOP / "native").glob("**/*.c")))]
     command += ["-o", str(package / "_native.abi3.so"), "-lm", "-lpthread", "-ldl"]
     subprocess.run(command, check=True)
 

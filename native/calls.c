@@ -1,0 +1,99 @@
+/* What a pool does when it is called. */
+
+#include "schedule.h"
+
+#include <stdlib.h>
+
+#include "failures.h"
+#include "instances.h"
+
+
+/* Other start variables than before: what was kept of them is of no use any more. */
+static bool make_room_for_starts(Pool *pool, const Access *start) {
+    const size_t count = pool->settings.count;
+
+    if (start->count <= pool->start_width) {
+        return true;
+    }
+    double *starts = malloc(count * start->count * sizeof *starts);
+    if (starts == NULL) {
+        return false;
+    }
+    free(pool->starts);
+    pool->starts = starts;
+    pool->start_width = start->count;
+    for (size_t i = 0; i < count; i++) {
+        pool->instances[i].start_id = 0;
+    }
+    return true;
+}
+
+/* The new start values may need more room than there is. */
+static size_t run_with_starts(Task *task, size_t count) {
+    return make_room_for_starts(task->pool, task->call->start) ? schedule_run(task, count)
+                                                               : task_give_up(task, 0, count);
+}
+
+size_t pool_step(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = STEP};
+    return schedule_run(&task, pool->settings.count);
+}
+
+size_t pool_reset(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = RESET, .listed = true};
+    return run_with_starts(&task, schedule_choose(pool, call->mask));
+}
+
+size_t pool_step_or_reset(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = MIXED};
+    return run_with_starts(&task, pool->settings.count);
+}
+
+size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
+    Task task = {.pool = pool, .call = call, .operation = PLAY};
+    const size_t troubled = run_with_starts(&task, pool->settings.count);
+
+    *ended = (size_t)atomic_get(&task.ended);
+    return troubled;
+}
+
+/* Reads variables of one instance to a column of values. */
+static Status read_instance(Pool *pool, Instance *me, const Access *access, double *memory,
+                            double *column) {
+    if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
+        return instance_refuse(me, "nothing can be read before a reset has mended the instance");
+    }
+    const Status status =
+        access_get(access, me->library, me->component, memory, memory + access->count);
+    if (status > STATUS_WARNING) {
+        return instance_fail(pool, me, "reading variables", status);
+    }
+    for (size_t i = 0; i < access->count; i++) {
+        column[i * pool->settings.count] = memory[i];
+    }
+    return status;
+}
+
+ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
+    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    ptrdiff_t failed = -1;
+
+    if (memory == NULL) {
+        instance_refuse(&pool->instances[0], "out of memory");
+        return 0;
+    }
+    for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
+        Instance *me = &pool->instances[i];
+        if (read_instance(pool, me, access, memory, values + i) > STATUS_WARNING) {
+            failed = (ptrdiff_t)i;
+        }
+    }
+    free(memory);
+    return failed;
+}
+
+void pool_recycle(Pool *pool) {
+    for (size_t i = 0; i < pool->settings.count; i++) {
+        pool->instances[i].due = true;
+    }
+}

@@ -1,0 +1,180 @@
+#include "initial_states.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "instances.h"
+
+static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states of one pool */
+
+/* Initialization */
+
+typedef struct {
+    Pool *pool;
+    Instance *me;
+    const Access *start;
+    Scratch scratch; /* holds the start values */
+    uint32_t refused; /* the String that could not be set */
+} StartContext;
+
+static Status set_start_values(void *context) {
+    StartContext *c = context;
+    const Settings *s = &c->pool->settings;
+    const Floats floats = floats_now();
+    Status status = access_set(c->start, c->me->library, c->me->component, c->scratch.values,
+                               c->scratch.typed);
+
+    for (size_t i = 0; i < s->number_of_strings && status <= STATUS_WARNING; i++) {
+        const StringValue *string = &s->strings[i];
+        status = s->fmi->set_string(c->me->library, c->me->component, string->reference,
+                                    string->text);
+        floats_restore(&floats);
+        c->refused = status > STATUS_WARNING ? string->reference : c->refused;
+    }
+    return status;
+}
+
+static Status fail_initialization(Pool *pool, Instance *me, const StartContext *context,
+                                  const char *doing, Status status) {
+    instance_fail(pool, me, doing, status);
+    if (me->failure != NULL) {
+        me->failure->string_reference = context->refused;
+    }
+    if (me->phase == PHASE_INSTANTIATED) {
+        me->phase = PHASE_FAILED; /* somewhere in the middle of it: a reset is due */
+    }
+    return status;
+}
+
+static Status warm_up(Pool *pool, Instance *me) {
+    instance_count_from(me, 0);
+    for (int64_t i = 0; i < pool->settings.warm_up_steps; i++) {
+        const Status status = instance_advance(pool, me);
+        instance_count_from(me, me->steps);
+        if (status > STATUS_WARNING) {
+            if (me->failure != NULL) {
+                me->failure->in_warm_up = true;
+            }
+            return status;
+        }
+    }
+    return STATUS_OK;
+}
+
+static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
+    const Settings *s = &pool->settings;
+    StartContext context = {pool, me, start, scratch, UINT32_MAX};
+    const char *doing = "initialization";
+    const Floats floats = floats_now();
+    Status status = instance_return_to_start(pool, me);
+
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    status = s->fmi->initialize(me->library, me->component, &s->experiment,
+                                (StartValues){set_start_values, &context}, &doing);
+    floats_restore(&floats);
+    if (status > STATUS_WARNING) {
+        return fail_initialization(pool, me, &context, doing, status);
+    }
+    me->phase = PHASE_STEPPING;
+    return warm_up(pool, me);
+}
+
+/* Initial states: kept once the same start values come a second time, after an episode with steps, and
+ * restored from then on. */
+
+static bool states_are_of_use(Pool *pool, const Instance *me) {
+    return pool->settings.restores && !me->unsavable && !atomic_get(&pool->states_too_large);
+}
+
+static bool too_large(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    const Floats floats = floats_now();
+    const size_t size = s->fmi->state_size(me->library, me->component, me->saved);
+    floats_restore(&floats);
+    return size > STATES_LIMIT / s->count;
+}
+
+static void keep_state(Pool *pool, Instance *me) {
+    if (instance_save(pool, me, &me->saved) > STATUS_WARNING) {
+        me->unsavable = true;
+    } else if (too_large(pool, me)) {
+        atomic_set(&pool->states_too_large, 1);
+    }
+}
+
+static double *start_values_of(const Pool *pool, const Instance *me) {
+    return pool->starts + index_of(pool, me) * pool->start_width;
+}
+
+static bool starts_as_before(const Pool *pool, const Instance *me, const Access *start,
+                             const double *values) {
+    const size_t size = start->count * sizeof *values;
+    return me->start_id == start->id && memcmp(start_values_of(pool, me), values, size) == 0;
+}
+
+static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
+                         Scratch scratch) {
+    const Access *start = call->start;
+
+    instance_free_state(pool, me, &me->saved);
+    const Status status = initialize(pool, me, start, scratch);
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    again = again && me->start_id == start->id; /* it may have been replaced */
+    me->start_id = start->id;
+    memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
+    if (again && states_are_of_use(pool, me)) {
+        keep_state(pool, me);
+    }
+    return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
+}
+
+static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
+    const Status status = start_anew(pool, me, call, again, scratch);
+
+    if (status > STATUS_WARNING) {
+        return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
+    }
+    instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
+    return instance_read_outputs(pool, me, scratch);
+}
+
+static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
+    const Status status = instance_restore(pool, me, me->saved);
+
+    if (status > STATUS_WARNING) {
+        instance_free_state(pool, me, &me->saved);
+        me->unsavable = true;
+        return status;
+    }
+    instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
+    return instance_read_outputs(pool, me, scratch);
+}
+
+Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
+    const Access *start = call->start;
+    const Matrix *values = &call->start_values;
+    const bool stepped = me->steps > pool->settings.warm_up_steps * pool->settings.substeps;
+
+    health_count_steps(pool, me);
+    health_of(pool, me)[RESETS]++;
+    health_of(pool, me)[RETRIED] = 0;
+    if (instance_renew_if_due(pool, me) > STATUS_WARNING) {
+        return STATUS_FATAL;
+    }
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values);
+    const bool again = starts_as_before(pool, me, start, scratch.values);
+
+    if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
+        return restart(pool, me, call, again && stepped, scratch);
+    }
+    const Status status = return_to_start(pool, me, scratch);
+    if (me->saved != NULL) {
+        return status;
+    }
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* it refused */
+    return restart(pool, me, call, again, scratch);
+}

@@ -1,0 +1,168 @@
+#include "instances.h"
+
+#include "failures.h"
+#include "floats.h"
+
+static const char *name_of(const Pool *pool, size_t index) {
+    return pool->names + index * pool->name_size;
+}
+
+bool instance_build(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    const size_t index = index_of(pool, me);
+    const Identity identity = {name_of(pool, index), s->token, s->resources,
+                               log_environment(&pool->log, index), s->logging};
+
+    const Floats floats = floats_now();
+
+    mutex_lock(&pool->making);
+    me->component = s->fmi->instantiate(me->library, &identity);
+    mutex_unlock(&pool->making);
+    floats_restore(&floats);
+    me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
+    return me->component != NULL;
+}
+
+Status instance_free_state(const Pool *pool, Instance *me, void **state) {
+    const Floats floats = floats_now();
+    Status status = STATUS_OK;
+
+    if (*state != NULL && me->phase != PHASE_DEAD) {
+        status = instance_judge(me, pool->settings.fmi->free_state(me->library, me->component, state));
+        floats_restore(&floats);
+    }
+    *state = NULL; /* after Fatal the standard forbids to free it: the memory is given up */
+    return status;
+}
+
+/* Snapshots are linked and unlinked under the pool's lock, but instances are replaced by several
+ * threads; each of these touches only what is its own instance's. */
+static void free_states(Pool *pool, Instance *me) {
+    const size_t index = index_of(pool, me);
+
+    instance_free_state(pool, me, &me->saved);
+    for (Snapshot *snapshot = pool->snapshots; snapshot != NULL; snapshot = snapshot->next) {
+        if (snapshot->generations[index] == me->generation) {
+            instance_free_state(pool, me, &snapshot->states[index]);
+        }
+    }
+}
+
+void instance_discard(Pool *pool, Instance *me) {
+    const Fmi *fmi = pool->settings.fmi;
+    const Floats floats = floats_now();
+
+    free_states(pool, me);
+    if (me->phase == PHASE_STEPPING || me->phase == PHASE_ENDED) {
+        instance_judge(me, fmi->terminate(me->library, me->component));
+    }
+    if (me->phase != PHASE_DEAD) {
+        mutex_lock(&pool->making);
+        fmi->free_instance(me->library, me->component);
+        mutex_unlock(&pool->making);
+    }
+    floats_restore(&floats);
+    me->component = NULL;
+    me->phase = PHASE_DEAD;
+    me->generation++;
+    me->start_id = 0;
+    me->unsavable = false;
+    log_forget(&pool->log, index_of(pool, me));
+}
+
+/* A private library may be loaded anew: whatever Fatal left in its globals is gone then. */
+static void reload_private_library(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+    const Floats floats = floats_now(); /* code runs when a library is loaded, too */
+    char unused[256];
+
+    if (s->private_libraries) {
+        library_close(me->library);
+        if (library_open(me->library, s->paths[index_of(pool, me)], unused, sizeof unused) &&
+            !s->fmi->bind(me->library, unused, sizeof unused)) {
+            library_close(me->library);
+        }
+    }
+    floats_restore(&floats);
+}
+
+static Status rebuild(Pool *pool, Instance *me) {
+    const bool was_dead = me->phase == PHASE_DEAD;
+
+    instance_discard(pool, me);
+    if (was_dead || pool->settings.reloads) {
+        reload_private_library(pool, me);
+    }
+    const bool loaded = me->library->functions != NULL;
+    if (loaded && instance_build(pool, me)) {
+        return STATUS_OK;
+    }
+    Failure *failure = failure_note(me, loaded ? "the FMU refused to be instantiated anew"
+                                               : "the FMU's library cannot be loaded anew", -1);
+    if (failure != NULL) {
+        failure->said = log_said(&pool->log, index_of(pool, me));
+    }
+    return STATUS_FATAL;
+}
+
+static Status replace(Pool *pool, Instance *me) {
+    health_of(pool, me)[REPLACEMENTS]++;
+    return rebuild(pool, me);
+}
+
+Status instance_renew_if_due(Pool *pool, Instance *me) {
+    const bool due = me->due;
+
+    me->due = false;
+    if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
+        return STATUS_OK;
+    }
+    if (due) {
+        health_of(pool, me)[RECYCLINGS]++;
+        return replace(pool, me);
+    }
+    return pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
+}
+
+/* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
+ * reset. */
+Status instance_return_to_start(Pool *pool, Instance *me) {
+    if (me->phase == PHASE_INSTANTIATED) {
+        return STATUS_OK;
+    }
+    if (me->phase != PHASE_DEAD) {
+        const Floats floats = floats_now();
+        const Status status = pool->settings.fmi->reset(me->library, me->component);
+        floats_restore(&floats);
+        if (status <= STATUS_WARNING) {
+            me->phase = PHASE_INSTANTIATED;
+            return STATUS_OK;
+        }
+        instance_judge(me, status);
+    }
+    return replace(pool, me);
+}
+
+Status instance_save(Pool *pool, Instance *me, void **state) {
+    const Floats floats = floats_now();
+
+    *state = NULL;
+    const Status status = pool->settings.fmi->get_state(me->library, me->component, state);
+    floats_restore(&floats);
+    return status > STATUS_WARNING ? instance_fail(pool, me, "saving the FMU state", status) : status;
+}
+
+Status instance_restore(Pool *pool, Instance *me, void *state) {
+    if (me->phase == PHASE_DEAD) {
+        return instance_refuse(me, "no restore after a fatal error");
+    }
+    const Floats floats = floats_now();
+    const Status status = pool->settings.fmi->set_state(me->library, me->component, state);
+    floats_restore(&floats);
+    if (status > STATUS_WARNING) {
+        instance_fail(pool, me, "restoring the FMU state", status);
+        return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
+    }
+    me->phase = PHASE_STEPPING;
+    return status;
+}

@@ -1,0 +1,333 @@
+#include "runs.h"
+
+#include <string.h>
+
+#include "initial_states.h"
+#include "instances.h"
+
+void write_observation(const Pool *pool, size_t index, float *observations) {
+    const Settings *s = &pool->settings;
+    const double *value = s->output_values + index;
+    float *row = observations + index * s->num_observed;
+
+    for (size_t i = 0; i < s->num_observed; i++, value += s->count) {
+        row[i] = (float)*value;
+    }
+}
+
+static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
+    const size_t index = index_of(task->pool, me);
+
+    health_count_steps(task->pool, me);
+    const Status status = instance_restore(task->pool, me, task->snapshot->states[index]);
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    instance_count_from(me, task->snapshot->steps[index]);
+    return instance_read_outputs(task->pool, me, scratch);
+}
+
+static size_t note_status(Task *task, size_t index, Status status) {
+    task->pool->settings.status[index] = (int8_t)status;
+    if (status <= STATUS_WARNING) {
+        return 0;
+    }
+    health_count_fault(task->pool, &task->pool->instances[index], status);
+    return 1;
+}
+
+/* Resets or restores instances that need not be neighbours. */
+size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
+    Pool *pool = task->pool;
+    const Call *call = task->call;
+    size_t troubled = 0;
+
+    for (size_t i = begin; i < end; i++) {
+        const size_t index = pool->chosen[i];
+        Instance *me = &pool->instances[index];
+        const Status status =
+            task->operation == RESTORE
+                ? restore_instance(task, me, scratch)
+                : instance_reset(pool, me, call, scratch);
+        troubled += note_status(task, index, status);
+        if (call->observations != NULL) {
+            write_observation(pool, index, call->observations);
+        }
+    }
+    return troubled;
+}
+
+/* Steps of neighbours */
+
+static void gather_inputs(const Task *task, size_t begin, size_t count, double *inputs) {
+    const Matrix *matrix = &task->call->inputs;
+    const size_t width = task->pool->settings.inputs->count;
+
+    for (size_t i = 0; i < width; i++) {
+        const char *place = matrix->data + (ptrdiff_t)i * matrix->row_stride +
+                            (ptrdiff_t)begin * matrix->column_stride;
+        double *to = inputs + i;
+        for (size_t j = 0; j < count; j++, place += matrix->column_stride, to += width) {
+            memcpy(to, place, sizeof *to);
+        }
+    }
+}
+
+/* Those that cannot be left as they are: their outputs stay as before. */
+static size_t take_not_finite(Task *task, size_t begin, size_t count, double *outputs) {
+    Pool *pool = task->pool;
+    const size_t width = pool->settings.outputs->count;
+    size_t troubled = 0;
+
+    for (size_t j = 0; j < count; j++, outputs += width) {
+        Instance *me = &pool->instances[begin + j];
+        if (!all_finite(outputs, width)) {
+            const bool counted = pool->settings.status[begin + j] > STATUS_WARNING;
+            note_status(task, begin + j, instance_note_not_finite(me, BAD_OUTPUTS, outputs, width));
+            troubled += !counted;
+            instance_copy_outputs(pool, me, outputs);
+        }
+    }
+    return troubled;
+}
+
+/* One value of each of count rows; four at a time, as there are many. */
+static void take_column(const double *rows, size_t width, size_t count, double *column) {
+    size_t j = 0;
+
+    for (; j + 4 <= count; j += 4, rows += 4 * width) {
+        column[j] = rows[0];
+        column[j + 1] = rows[width];
+        column[j + 2] = rows[2 * width];
+        column[j + 3] = rows[3 * width];
+    }
+    for (; j < count; j++, rows += width) {
+        column[j] = *rows;
+    }
+}
+
+static void keep_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
+    const Settings *s = &task->pool->settings;
+    const size_t width = s->outputs->count;
+
+    for (size_t i = 0; i < width; i++) {
+        take_column(outputs + i, width, count, s->output_values + i * s->count + begin);
+    }
+}
+
+WIDE static void convert(const double *values, size_t count, float *converted) {
+    for (size_t i = 0; i < count; i++) {
+        converted[i] = (float)values[i];
+    }
+}
+
+static void write_observations(const Task *task, size_t begin, size_t count,
+                               const double *outputs) {
+    const size_t width = task->pool->settings.outputs->count;
+    const size_t observed = task->pool->settings.num_observed;
+    float *rows = task->call->observations + begin * observed;
+
+    if (observed == width) {
+        convert(outputs, count * width, rows);
+        return;
+    }
+    for (size_t j = 0; j < count; j++) {
+        convert(outputs + j * width, observed, rows + j * observed);
+    }
+}
+
+/* The same scratch memory, without the first instances of its run. */
+static Scratch scratch_from(const Pool *pool, Scratch scratch, size_t place) {
+    scratch.inputs += place * pool->settings.inputs->count;
+    scratch.outputs += place * pool->settings.outputs->count;
+    return scratch;
+}
+
+/* Where a step has given no outputs, those from before are handed out. */
+static size_t conclude_step(Task *task, size_t index, Status status, double *outputs) {
+    if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
+        instance_copy_outputs(task->pool, &task->pool->instances[index], outputs);
+    }
+    return note_status(task, index, status);
+}
+
+/* Resets an instance in the mask, or steps another; a plain step leaves those in the mask. */
+static size_t do_one(Task *task, size_t index, Scratch scratch) {
+    Pool *pool = task->pool;
+    const Call *call = task->call;
+    Instance *me = &pool->instances[index];
+    size_t troubled = 0;
+
+    if (!is_in(call->mask, index)) {
+        return conclude_step(task, index, instance_step(pool, me, scratch), scratch.outputs);
+    }
+    if (task->operation != STEP) {
+        if (call->turn != NULL) {
+            play_draw(call->turn, index);
+        }
+        troubled = note_status(task, index, instance_reset(pool, me, call, scratch));
+    }
+    instance_copy_outputs(pool, me, scratch.outputs);
+    return troubled;
+}
+
+/* Those of a run that are stepped together, by one call of the FMI version, and the others; by their
+ * places in the run. */
+typedef struct {
+    size_t count, others;
+    uint32_t places[RUN], other_places[RUN];
+    void *components[RUN];
+    double times[RUN];
+    Outcome outcomes[RUN];
+} LineUp;
+
+/* Takes the steps for done. Without branches: nobody can foresee which episodes have ended. */
+static void line_up(const Task *task, size_t begin, size_t count, bool together, LineUp *line) {
+    const Pool *pool = task->pool;
+    const Library *library = pool->instances[begin].library;
+    size_t steppers = 0, others = 0;
+
+    for (size_t j = 0; j < count; j++) {
+        Instance *me = &pool->instances[begin + j];
+        const bool steps = together & !is_in(task->call->mask, begin + j) &
+                           (me->phase == PHASE_STEPPING) & (me->library == library);
+
+        line->places[steppers] = line->other_places[others] = (uint32_t)j;
+        line->components[steppers] = me->component;
+        line->times[steppers] = instance_time(pool, me);
+        me->steps += steps;
+        steppers += steps;
+        others += !steps;
+    }
+    line->count = steppers;
+    line->others = others;
+}
+
+/* Asks for the memory that a reset will read, if there is one: many places, far from each other. */
+static void foresee_reset(const Task *task, size_t index) {
+    const Call *call = task->call;
+    const Matrix *values = &call->start_values;
+    const char *place = values->data + (ptrdiff_t)index * values->column_stride;
+
+    if (task->operation == STEP || !is_in(call->mask, index)) {
+        return;
+    }
+    for (size_t i = 0; i < call->start->count; i++, place += values->row_stride) {
+        prefetch(place);
+    }
+    if (call->turn != NULL) {
+        play_foresee(call->turn->play, index);
+    }
+}
+
+static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) {
+    if (outcome.status <= STATUS_WARNING) {
+        return outcome.status;
+    }
+    if (outcome.stage == SETTING_INPUTS) {
+        me->steps--;
+        return instance_fail_setting(pool, me, outcome.status);
+    }
+    return outcome.stage == DOING_STEP ? instance_fail_step(pool, me, time, outcome.status)
+                                       : instance_fail_reading(pool, me, outcome.status);
+}
+
+static size_t conclude_steps(Task *task, size_t begin, const LineUp *line, Scratch scratch) {
+    Pool *pool = task->pool;
+    size_t troubled = 0;
+
+    for (size_t i = 0; i < line->count; i++) {
+        const size_t place = line->places[i], index = begin + place;
+        const Status status =
+            status_of(pool, &pool->instances[index], line->times[i], line->outcomes[i]);
+        double *outputs = scratch_from(pool, scratch, place).outputs;
+        troubled += conclude_step(task, index, status, outputs);
+    }
+    return troubled;
+}
+
+static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scratch) {
+    const Pool *pool = task->pool;
+    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
+    const Exchange e = {
+        .input_references = in->groups[0].references,
+        .output_references = out->groups[0].references,
+        .number_of_inputs = in->count,
+        .number_of_outputs = out->count,
+        .step = pool->step_size,
+        .no_return = pool->no_return,
+        .count = line->count,
+        .components = line->components,
+        .places = line->places,
+        .times = line->times,
+        .floats = scratch.floats,
+        .inputs = scratch.inputs,
+        .outputs = scratch.outputs,
+        .outcomes = line->outcomes,
+    };
+    if (!pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
+        return conclude_steps(task, begin, line, scratch);
+    }
+    for (size_t i = 0; i < line->count; i++) {
+        pool->settings.status[begin + line->places[i]] = STATUS_OK;
+    }
+    return 0;
+}
+
+static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
+    const Pool *pool = task->pool;
+    LineUp line;
+    size_t troubled = 0;
+
+    line_up(task, begin, count, pool->direct && scratch.sound, &line);
+    for (size_t i = 0; i < line.others; i++) {
+        foresee_reset(task, begin + line.other_places[i]);
+    }
+    if (line.count > 0) {
+        troubled += step_together(task, begin, &line, scratch);
+    }
+    for (size_t i = 0; i < line.others; i++) {
+        const size_t place = line.other_places[i];
+        troubled += do_one(task, begin + place, scratch_from(pool, scratch, place));
+    }
+    return troubled;
+}
+
+static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
+    gather_inputs(task, begin, count, scratch.inputs);
+    scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
+    size_t troubled = do_each(task, begin, count, scratch);
+
+    if (!all_finite(scratch.outputs, count * task->pool->settings.outputs->count)) {
+        troubled += take_not_finite(task, begin, count, scratch.outputs);
+    }
+    keep_outputs(task, begin, count, scratch.outputs);
+    if (task->call->observations != NULL) {
+        write_observations(task, begin, count, scratch.outputs);
+    }
+    return troubled;
+}
+
+size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch) {
+    size_t troubled = 0;
+    for (size_t first = begin; first < end; first += RUN) {
+        troubled += do_run(task, first, length_of_run(first, end), scratch);
+    }
+    return troubled;
+}
+
+size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
+    const Turn *turn = task->call->turn;
+    PlayScratch registers;
+    size_t troubled = 0, ended = 0;
+
+    play_open(turn, &registers);
+    for (size_t first = begin; first < end; first += RUN) {
+        const size_t count = length_of_run(first, end);
+        play_prepare(turn, first, count, &registers);
+        troubled += do_run(task, first, count, scratch);
+        ended += play_judge(turn, first, count, &registers);
+    }
+    atomic_add(&task->ended, ended);
+    return troubled;
+}

@@ -1,0 +1,44 @@
+/* Runs: neighbours whose inputs and outputs are moved together, in loops that become vector
+ * instructions. */
+
+#ifndef FMUGYM_RUNS_H
+#define FMUGYM_RUNS_H
+
+#include "pool.h"
+#include "steps.h"
+
+enum { RUN = PROGRAM_WIDTH /* instances of a run */ };
+
+/* What a call does; all threads that work on it write to its last fields. */
+typedef struct {
+    Pool *pool;
+    const Call *call;
+    int operation;
+    const Snapshot *snapshot; /* to be restored */
+    bool listed;              /* whether the items are places in pool->chosen, or instances */
+    bool measured;
+    _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
+    Atomic ended;    /* episodes, when playing */
+    Atomic time;     /* ns, of all threads together, if measured */
+} Task;
+
+static inline bool is_in(Mask mask, size_t index) {
+    return mask.data != NULL && mask.data[(ptrdiff_t)index * mask.stride] != 0;
+}
+
+static inline size_t length_of_run(size_t first, size_t end) {
+    return end - first < RUN ? end - first : RUN;
+}
+
+/* All three work on items from begin to end and return how many instances have a status worse than a
+ * warning. Resets or restores instances that need not be neighbours: */
+size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);
+/* Steps or resets: */
+size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch);
+/* The same with programs before and after: */
+size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch);
+
+/* Writes the first outputs of an instance. */
+void write_observation(const Pool *pool, size_t index, float *observations);
+
+#endif

@@ -1,0 +1,173 @@
+#include "schedule.h"
+
+#include <stdlib.h>
+
+#include "entering.h"
+#include "threads.h"
+
+static const double QUICK = 10e3;         /* ns for which others may wait */
+static const double SMALLEST_CHUNK = 2e3; /* ns */
+static const double LARGEST_CHUNK = 50e3; /* ns */
+static const double PARALLEL_FROM = 20e3;
+
+enum {
+    STACK_VALUES = 512,
+    MANY = 64,         /* instances from which on every call is measured */
+    MEASURE_EVERY = 16 /* calls with fewer */
+};
+
+/* Without 16 bytes per value nothing else will work either. The caller's arrays are filled all the
+ * same: with what was there before. */
+size_t task_give_up(Task *task, size_t begin, size_t end) {
+    const Call *call = task->call;
+
+    for (size_t i = begin; i < end; i++) {
+        const size_t index = task->listed ? task->pool->chosen[i] : i;
+        instance_refuse(&task->pool->instances[index], "out of memory");
+        task->pool->settings.status[index] = STATUS_ERROR;
+        if (call->observations != NULL) {
+            write_observation(task->pool, index, call->observations);
+        }
+        if (call->turn != NULL) {
+            play_skip(call->turn, index);
+        }
+    }
+    return end - begin;
+}
+
+static size_t most_values(const Task *task) {
+    const Settings *s = &task->pool->settings;
+    const size_t in = s->inputs->count, out = s->outputs->count;
+    const size_t start = task->call->start == NULL ? 0 : task->call->start->count;
+    const size_t most = in > out ? in : out;
+    return most > start ? most : start;
+}
+
+static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
+    if (task->listed) {
+        return run_listed(task, begin, end, scratch);
+    }
+    return task->operation == PLAY ? run_play(task, begin, end, scratch)
+                                   : run_steps(task, begin, end, scratch);
+}
+
+static size_t work_with_memory(Task *task, size_t begin, size_t end) {
+    const Settings *s = &task->pool->settings;
+    const size_t most = most_values(task), run = task->listed ? 0 : length_of_run(begin, end);
+    const size_t in = run * s->inputs->count, size = 2 * most + in + run * s->outputs->count;
+    double stack[STACK_VALUES];
+    double *memory = size <= STACK_VALUES ? stack : malloc(size * sizeof *memory);
+
+    if (memory == NULL) {
+        return task_give_up(task, begin, end);
+    }
+    const Floats floats = floats_now();
+    const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in,
+                             true, &floats};
+    const size_t troubled = work_with(task, begin, end, scratch);
+    if (memory != stack) {
+        free(memory);
+    }
+    return troubled;
+}
+
+/* A chunk of the work, on any thread. */
+static void work(void *context, size_t begin, size_t end) {
+    Task *task = context;
+    const uint64_t began = task->measured ? clock_now() : 0;
+
+    begin_inside(task->pool);
+    const size_t troubled = work_with_memory(task, begin, end);
+    end_inside();
+    if (troubled > 0) {
+        atomic_add(&task->troubled, troubled);
+    }
+    if (task->measured) {
+        atomic_add(&task->time, clock_now() - began);
+    }
+}
+
+/* The first time an operation is done nothing is known of its cost: item by item, until there is
+ * so much work that helpers are worth while. Returns how many items were done. */
+static size_t explore(Task *task, Cost *cost, size_t count) {
+    size_t done = 0;
+
+    task->measured = true;
+    while (done < count && (double)atomic_get(&task->time) < PARALLEL_FROM) {
+        work(task, done, done + 1);
+        done++;
+    }
+    cost->mean = (double)(atomic_get(&task->time) + 1) / (double)done;
+    return done;
+}
+
+static size_t at_least_one(double items) {
+    return items < 1.0 ? 1 : items > 1e9 ? (size_t)1e9 : (size_t)items;
+}
+
+/* Items from the first one on that explore has left. */
+typedef struct {
+    Task *task;
+    size_t first;
+} Rest;
+
+static void work_on_rest(void *context, size_t begin, size_t end) {
+    const Rest *rest = context;
+    work(rest->task, rest->first + begin, rest->first + end);
+}
+
+static void run(Task *task, double mean, size_t first, size_t count) {
+    const double total = mean * (double)(count - first);
+    Rest rest = {task, first};
+    const Job job = {
+        .work = work_on_rest,
+        .context = &rest,
+        .count = count - first,
+        .helpers = total < PARALLEL_FROM || task->call->alone ? 0 : task->pool->settings.threads - 1,
+        .smallest = at_least_one(SMALLEST_CHUNK / mean),
+        .largest = at_least_one(LARGEST_CHUNK / mean),
+    };
+    threads_run(&job);
+}
+
+static void run_measured(Task *task, Cost *cost, size_t count) {
+    task->measured = count >= MANY || ++cost->calls % MEASURE_EVERY == 0;
+    run(task, cost->mean, 0, count);
+    if (task->measured) {
+        const double mean = (double)atomic_get(&task->time) / (double)count;
+        cost->mean += (mean - cost->mean) / 8.0;
+    }
+}
+
+size_t schedule_run(Task *task, size_t count) {
+    Cost *cost = &task->pool->costs[task->operation];
+
+    if (count == 0) {
+        return 0;
+    }
+    if (cost->mean == 0.0) {
+        const size_t done = explore(task, cost, count);
+        if (done < count) {
+            run(task, cost->mean, done, count);
+        }
+    } else {
+        run_measured(task, cost, count);
+    }
+    return (size_t)atomic_get(&task->troubled);
+}
+
+bool pool_is_quick(const Pool *pool, int operation) {
+    const double mean = pool->costs[operation].mean;
+    return mean > 0.0 && mean * (double)pool->settings.count < QUICK;
+}
+
+size_t schedule_choose(Pool *pool, Mask mask) {
+    const size_t count = pool->settings.count;
+    size_t chosen = 0;
+
+    for (size_t i = 0; i < count; i++) {
+        pool->chosen[chosen] = (uint32_t)i;
+        chosen += mask.data == NULL || mask.data[(ptrdiff_t)i * mask.stride] != 0;
+    }
+    return chosen;
+}

@@ -1,0 +1,178 @@
+#include "steps.h"
+
+#include <float.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "instances.h"
+
+static const char *const BAD_INPUTS = "the inputs are not finite";
+const char *const BAD_OUTPUTS = "the outputs are not finite";
+
+/* After a step that was not done FMI wants no other. */
+static void forbid_steps(Instance *me) {
+    if (me->phase == PHASE_STEPPING) {
+        me->phase = PHASE_ENDED;
+    }
+}
+
+Status instance_fail_step(Pool *pool, Instance *me, double time, Status status) {
+    instance_fail(pool, me, "the step", status);
+    forbid_steps(me);
+    if (me->failure != NULL) {
+        me->failure->time = time;
+    }
+    return status;
+}
+
+/* A communication step as several smaller ones. */
+static Status step_in_parts(Pool *pool, Instance *me, double time, int64_t parts) {
+    const Settings *s = &pool->settings;
+    const double size = pool->step_size / (double)parts;
+    const Floats floats = floats_now();
+    Status status = STATUS_OK;
+
+    for (int64_t i = 0; i < parts && status <= STATUS_WARNING; i++) {
+        status = s->fmi->do_step(me->library, me->component, time + (double)i * size, size,
+                                 pool->no_return);
+        floats_restore(&floats);
+    }
+    return status;
+}
+
+/* A discarded step leaves the instance where it may not be stepped on from: each try begins at the
+ * state before the first one. */
+static Status retry(Pool *pool, Instance *me, double time, void *before) {
+    const Settings *s = &pool->settings;
+    int64_t *health = health_of(pool, me);
+    Status status = STATUS_DISCARD;
+
+    for (int64_t i = 1; i <= s->retries && status == STATUS_DISCARD; i++) {
+        const Floats floats = floats_now();
+        const Status restored = s->fmi->set_state(me->library, me->component, before);
+        floats_restore(&floats);
+        if (restored > STATUS_WARNING) {
+            return restored;
+        }
+        health[RETRIES]++;
+        health[RETRIED]++;
+        status = step_in_parts(pool, me, time, (int64_t)1 << i);
+    }
+    return status;
+}
+
+static Status step_with_retries(Pool *pool, Instance *me, double time) {
+    void *before = NULL;
+    const Floats floats = floats_now();
+    Status status = pool->settings.fmi->get_state(me->library, me->component, &before);
+
+    floats_restore(&floats);
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    status = step_in_parts(pool, me, time, 1);
+    if (status == STATUS_DISCARD) {
+        status = retry(pool, me, time, before);
+    }
+    instance_judge(me, status);
+    const Status freed = instance_free_state(pool, me, &before);
+    return status > STATUS_WARNING ? status : freed;
+}
+
+static Status step_once(Pool *pool, Instance *me) {
+    const double time = instance_time(pool, me);
+    const Status status = pool->settings.retries == 0 ? step_in_parts(pool, me, time, 1)
+                                                      : step_with_retries(pool, me, time);
+
+    me->steps++;
+    return status > STATUS_WARNING ? instance_fail_step(pool, me, time, status) : status;
+}
+
+Status instance_advance(Pool *pool, Instance *me) {
+    Status status = STATUS_OK;
+    for (int64_t i = 0; i < pool->settings.substeps && status <= STATUS_WARNING; i++) {
+        status = step_once(pool, me);
+    }
+    return status;
+}
+
+WIDE bool all_finite(const double *values, size_t count) {
+    int64_t bad = 0; /* as wide as the values, for the compiler's sake */
+
+    for (size_t i = 0; i < count; i++) {
+        bad |= !(fabs(values[i]) <= DBL_MAX);
+    }
+    return bad == 0;
+}
+
+void instance_copy_outputs(const Pool *pool, const Instance *me, double *values) {
+    const Settings *s = &pool->settings;
+    const double *place = s->output_values + index_of(pool, me);
+
+    for (size_t i = 0; i < s->outputs->count; i++, place += s->count) {
+        values[i] = *place;
+    }
+}
+
+Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch) {
+    const Settings *s = &pool->settings;
+    const size_t count = s->outputs->count;
+    const Status got =
+        access_get(s->outputs, me->library, me->component, scratch.values, scratch.typed);
+
+    if (got > STATUS_WARNING) {
+        return instance_fail(pool, me, "reading the outputs", got);
+    }
+    if (!all_finite(scratch.values, count)) {
+        return instance_note_not_finite(me, BAD_OUTPUTS, scratch.values, count);
+    }
+    double *place = s->output_values + index_of(pool, me);
+    for (size_t i = 0; i < count; i++, place += s->count) {
+        *place = scratch.values[i];
+    }
+    return STATUS_OK;
+}
+
+void matrix_gather(const Matrix *matrix, size_t column, size_t rows, double *values) {
+    const char *place = matrix->data + (ptrdiff_t)column * matrix->column_stride;
+    for (size_t i = 0; i < rows; i++, place += matrix->row_stride) {
+        memcpy(&values[i], place, sizeof values[i]);
+    }
+}
+
+Status instance_fail_reading(Pool *pool, Instance *me, Status status) {
+    instance_fail(pool, me, "reading the outputs", status);
+    forbid_steps(me); /* the step before may have been the last */
+    return status;
+}
+
+Status instance_fail_setting(Pool *pool, Instance *me, Status status) {
+    return instance_fail(pool, me, "setting the inputs", status);
+}
+
+Status instance_step(Pool *pool, Instance *me, Scratch scratch) {
+    const Settings *s = &pool->settings;
+
+    if (me->phase != PHASE_STEPPING) {
+        return instance_refuse(me, "a step was asked for before a reset has mended the instance");
+    }
+    if (!scratch.sound && !all_finite(scratch.inputs, s->inputs->count)) {
+        return instance_note_not_finite(me, BAD_INPUTS, scratch.inputs, s->inputs->count);
+    }
+    if (s->retries > 0) {
+        health_of(pool, me)[RETRIED] = 0;
+    }
+    const Status set =
+        access_set(s->inputs, me->library, me->component, scratch.inputs, scratch.typed);
+    if (set > STATUS_WARNING) {
+        return instance_fail_setting(pool, me, set);
+    }
+    const Status status = instance_advance(pool, me);
+    if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
+        return status;
+    }
+    const Status got =
+        access_get(s->outputs, me->library, me->component, scratch.outputs, scratch.typed);
+    return got > STATUS_WARNING ? instance_fail_reading(pool, me, got) : status;
+}

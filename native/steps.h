@@ -1,0 +1,51 @@
+/* Steps of one instance, and what is read after them. */
+
+#ifndef FMUGYM_STEPS_H
+#define FMUGYM_STEPS_H
+
+#include "failures.h"
+#include "floats.h"
+#include "pool.h"
+
+/* Scratch memory of one thread. */
+typedef struct {
+    double *values; /* of one instance, */
+    void *typed;    /* and their typed form */
+    double *inputs; /* of a run of instances, one after the other */
+    double *outputs;
+    bool sound;     /* whether these inputs are all finite */
+    const Floats *floats; /* the environment that FMUs shall find */
+} Scratch;
+
+/* The order of operations of PoolSpec.communication_point; a division by 1 changes nothing. */
+static inline double instance_time(const Pool *pool, const Instance *me) {
+    const Settings *s = &pool->settings;
+    const double since_start = (double)me->steps * s->time_step;
+    return s->experiment.start_time +
+           (s->substeps == 1 ? since_start : since_start / (double)s->substeps);
+}
+
+static inline void instance_count_from(Instance *me, int64_t steps) {
+    me->steps = me->counted = steps;
+}
+
+/* Sets the inputs, does a step and reads the outputs to the scratch memory. */
+Status instance_step(Pool *pool, Instance *me, Scratch scratch);
+/* Does the substeps of a step. */
+Status instance_advance(Pool *pool, Instance *me);
+/* Reads the outputs to the pool's array, if they are finite. */
+Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch);
+/* Copies the outputs from the pool's array. */
+void instance_copy_outputs(const Pool *pool, const Instance *me, double *values);
+
+Status instance_fail_step(Pool *pool, Instance *me, double time, Status status);
+Status instance_fail_setting(Pool *pool, Instance *me, Status status);
+Status instance_fail_reading(Pool *pool, Instance *me, Status status);
+
+bool all_finite(const double *values, size_t count);
+/* Copies a column of a matrix. */
+void matrix_gather(const Matrix *matrix, size_t column, size_t rows, double *values);
+
+extern const char *const BAD_OUTPUTS;
+
+#endif
