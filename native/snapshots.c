@@ -91,7 +91,7 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
     if (me->phase != PHASE_STEPPING) {
         return instance_refuse(me, me->phase == PHASE_INSTANTIATED
                               ? "cannot save the FMU state before the first reset"
-                              : "cannot save the FMU state before a reset has mended the instance");
+                              : "the instance needs a reset before its FMU state can be saved");
     }
     snapshot->generations[index] = me->generation;
     snapshot->steps[index] = me->steps;

@@ -8,8 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import zoo_tools
-from fmugym.adapters import Status
-from fmugym.vector.trace import OPERATIONS
 from test_native_pool import LOG, make, on_linux
 from test_native_threads import run_python
 
@@ -17,8 +15,10 @@ import fmugym
 from fmugym import FMU, bundled_fmu
 from fmugym import pool as pools
 from fmugym.envs import CartPoleEnv
+from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.health import no_counts
+from fmugym.vector.hooks.program import OPERATIONS
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():
