@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.model_description import Variable
+from fmugym.pool.processors import available_processors
 from fmugym.pool_spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
 
 __all__ = [
@@ -144,10 +144,3 @@ class Pool(Protocol):
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
         ...
-
-
-def available_processors() -> int:
-    """The number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
