@@ -1,14 +1,21 @@
 """The C extension, which is optional: without a compiler the package installs and works without it.
 
-All metadata is in ``pyproject.toml``.
+With ``FMUGYM_REQUIRE_NATIVE=1`` in the environment a build that fails is an error. All metadata is
+in ``pyproject.toml``.
 """
 
+import os
 import sys
+import sysconfig
 from pathlib import Path
 
 from setuptools import Extension, setup
 
+if sysconfig.get_config_var("Py_GIL_DISABLED"):
+    sys.exit("fmugym needs Python with the GIL: free-threaded Python is not supported")
+
 WINDOWS = sys.platform == "win32"
+REQUIRED = os.environ.get("FMUGYM_REQUIRE_NATIVE", "0") not in ("", "0")
 
 # One wheel for all versions of Python from 3.11 on, the first to have buffers in its stable ABI.
 # Results must not depend on the compiler: no contraction, no relaxed floating-point arithmetic.
@@ -23,7 +30,7 @@ native = Extension(
     else ["-std=gnu11", "-O3", "-ffp-contract=off", "-fvisibility=hidden"],
     libraries=[] if WINDOWS else ["m", "pthread", "dl"],
     py_limited_api=True,
-    optional=True,
+    optional=not REQUIRED,
 )
 
 setup(ext_modules=[native], options={"bdist_wheel": {"py_limited_api": "cp311"}})

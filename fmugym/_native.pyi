@@ -5,12 +5,26 @@ int8 for statuses. Those that are only read may have any strides.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypedDict, final
+from typing import Any, Final, TypedDict, final
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
+
+MOST_INSTRUCTIONS: Final[int]
+"""The most instructions of a program."""
+
+def operations() -> tuple[str, ...]:
+    """The operations of programs, in the order of their numbers."""
+
+def statistics() -> dict[str, int]:
+    """What helper threads have done in this process.
+
+    Returns:
+        ``jobs`` in which helpers could take part, ``wakes`` of helpers that slept, and ``chunks``
+        that these jobs were divided into.
+    """
 
 def echo_to(memory: Array, /) -> None:
     """Write what FMUs say to memory as well, before they go on.

@@ -36,12 +36,19 @@ static size_t number_of_libraries(const Settings *s) {
     return s->private_libraries ? s->count : 1;
 }
 
+/* The memory is a line longer than needed. */
+static void *at_cache_line(void *memory) {
+    const uintptr_t rest = (uintptr_t)memory % CACHE_LINE;
+    return memory == NULL || rest == 0 ? memory : (char *)memory + (CACHE_LINE - rest);
+}
+
 static bool allocate(Pool *pool) {
     const Settings *s = &pool->settings;
 
     pool->name_size = strlen(s->model) + sizeof "_4294967295_4294967295";
     pool->libraries = calloc(number_of_libraries(s), sizeof *pool->libraries);
-    pool->instances = calloc(s->count, sizeof *pool->instances);
+    pool->instance_memory = calloc(s->count + 1, sizeof *pool->instances);
+    pool->instances = at_cache_line(pool->instance_memory);
     pool->names = calloc(s->count, pool->name_size);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
@@ -126,7 +133,7 @@ void pool_close(Pool *pool) {
     free_instances(pool);
     pool->open = false;
     free(pool->libraries);
-    free(pool->instances);
+    free(pool->instance_memory);
     free(pool->starts);
     free(pool->names);
     free(pool->chosen);

@@ -96,7 +96,10 @@ typedef struct {
     uint8_t phase;
     bool unsavable; /* it refused once */
     bool due;       /* to be replaced at its next reset */
-} Instance; /* of 64 bytes */
+} Instance;
+
+/* Threads that work on neighbours do not write to the same line of the cache. */
+_Static_assert(sizeof(void *) != 8 || sizeof(Instance) == CACHE_LINE, "an instance fills a line");
 
 typedef struct Snapshot {
     struct Snapshot *next; /* in the list of the pool's snapshots */
@@ -106,9 +109,14 @@ typedef struct Snapshot {
     uint32_t *generations;
 } Snapshot;
 
-/* Measured cost of an operation. */
+enum { SAMPLES = 8 };
+
+/* The measured cost of an operation: a low quantile of the last samples. What else the machine does
+ * makes some samples many times too high, and none too low. */
 typedef struct {
-    double mean; /* ns per instance; 0 as long as it is unknown */
+    double low; /* ns per instance; 0 as long as it is unknown */
+    double samples[SAMPLES];
+    uint32_t taken;
     uint32_t calls;
 } Cost;
 
@@ -125,7 +133,8 @@ typedef struct Pool {
     bool open;
     Log log;
     Library *libraries;
-    Instance *instances;
+    Instance *instances; /* in instance_memory, at the beginning of a line of the cache */
+    void *instance_memory;
     double *starts; /* start values of the last initialization, start_width for each instance */
     size_t start_width;
     char *names;

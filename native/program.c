@@ -5,6 +5,34 @@
 
 #include "platform.h"
 
+const char *const operation_names[NUMBER_OF_OPERATIONS] = {
+    [LOAD_OUTPUT] = "output",
+    [LOAD_INPUT] = "input",
+    [LOAD_ACTION] = "action",
+    [LOAD_PARAMETER] = "parameter",
+    [LOAD_STEP_COUNT] = "step_count",
+    [LOAD_CONSTANT] = "constant",
+    [OP_ADD] = "add",
+    [OP_SUBTRACT] = "subtract",
+    [OP_MULTIPLY] = "multiply",
+    [OP_DIVIDE] = "divide",
+    [OP_NEGATIVE] = "negative",
+    [OP_ABSOLUTE] = "absolute",
+    [OP_SQUARE_ROOT] = "square_root",
+    [OP_MINIMUM] = "minimum",
+    [OP_MAXIMUM] = "maximum",
+    [OP_LESS] = "less",
+    [OP_LESS_EQUAL] = "less_equal",
+    [OP_GREATER] = "greater",
+    [OP_GREATER_EQUAL] = "greater_equal",
+    [OP_EQUAL] = "equal",
+    [OP_NOT_EQUAL] = "not_equal",
+    [OP_AND] = "and",
+    [OP_OR] = "or",
+    [OP_NOT] = "not",
+    [OP_WHERE] = "where",
+};
+
 /* Those that are registers. */
 static size_t number_of_operands(uint16_t operation) {
     if (operation <= LOAD_CONSTANT) {

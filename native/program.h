@@ -13,7 +13,8 @@ enum {
     PROGRAM_RESULTS = 16  /* results, at most */
 };
 
-/* In the order of OPERATIONS in fmugym/vector/hooks/program.py. */
+/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order, which is compared when that
+ * is imported. */
 typedef enum {
     LOAD_OUTPUT,
     LOAD_INPUT,
@@ -42,6 +43,8 @@ typedef enum {
     OP_WHERE,
     NUMBER_OF_OPERATIONS
 } Operation;
+
+extern const char *const operation_names[NUMBER_OF_OPERATIONS];
 
 /* Instruction i writes register i. Booleans are 0 and 1. */
 typedef struct {

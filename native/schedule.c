@@ -1,14 +1,16 @@
 #include "schedule.h"
 
+#include <math.h>
 #include <stdlib.h>
 
 #include "entering.h"
 #include "threads.h"
 
-static const double QUICK = 10e3;         /* ns for which others may wait */
-static const double SMALLEST_CHUNK = 2e3; /* ns */
-static const double LARGEST_CHUNK = 50e3; /* ns */
-static const double PARALLEL_FROM = 20e3;
+/* All in ns. */
+static const double QUICK = 10e3;         /* for which others may wait */
+static const double SMALLEST_CHUNK = 2e3;
+static const double LARGEST_CHUNK = 50e3;
+static const double WORTH_A_THREAD = 10e3; /* of work, for which waking another one pays */
 
 enum {
     STACK_VALUES = 512,
@@ -87,17 +89,35 @@ static void work(void *context, size_t begin, size_t end) {
     }
 }
 
+/* The second smallest of the last samples; the smallest while there are few. */
+static double low_quantile(const Cost *cost) {
+    const size_t count = cost->taken < SAMPLES ? cost->taken : SAMPLES;
+    double first = cost->samples[0], second = INFINITY;
+
+    for (size_t i = 1; i < count; i++) {
+        const double sample = cost->samples[i];
+        second = sample < first ? first : sample < second ? sample : second;
+        first = sample < first ? sample : first;
+    }
+    return count < SAMPLES ? first : second;
+}
+
+static void add_sample(Cost *cost, double sample) {
+    cost->samples[cost->taken++ % SAMPLES] = sample;
+    cost->low = low_quantile(cost);
+}
+
 /* The first time an operation is done nothing is known of its cost: item by item, until there is
  * so much work that helpers are worth while. Returns how many items were done. */
 static size_t explore(Task *task, Cost *cost, size_t count) {
     size_t done = 0;
 
     task->measured = true;
-    while (done < count && (double)atomic_get(&task->time) < PARALLEL_FROM) {
+    while (done < count && (double)atomic_get(&task->time) < 2.0 * WORTH_A_THREAD) {
         work(task, done, done + 1);
         done++;
     }
-    cost->mean = (double)(atomic_get(&task->time) + 1) / (double)done;
+    add_sample(cost, (double)(atomic_get(&task->time) + 1) / (double)done);
     return done;
 }
 
@@ -116,26 +136,32 @@ static void work_on_rest(void *context, size_t begin, size_t end) {
     work(rest->task, rest->first + begin, rest->first + end);
 }
 
-static void run(Task *task, double mean, size_t first, size_t count) {
-    const double total = mean * (double)(count - first);
+/* Threads that are worth waking besides the caller's. */
+static size_t number_of_helpers(const Task *task, double total) {
+    const size_t most = task->pool->settings.threads - 1;
+    const size_t wanted = at_least_one(total / WORTH_A_THREAD) - 1;
+
+    return task->call->alone ? 0 : wanted < most ? wanted : most;
+}
+
+static void run(Task *task, double cost, size_t first, size_t count) {
     Rest rest = {task, first};
     const Job job = {
         .work = work_on_rest,
         .context = &rest,
         .count = count - first,
-        .helpers = total < PARALLEL_FROM || task->call->alone ? 0 : task->pool->settings.threads - 1,
-        .smallest = at_least_one(SMALLEST_CHUNK / mean),
-        .largest = at_least_one(LARGEST_CHUNK / mean),
+        .helpers = number_of_helpers(task, cost * (double)(count - first)),
+        .smallest = at_least_one(SMALLEST_CHUNK / cost),
+        .largest = at_least_one(LARGEST_CHUNK / cost),
     };
     threads_run(&job);
 }
 
 static void run_measured(Task *task, Cost *cost, size_t count) {
     task->measured = count >= MANY || ++cost->calls % MEASURE_EVERY == 0;
-    run(task, cost->mean, 0, count);
+    run(task, cost->low, 0, count);
     if (task->measured) {
-        const double mean = (double)atomic_get(&task->time) / (double)count;
-        cost->mean += (mean - cost->mean) / 8.0;
+        add_sample(cost, (double)(atomic_get(&task->time) + 1) / (double)count);
     }
 }
 
@@ -145,10 +171,10 @@ size_t schedule_run(Task *task, size_t count) {
     if (count == 0) {
         return 0;
     }
-    if (cost->mean == 0.0) {
+    if (cost->taken == 0) {
         const size_t done = explore(task, cost, count);
         if (done < count) {
-            run(task, cost->mean, done, count);
+            run(task, cost->low, done, count);
         }
     } else {
         run_measured(task, cost, count);
@@ -157,8 +183,8 @@ size_t schedule_run(Task *task, size_t count) {
 }
 
 bool pool_is_quick(const Pool *pool, int operation) {
-    const double mean = pool->costs[operation].mean;
-    return mean > 0.0 && mean * (double)pool->settings.count < QUICK;
+    const Cost *cost = &pool->costs[operation];
+    return cost->taken > 0 && cost->low * (double)pool->settings.count < QUICK;
 }
 
 size_t schedule_choose(Pool *pool, Mask mask) {

@@ -11,6 +11,7 @@
 
 #include "threads.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "floats.h"
@@ -24,49 +25,70 @@ enum {
     SLOTS = 64, /* jobs at the same time; with more, a caller works alone */
     MOST_RANGES = 16,
     MOST_HELPERS = 255,
+    WHOLE = 16, /* items whose 32-bit values fill a line of the cache */
+    FANOUT = 2, /* helpers that each thread wakes */
     STACK_SIZE = 8 << 20, /* of the main thread on most systems: FMUs may count on it */
     HELPER_SPIN = 20000, /* ns to look for more work before going to sleep */
     CALLER_SPIN = 5000  /* ns to wait for the last chunks before going to sleep */
 };
 
+/* Of a range: epoch << 32 | next item. Each is written by another thread, most of the time. */
 typedef struct {
-    Atomic tickets[MOST_RANGES]; /* epoch << 32 | next item of a range */
-    Atomic ranges;
+    _Alignas(CACHE_LINE) Atomic value;
+} Ticket;
+
+typedef struct {
+    Ticket tickets[MOST_RANGES];
+    _Alignas(CACHE_LINE) Atomic done;
+    _Alignas(CACHE_LINE) Atomic helpers; /* at work in this slot */
+    Atomic woken;                        /* for this job */
+    /* constant from the opening of the tickets until all is done */
+    _Alignas(CACHE_LINE) Atomic ranges;
     Atomic count;
-    Atomic done;
-    Atomic helpers; /* at work in this slot */
-    Atomic limit;   /* of helpers */
+    Atomic limit; /* of helpers */
     Atomic smallest;
     Atomic largest;
-    Atomic waiting; /* whether the caller sleeps */
-    /* constant from the opening of the tickets until all is done */
     Job job;
     Floats floats; /* of the caller */
+    /* while the caller waits for the last chunks */
+    _Alignas(CACHE_LINE) Atomic waiting; /* whether it sleeps */
     Mutex lock;
     Condition finished;
-    char padding[64];
 } Slot;
+
+_Static_assert(sizeof(Ticket) == CACHE_LINE, "a ticket has a line of the cache to itself");
+_Static_assert(offsetof(Slot, helpers) - offsetof(Slot, done) == CACHE_LINE, "so has done");
+_Static_assert(offsetof(Slot, ranges) - offsetof(Slot, helpers) == CACHE_LINE, "so have helpers");
 
 static const uint64_t CLOSED = UINT32_MAX;
 
 static Slot slots[SLOTS];
-static Atomic taken;  /* one bit per slot: in use */
-static Atomic opened; /* one bit per slot: has a job */
-static Atomic sleeping;
+static _Alignas(CACHE_LINE) Atomic taken;  /* one bit per slot: in use */
+static _Alignas(CACHE_LINE) Atomic opened; /* one bit per slot: has a job */
+static _Alignas(CACHE_LINE) Atomic sleeping;
 static Atomic started;
 static Mutex lock; /* of going to sleep and of starting helpers */
 static Condition work_arrived;
+static _Alignas(CACHE_LINE) Atomic jobs;
+static Atomic wakes, chunks;
 
 static size_t next_item(uint64_t ticket) {
     return (size_t)(ticket & UINT32_MAX);
 }
 
-static size_t end_of_range(const Slot *slot, size_t range) {
-    return (size_t)(atomic_get(&slot->count) * (range + 1) / atomic_get(&slot->ranges));
+/* Whole cache lines where there are many items: neighbours write next to each other. */
+static size_t start_of_range(uint64_t count, uint64_t ranges, uint64_t range) {
+    const uint64_t start = count * range / ranges;
+    const bool whole = range < ranges && count / ranges >= 4 * WHOLE;
+    return (size_t)(whole ? start / WHOLE * WHOLE : start);
 }
 
-/* Large chunks first, smaller ones towards the end, so that all finish together. Whole cache lines
- * where chunks are large: neighbours write next to each other. */
+static size_t end_of_range(const Slot *slot, size_t range) {
+    return start_of_range(atomic_get(&slot->count), atomic_get(&slot->ranges), range + 1);
+}
+
+/* Large chunks first, smaller ones towards the end, so that all finish together. Large ones are
+ * multiples of WHOLE, too. */
 static size_t chunk_size(const Slot *slot, size_t left) {
     const size_t smallest = (size_t)atomic_get(&slot->smallest);
     const size_t largest = (size_t)atomic_get(&slot->largest);
@@ -74,9 +96,14 @@ static size_t chunk_size(const Slot *slot, size_t left) {
 
     size = size > largest ? largest : size;
     size = size < smallest ? smallest : size;
-    if (size >= 16) {
-        size = (size + 15) / 16 * 16;
+    if (size >= WHOLE) {
+        size = (size + WHOLE - 1) / WHOLE * WHOLE;
     }
+    return size < left ? size : left;
+}
+
+static size_t smallest_chunk(const Slot *slot, size_t left) {
+    const size_t size = (size_t)atomic_get(&slot->smallest);
     return size < left ? size : left;
 }
 
@@ -88,19 +115,19 @@ static void finish(Slot *slot, size_t size, size_t count) {
     }
 }
 
-/* Takes chunks of a range until there are none. A helper works in the caller's floating-point
+/* Takes chunks of a range until there are none, or only the first one. A helper works in the caller's floating-point
  * environment: the rounding mode and the treatment of denormals must not depend on the thread. epoch is
  * that of the job for which it has been set. */
-static void take_range(Slot *slot, size_t range, bool helper, uint64_t *epoch) {
-    Atomic *place = &slot->tickets[range];
-    uint64_t ticket = atomic_get(place);
+static void take_range(Slot *slot, size_t range, bool helper, bool one, uint64_t *epoch) {
+    Atomic *place = &slot->tickets[range].value;
+    uint64_t ticket = atomic_get(place), taken_here = 0;
 
-    for (;;) {
+    while (!one || taken_here == 0) {
         const size_t begin = next_item(ticket), end = end_of_range(slot, range);
         if (begin >= end) {
-            return;
+            break;
         }
-        const size_t size = chunk_size(slot, end - begin);
+        const size_t size = one ? smallest_chunk(slot, end - begin) : chunk_size(slot, end - begin);
         if (!atomic_replace(place, &ticket, ticket + size)) {
             continue;
         }
@@ -110,8 +137,12 @@ static void take_range(Slot *slot, size_t range, bool helper, uint64_t *epoch) {
         }
         const size_t count = (size_t)atomic_get(&slot->count);
         slot->job.work(slot->job.context, begin, begin + size);
+        taken_here++;
         finish(slot, size, count);
         ticket = atomic_get(place);
+    }
+    if (taken_here > 0) {
+        atomic_add(&chunks, taken_here);
     }
 }
 
@@ -120,7 +151,7 @@ static void take_chunks(Slot *slot, size_t home, bool helper) {
     uint64_t epoch = UINT64_MAX;
 
     for (size_t i = 0; i < ranges; i++) {
-        take_range(slot, (home + i) % ranges, helper, &epoch);
+        take_range(slot, (home + i) % ranges, helper, false, &epoch);
     }
 }
 
@@ -131,7 +162,7 @@ static bool has_work(const Slot *slot) {
         return false;
     }
     for (size_t i = 0; i < atomic_get(&slot->ranges); i++) {
-        if (next_item(atomic_get(&slot->tickets[i])) < end_of_range(slot, i)) {
+        if (next_item(atomic_get(&slot->tickets[i].value)) < end_of_range(slot, i)) {
             return true;
         }
     }
@@ -148,9 +179,27 @@ static Slot *find_work(void) {
     return NULL;
 }
 
+static void wake_one(void) {
+    mutex_lock(&lock);
+    condition_wake_one(&work_arrived);
+    mutex_unlock(&lock);
+    atomic_add(&wakes, 1);
+}
+
+/* Wakes a few of the helpers that a job still lacks. Those wake others in turn. */
+static void wake_some(Slot *slot) {
+    for (int i = 0; i < FANOUT && atomic_get(&sleeping) > 0 && has_work(slot); i++) {
+        if (atomic_add(&slot->woken, 1) >= atomic_get(&slot->limit)) {
+            return;
+        }
+        wake_one();
+    }
+}
+
 /* The caller's range is the first one. */
 static void help(Slot *slot, size_t number) {
     if (atomic_add(&slot->helpers, 1) < atomic_get(&slot->limit)) {
+        wake_some(slot);
         take_chunks(slot, 1 + number, true);
     }
     atomic_add(&slot->helpers, (uint64_t)-1);
@@ -255,17 +304,6 @@ static void start_helpers(size_t wanted) {
     mutex_unlock(&lock);
 }
 
-static void wake_helpers(size_t wanted) {
-    if (atomic_get(&sleeping) == 0) {
-        return;
-    }
-    mutex_lock(&lock);
-    for (size_t i = 0; i < wanted && i < atomic_get(&sleeping); i++) {
-        condition_wake_one(&work_arrived);
-    }
-    mutex_unlock(&lock);
-}
-
 /* The caller */
 
 static Slot *take_slot(void) {
@@ -280,11 +318,11 @@ static Slot *take_slot(void) {
 
 /* The tickets are closed while the rest changes: no late helper may take a chunk meanwhile. */
 static void open_slot(Slot *slot, const Job *job) {
-    const uint64_t epoch = (atomic_get(&slot->tickets[0]) >> 32) + 1;
+    const uint64_t epoch = (atomic_get(&slot->tickets[0].value) >> 32) + 1;
     const size_t ranges = job->helpers < MOST_RANGES ? job->helpers + 1 : MOST_RANGES;
 
     for (size_t i = 0; i < MOST_RANGES; i++) {
-        atomic_set(&slot->tickets[i], epoch << 32 | CLOSED);
+        atomic_set(&slot->tickets[i].value, epoch << 32 | CLOSED);
     }
     slot->job = *job;
     slot->floats = floats_now();
@@ -292,10 +330,12 @@ static void open_slot(Slot *slot, const Job *job) {
     atomic_set(&slot->smallest, job->smallest);
     atomic_set(&slot->largest, job->largest);
     atomic_set(&slot->done, 0);
+    atomic_set(&slot->woken, 0);
     atomic_set(&slot->count, job->count);
     atomic_set(&slot->ranges, ranges);
     for (size_t i = 0; i < ranges; i++) {
-        atomic_set(&slot->tickets[i], epoch << 32 | (job->count * i / ranges));
+        const size_t start = start_of_range(job->count, ranges, i);
+        atomic_set(&slot->tickets[i].value, epoch << 32 | start);
     }
     atomic_or_bits(&opened, (uint64_t)1 << (slot - slots));
 }
@@ -320,7 +360,10 @@ static void wait_for_chunks(Slot *slot, size_t count) {
     mutex_unlock(&slot->lock);
 }
 
+/* Helpers that look for work take part at once. Those that sleep are woken after the first chunk, by
+ * which time there may be nothing left for them. */
 void threads_run(const Job *job) {
+    uint64_t epoch = UINT64_MAX;
     Slot *slot = job->helpers == 0 || job->count < 2 ? NULL : take_slot();
 
     if (slot == NULL) {
@@ -328,13 +371,19 @@ void threads_run(const Job *job) {
         return;
     }
     const uint64_t bit = (uint64_t)1 << (slot - slots);
+    atomic_add(&jobs, 1);
     start_helpers(job->helpers);
     open_slot(slot, job);
-    wake_helpers(job->helpers);
+    take_range(slot, 0, false, true, &epoch);
+    wake_some(slot);
     take_chunks(slot, 0, false);
     atomic_and_bits(&opened, ~bit);
     wait_for_chunks(slot, job->count);
     atomic_and_bits(&taken, ~bit);
+}
+
+ThreadStatistics threads_statistics(void) {
+    return (ThreadStatistics){atomic_get(&jobs), atomic_get(&wakes), atomic_get(&chunks)};
 }
 
 void threads_reset(void) {

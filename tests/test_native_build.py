@@ -1,10 +1,16 @@
 """The C sources compile for every platform without a warning, and without Python."""
 
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from fmugym.pool import has_native_pool
+from fmugym.vector.hooks import program as trace
 
 pytest.importorskip("ziglang")
 
@@ -32,3 +38,59 @@ def test_core_compiles(target, source, tmp_path):
 def test_core_needs_no_python():
     for path in NATIVE.glob("*.[ch]"):
         assert "Python.h" not in path.read_text(encoding="utf-8")
+
+
+def build_without_compiler(folder, **environment):
+    """Build the extension with a compiler that fails."""
+    for name in ("setup.py", "native"):
+        (shutil.copy if name.endswith(".py") else shutil.copytree)(
+            NATIVE.parent / name, folder / name
+        )
+    return subprocess.run(
+        [sys.executable, "setup.py", "-q", "build_ext", "--build-lib", "lib", "--build-temp", "t"],
+        cwd=folder,
+        env=os.environ | {"CC": "false", "FMUGYM_REQUIRE_NATIVE": "0"} | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the compiler of Windows is not chosen by CC")
+def test_a_build_that_fails_is_an_error_only_where_it_is_required(tmp_path):
+    for folder in ("optional", "required"):
+        (tmp_path / folder).mkdir()
+    assert build_without_compiler(tmp_path / "optional").returncode == 0
+    assert build_without_compiler(tmp_path / "required", FMUGYM_REQUIRE_NATIVE="1").returncode != 0
+
+
+def test_free_threaded_python_is_refused(tmp_path):
+    script = "import sysconfig, runpy\n"
+    script += "sysconfig.get_config_vars()['Py_GIL_DISABLED'] = 1\n"
+    script += f"runpy.run_path({str(NATIVE.parent / 'setup.py')!r})"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "free-threaded Python is not supported" in done.stderr
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+def test_the_table_of_operations_is_that_of_the_extension():
+    from fmugym import _native
+
+    trace.require_same_table(_native)
+    assert _native.operations() == trace.OPERATIONS
+
+
+@pytest.mark.parametrize(
+    "stale",
+    [
+        SimpleNamespace(),
+        SimpleNamespace(operations=lambda: trace.OPERATIONS, MOST_INSTRUCTIONS=64),
+        SimpleNamespace(operations=lambda: trace.OPERATIONS[:-1], MOST_INSTRUCTIONS=128),
+        SimpleNamespace(operations=lambda: trace.OPERATIONS[::-1], MOST_INSTRUCTIONS=128),
+    ],
+)
+def test_a_stale_extension_is_refused_with_the_cure(stale):
+    with pytest.raises(ImportError, match="pip install"):
+        trace.require_same_table(stale)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.errors import SimulationError
+from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 
 __all__ = [
@@ -206,9 +206,3 @@ class Pool(ABC):
         """Return what is known of the last step by name, each of shape (N,)."""
         return {}
 
-
-def available_processors() -> int:
-    """The number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -2,6 +2,8 @@
 
 #include "python.h"
 
+#include "threads.h"
+
 PyObject *closed_error;
 
 /* The memory of the echo, which is the process's. */
@@ -20,7 +22,32 @@ static PyObject *echo_to(PyObject *module, PyObject *memory) {
     Py_RETURN_NONE;
 }
 
+static PyObject *operations(PyObject *module, PyObject *unused) {
+    PyObject *names = PyTuple_New(NUMBER_OF_OPERATIONS);
+
+    (void)module;
+    (void)unused;
+    for (int i = 0; names != NULL && i < NUMBER_OF_OPERATIONS; i++) {
+        PyObject *name = decode(operation_names[i]);
+        if (name == NULL || PyTuple_SetItem(names, i, name) < 0) {
+            Py_CLEAR(names);
+        }
+    }
+    return names;
+}
+
+static PyObject *statistics(PyObject *module, PyObject *unused) {
+    const ThreadStatistics s = threads_statistics();
+
+    (void)module;
+    (void)unused;
+    return Py_BuildValue("{sKsKsK}", "jobs", (unsigned long long)s.jobs, "wakes",
+                         (unsigned long long)s.wakes, "chunks", (unsigned long long)s.chunks);
+}
+
 static PyMethodDef functions[] = {
+    {"operations", operations, METH_NOARGS, NULL},
+    {"statistics", statistics, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
     {NULL, NULL, 0, NULL},
 };
@@ -56,7 +83,8 @@ PyMODINIT_FUNC PyInit__native(void) {
     pool_prepare_process();
     if (!find_error() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
-        !add_type(module, &snapshot_type, &snapshot_spec)) {
+        !add_type(module, &snapshot_type, &snapshot_spec) ||
+        PyModule_AddIntConstant(module, "MOST_INSTRUCTIONS", PROGRAM_LENGTH) < 0) {
         Py_DECREF(module);
         return NULL;
     }

@@ -263,21 +263,21 @@ PyObject *py_recycle(PyObject *object, PyObject *unused) {
 }
 
 static void do_copy_costs(PyPool *self, bool alone, void *context) {
-    double *means = context;
+    double *costs = context;
     (void)alone;
     for (int i = 0; i < OPERATIONS; i++) {
-        means[i] = self->pool.costs[i].mean;
+        costs[i] = self->pool.costs[i].low;
     }
 }
 
 PyObject *py_costs(PyObject *object, PyObject *unused) {
-    double means[OPERATIONS];
+    double costs[OPERATIONS];
 
     (void)unused;
-    if (!perform((PyPool *)object, ALWAYS_SHORT, do_copy_costs, means)) {
+    if (!perform((PyPool *)object, ALWAYS_SHORT, do_copy_costs, costs)) {
         return NULL;
     }
-    return Py_BuildValue("(ddd)", means[STEP], means[RESET], means[MIXED]);
+    return Py_BuildValue("(ddd)", costs[STEP], costs[RESET], costs[MIXED]);
 }
 
 PyObject *py_uses_states(PyObject *object, PyObject *unused) {

@@ -6,6 +6,10 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#if defined Py_GIL_DISABLED
+#error "Python without the GIL is not supported: the GIL guards the objects of this extension"
+#endif
+
 #include "buffers.h"
 #include "pool.h"
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray
+from fmugym.pool.extension import has_native_pool
 
 __all__ = [
     "MOST_INSTRUCTIONS",
@@ -57,6 +58,30 @@ OPERATIONS: Final = (
 
 MOST_INSTRUCTIONS: Final = 128
 """The native pool has this many registers."""
+
+
+def require_same_table(native: Any) -> None:
+    """Compare the operations with those that the C extension was built with.
+
+    Args:
+        native: The module ``fmugym._native``.
+
+    Raises:
+        ImportError: If they differ, because the extension was built from other sources.
+    """
+    operations: Any = getattr(native, "operations", tuple)()
+    if (operations, getattr(native, "MOST_INSTRUCTIONS", 0)) != (OPERATIONS, MOST_INSTRUCTIONS):
+        raise ImportError(
+            "the C extension fmugym._native was built from other sources than the Python code of "
+            "fmugym: its table of operations differs. Install fmugym again, in a working copy "
+            "with: pip install --no-deps --editable ."
+        )
+
+
+if has_native_pool():
+    from fmugym import _native
+
+    require_same_table(_native)
 
 
 class UntraceableError(Exception):

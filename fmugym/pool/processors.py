@@ -1,0 +1,84 @@
+"""How many processors this process may use, in a container too."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+__all__ = ["available_processors", "processor_quota"]
+
+
+def available_processors() -> int:
+    """The number of processors that this process may use.
+
+    Counts the processors it may run on, and no more than the CPU quota of its container is worth,
+    rounded up.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        processors = len(os.sched_getaffinity(0))
+    else:
+        processors = os.cpu_count() or 1
+    return max(1, math.ceil(min(processors, processor_quota())))
+
+
+def processor_quota(root: Path = Path("/")) -> float:
+    """The processors that the control groups of this process allow; inf if there is no limit.
+
+    The limits of all groups count that contain the process, for cgroup v1 and v2. Groups that
+    cannot be read count as groups without a limit.
+
+    Args:
+        root: The folder with ``proc`` and ``sys``.
+    """
+    quotas = [math.inf]
+    for controllers, group in _groups(root):
+        quota = _quota_v1 if controllers else _quota_v2
+        quotas.extend(map(quota, _folders(root, controllers, group)))
+    return min(quotas)
+
+
+def _groups(root: Path) -> Iterator[tuple[str, PurePosixPath]]:
+    """The controllers (empty in cgroup v2) and the path of each group that may limit processors."""
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        _, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if not controllers or "cpu" in controllers.split(","):
+            yield controllers, PurePosixPath(path)
+
+
+def _folders(root: Path, controllers: str, group: PurePosixPath) -> Iterator[Path]:
+    """The folders of a group and of those around it.
+
+    In a container only the last one, the folder of all groups, may be there.
+    """
+    top = root / "sys/fs/cgroup" / controllers
+    parts = [part for part in group.parts if part not in ("/", "..")]
+    for count in range(len(parts), -1, -1):
+        yield top.joinpath(*parts[:count])
+
+
+def _quota_v2(folder: Path) -> float:
+    quota, _, period = _read(folder / "cpu.max").partition(" ")
+    return _ratio(quota, period)
+
+
+def _quota_v1(folder: Path) -> float:
+    return _ratio(_read(folder / "cpu.cfs_quota_us"), _read(folder / "cpu.cfs_period_us"))
+
+
+def _ratio(quota: str, period: str) -> float:
+    """What both are worth; no limit if they are not positive numbers, as ``max`` and ``-1``."""
+    try:
+        values = int(quota), int(period)
+    except ValueError:
+        return math.inf
+    return values[0] / values[1] if min(values) > 0 else math.inf
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

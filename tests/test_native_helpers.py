@@ -1,0 +1,152 @@
+"""How the native pool's work is divided among helper threads: shown by counters, not by times."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from test_native_pool import NativePool, busy_fmu, make, on_linux
+from test_native_threads import run_python
+
+from fmugym import pool as pools
+from fmugym.pool.processors import available_processors, processor_quota
+
+needs_native = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
+
+
+COUNT = """
+import json, sys, time
+import numpy as np
+from fmugym import _native
+from test_native_pool import NativePool, make
+
+threads, n, work, rest, rounds = (int(argument) for argument in sys.argv[2:])
+pool = make(NativePool, sys.argv[1], ["work"], ["steps"], n, threads=threads)
+pool.reset((), np.zeros((0, n)))
+inputs = np.full((1, n), float(work))
+for _ in range(20):  # until the cost is known, and all helpers are there
+    pool.step_into(inputs)
+before = _native.statistics()
+for _ in range(rounds):
+    time.sleep(rest / 1e3)  # helpers go to sleep
+    pool.step_into(inputs)
+after = _native.statistics()
+print(json.dumps({name: after[name] - before[name] for name in after}))
+"""
+
+
+@pytest.fixture(scope="module")
+def count(tmp_path_factory):
+    """Count what helpers do in rounds of steps of N instances, some us of work each."""
+    path = busy_fmu(tmp_path_factory.mktemp("busy"))
+
+    def run(threads, n, work, rest=2, rounds=50):
+        numbers = map(str, (threads, n, work, rest, rounds))
+        done = run_python("-c", COUNT, str(path), *numbers)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout) | {"rounds": rounds}
+
+    return run
+
+
+@needs_native
+def test_work_for_one_thread_is_no_job(count):
+    assert count(64, 2, 1)["jobs"] == 0
+
+
+@needs_native
+def test_a_short_job_wakes_few_of_many_helpers(count):
+    """Work of some 20 us is for two or three threads, whatever the number of threads is."""
+    counted = count(64, 12, 1)
+    assert counted["jobs"] == counted["rounds"]
+    assert 0 < counted["wakes"] <= 8 * counted["rounds"]
+
+
+@needs_native
+def test_a_long_job_wakes_no_more_helpers_than_there_are(count):
+    counted = count(3, 100, 20, rounds=20)
+    assert 0 < counted["wakes"] <= 2 * counted["rounds"]
+
+
+@on_linux
+@needs_native
+def test_a_busy_machine_does_not_shrink_chunks(count, monkeypatch):
+    """Samples of the cost that other work has made too high do not count."""
+    quiet = count(2, 400, 1, rest=0, rounds=100)
+    crowd = "import subprocess, sys, time\n"
+    crowd += "[subprocess.Popen([sys.executable, '-c', 'import time\\nend = time.time() + 8\\n"
+    crowd += "while time.time() < end: pass']) for _ in range(4)]\n"
+    monkeypatch.setattr(sys.modules[__name__], "COUNT", crowd + COUNT)
+    loaded = count(2, 400, 1, rest=0, rounds=100)
+    assert loaded["chunks"] < 3 * quiet["chunks"]
+    assert loaded["chunks"] < 400 * loaded["jobs"] / 4
+
+
+@needs_native
+def test_results_do_not_depend_on_where_ranges_begin(tmp_path):
+    """Ranges begin at whole lines of the cache where there are many instances."""
+    path = busy_fmu(tmp_path)
+    for n in (2, 15, 17, 127, 128, 129, 1000, 1025):
+        pool = make(NativePool, path, ["work"], ["steps"], n, threads=4)
+        pool.reset((), np.zeros((0, n)))
+        for number in range(1, 6):
+            pool.step_into(np.full((1, n), 30.0 if n < 200 else 1.0))
+            assert (pool.outputs == number).all()
+        pool.close()
+
+
+class TestQuota:
+    def write(self, root, files):
+        for name, text in files.items():
+            path = root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return root
+
+    @pytest.mark.parametrize(
+        ("files", "expected"),
+        [
+            ({}, np.inf),
+            ({"proc/self/cgroup": "0::/\n"}, np.inf),
+            (
+                {"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": "150000 100000\n"},
+                1.5,
+            ),
+            ({"proc/self/cgroup": "0::/a/b\n", "sys/fs/cgroup/a/cpu.max": "200000 100000"}, 2.0),
+            (
+                {
+                    "proc/self/cgroup": "0::/a/b\n",
+                    "sys/fs/cgroup/a/b/cpu.max": "max 100000",
+                    "sys/fs/cgroup/a/cpu.max": "50000 100000",
+                },
+                0.5,
+            ),
+            (
+                {
+                    "proc/self/cgroup": "12:memory:/x\n5:cpu,cpuacct:/docker/1\n",
+                    "sys/fs/cgroup/cpu,cpuacct/cpu.cfs_quota_us": "300000",
+                    "sys/fs/cgroup/cpu,cpuacct/cpu.cfs_period_us": "100000",
+                },
+                3.0,
+            ),
+            (
+                {
+                    "proc/self/cgroup": "5:cpu:/\n",
+                    "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "-1",
+                    "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000",
+                },
+                np.inf,
+            ),
+            ({"proc/self/cgroup": "0::/../..\n", "sys/fs/cgroup/cpu.max": "1 0"}, np.inf),
+            ({"proc/self/cgroup": "nonsense\n\n:::", "sys/fs/cgroup/cpu.max": "a b c"}, np.inf),
+        ],
+    )
+    def test_of_control_groups(self, tmp_path, files, expected):
+        assert processor_quota(self.write(tmp_path, files)) == expected
+
+    @pytest.mark.parametrize(("quota", "expected"), [(np.inf, 8), (3.0, 3), (1.5, 2), (0.1, 1)])
+    def test_counts_as_processors_do(self, monkeypatch, quota, expected):
+        name = "fmugym.pool.processors."
+        monkeypatch.setattr(name + "processor_quota", lambda: quota)
+        monkeypatch.setattr(name + "os.sched_getaffinity", lambda _: set(range(8)), raising=False)
+        assert available_processors() == expected
