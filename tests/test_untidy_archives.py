@@ -134,6 +134,11 @@ class TestEntries:
     def test_an_entry_for_the_archive_itself(self, make, name):
         runs(make(before=[(name, "")], after=[(name, "")]))
 
+    @pytest.mark.parametrize("name", ["./", ".\\", "resources/"])
+    def test_folders_with_content(self, make, name):
+        """They hung the check of folders once."""
+        runs(make(after=[(name, "content")]))
+
     def test_folders_with_two_entries(self, make):
         folders = [("resources/", ""), ("binaries/", ""), ("resources/", ""), ("binaries", "")]
         runs(make(before=folders, after=folders))

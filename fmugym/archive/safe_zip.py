@@ -128,9 +128,10 @@ class SafeZip:
 
     def _add(self, entry: zipfile.ZipInfo) -> None:
         place = self._place(entry)
-        if not place and not entry.file_size:  # such as "./"
+        is_folder = entry.filename.endswith(("/", "\\")) or not entry.filename
+        if not place and (is_folder or not entry.file_size):  # such as "./"
             return
-        if entry.filename.endswith(("/", "\\")):
+        if is_folder:
             self.folders.add(place)
             return
         self._check_file(entry, place)
@@ -361,10 +362,10 @@ def _escapes(name: str) -> bool:
 
 
 def _folders_above(place: str) -> Iterator[str]:
-    folder = posixpath.dirname(place)
+    folder = place.rpartition("/")[0]
     while folder:
         yield folder
-        folder = posixpath.dirname(folder)
+        folder = folder.rpartition("/")[0]
 
 
 def _link_target(archive: zipfile.ZipFile, place: str, link: zipfile.ZipInfo) -> str:
