@@ -67,17 +67,19 @@ def check_number(
     in_range = minimum <= number <= maximum and (number > 0 or not positive)
     if in_range and (may_be_infinite or math.isfinite(number)):
         return number
-    kind = "a number" if may_be_infinite else "finite"
-    wanted = kind + _range(minimum, maximum, positive)
+    wanted = _range(minimum, maximum, positive, may_be_infinite)
     raise ConfigError(f"{what} must be {wanted}, got {shown(value)}")
 
 
-def _range(minimum: float, maximum: float, positive: bool) -> str:
+def _range(minimum: float, maximum: float, positive: bool, may_be_infinite: bool) -> str:
+    kind = "a number" if may_be_infinite else "finite"
     if maximum < math.inf:
-        return f" and from {minimum:g} to {maximum:g}"
-    if positive or minimum == 0:
-        return " and positive" if positive else " and not negative"
-    return f" and at least {minimum:g}" if minimum > -math.inf else ""
+        return f"{kind} from {minimum:g} to {maximum:g}"
+    if positive:
+        return "positive" if may_be_infinite else "positive and finite"
+    if minimum == 0:
+        return f"{kind} and not negative"
+    return kind if minimum == -math.inf else f"{kind} and at least {minimum:g}"
 
 
 def number_of(what: str, value: Any) -> float:

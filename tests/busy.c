@@ -2,7 +2,14 @@
 
    Reals: 0 "work" (input, us of processor time per step), 1 "steps", 2 "total" (steps of all
    instances where SHARED is defined, else the same as steps), 3 "restore_work" (parameter, us per
-   restored state), 4 "drift" (parameter, added to "offset" by restoring a state), 5 "offset". */
+   restored state), 4 "drift" (parameter, added to "offset" by restoring a state), 5 "offset".
+   Where CRASH_IN_HELPER is defined, a step on any other thread than the main one crashes. */
+
+#if defined CRASH_IN_HELPER
+#define _GNU_SOURCE
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
 
 #include <stdlib.h>
 #include <string.h>
@@ -55,6 +62,11 @@ int fmi2Reset(Busy *me) {
 }
 
 int fmi2DoStep(Busy *me, double time, double step_size, int no_set_state) {
+#if defined CRASH_IN_HELPER
+    if (syscall(SYS_gettid) != getpid()) {
+        *(volatile int *)8 = 1;
+    }
+#endif
     work(me->values[WORK]);
     me->values[STEPS]++;
 #if defined SHARED

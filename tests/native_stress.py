@@ -2,10 +2,10 @@
 
     python tests/native_stress.py SECONDS [SEED] [python]
 
-Threads close pools while others use them, and replace what ``play`` uses while it runs. FMUs log. The
-receiver of their messages raises, and so do signal handlers. The interpreter ends while threads still
-call. With ``python``, one of the FMUs is written in Python and so needs the GIL; the process then
-ends early, because ``pythonfmu`` frees the same memory twice when its library is unloaded.
+Threads close pools while others use them, and replace what ``play`` uses while it runs. FMUs log.
+The receiver of their messages raises, and so do signal handlers. The interpreter ends while threads
+still call. With ``python``, one of the FMUs is written in Python and so needs the GIL. The process
+then skips the unloading of libraries at its end, where ``pythonfmu`` frees the same memory twice.
 
 Prints how often each call came through. The exit status is 0 if all is well. ``sanitize.py`` runs
 this with sanitizers.
@@ -105,8 +105,6 @@ class Subject:
         self.start = tuple(map(fmu.variable, start))
         self.values = np.ones((len(start), self.n))
         self.outputs = tuple(map(fmu.variable, outputs))
-        self.used = np.full(self.n, 4)
-        self.block = np.zeros((self.n, 4, 1))
         self.snapshot = None
         self.reset()
 
@@ -117,7 +115,7 @@ class Subject:
         self.pool.step_own()
 
     def step(self):
-        self.pool.step(np.zeros((len(self.pool.inputs), self.n)), self.mask(), None)
+        self.pool.step_into(np.zeros((len(self.pool.inputs), self.n)), self.mask(), None)
 
     def reset(self):
         values = self.values.copy()
@@ -134,8 +132,8 @@ class Subject:
             self.start,
             (INPUTS, JUDGEMENT),
             (0, 1),
-            self.values,
-            (self.block, self.used, *ends),
+            self.values.copy(),
+            (np.zeros((self.n, 4, 1)), np.full(self.n, 4), *ends),
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
         )
 
@@ -232,47 +230,70 @@ def on_alarm(*_):
     raise KeyboardInterrupt
 
 
-def main():
-    seconds, seed = float(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    with_python = "python" in sys.argv
-    faulthandler.enable()
-    sys.setswitchinterval(1e-4)  # many changes of threads, without waiting for them
-    faulthandler.dump_traceback_later(seconds + PATIENCE, exit=True)
-    sys.unraisablehook = lambda _: counts.update(["unraisable"])
-    folder = tempfile.TemporaryDirectory()
-    ring = Ring(list(recipes(folder.name, with_python)), seed)
-    end = time.monotonic() + seconds
-    trouble, ending = [], threading.Event()
+class Crowd:
+    """Threads that act on a ring.
 
-    def loop(number):
-        rng = np.random.default_rng([seed, number])
+    Those of an odd number stop in time; the others go on to the very end of the interpreter.
+    """
+
+    def __init__(self, ring, seed, end):
+        self.trouble, self.ending = [], threading.Event()
+        self._ring, self._seed, self._end = ring, seed, end
+        self._threads = [
+            threading.Thread(target=self._loop, args=[i], daemon=True) for i in range(THREADS)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def join(self):
+        for thread in self._threads[1::2]:
+            thread.join()
+        self.ending.set()
+
+    def _loop(self, number):
+        rng = np.random.default_rng([self._seed, number])
         try:
-            while True:  # on to the very end of the interpreter
-                ring.act(rng)
-                if number % 2 and time.monotonic() > end:
-                    return
+            while number % 2 == 0 or time.monotonic() < self._end:
+                self._ring.act(rng)
         except BaseException as error:
-            if not ending.is_set():  # temporary files go at the end
-                trouble.append(repr(error))
+            if not self.ending.is_set():  # temporary files go at the end
+                self.trouble.append(repr(error))
 
-    threads = [threading.Thread(target=loop, args=[i], daemon=True) for i in range(THREADS)]
-    for thread in threads:
-        thread.start()
-    signal.signal(signal.SIGALRM, on_alarm)
+
+def act_with_alarms(ring, seed, end):
+    """What the main thread does, as only that handles signals."""
     rng = np.random.default_rng(seed)
+    signal.signal(signal.SIGALRM, on_alarm)
     while time.monotonic() < end:
         with contextlib.suppress(KeyboardInterrupt):
             signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-3, 20e-3)))
             while time.monotonic() < end:
                 ring.act(rng)
     signal.signal(signal.SIGALRM, signal.SIG_IGN)
-    for thread in threads[1::2]:
-        thread.join()
-    ending.set()
-    print(json.dumps(counts), flush=True)
+
+
+def watch(seconds):
+    faulthandler.enable()
+    faulthandler.dump_traceback_later(seconds + PATIENCE, exit=True)
+    sys.unraisablehook = lambda _: counts.update(["unraisable"])
+    sys.setswitchinterval(1e-4)  # many changes of threads, without waiting for them
+
+
+def main():
+    seconds, seed = float(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
+    with_python = "python" in sys.argv
+    watch(seconds)
+    folder = tempfile.TemporaryDirectory()
+    ring = Ring(list(recipes(folder.name, with_python)), seed)
+    end = time.monotonic() + seconds
+    crowd = Crowd(ring, seed, end)
+    act_with_alarms(ring, seed, end)
+    crowd.join()
+    sys.stdout.write(json.dumps(counts) + "\n")
+    sys.stdout.flush()
     missing = {*ACTIONS, "played", "message", "interrupted", "unraisable", "closed"} - {*counts}
-    if missing or trouble:
-        sys.exit(f"never done: {sorted(missing)}; trouble: {trouble}")
+    if missing or crowd.trouble:
+        sys.exit(f"never done: {sorted(missing)}; trouble: {crowd.trouble}")
     if with_python:
         os._exit(0)
 

@@ -270,6 +270,7 @@ static int type_of(int type, const Reference *references, size_t count) {
     }                                                                                              \
     int NAME(Set##suffix)(Probe *me, const Reference *vr, size_t count,                            \
                           const ctype *value COUNTED) {                                            \
+        illegal_calls += me->phase == FAILED;                                                      \
         for (size_t i = 0; i < count; i++) {                                                       \
             if (check(me, type_of(type, vr + i, 1), vr + i, 1) != OK) {                            \
                 return ERROR;                                                                      \

@@ -148,16 +148,37 @@ class TestInfo:
         assert "Findings (" in text
 
     @pytest.mark.parametrize(
-        ("tool", "named"), [("EnergyPlus 23", "EnergyPlus 23"), ("", "the tool")]
+        ("tool", "flag", "named"),
+        [
+            ("Dymola 2024x", "true", "Dymola 2024x"),
+            ("", "true", "the tool that exported it"),
+            ("EnergyPlusToFMU 3.1", "false", "EnergyPlus"),
+            ("Overture 3.0", "false", "Java"),
+            ("Simulink (R2023b)", "true", "MATLAB"),
+            ("Simulink (R2023b)", "false", None),
+            ("Dymola 2024x", "false", None),
+        ],
     )
-    def test_a_tool_that_must_be_installed_is_named(self, info, facts, tmp_path, tool, named):
+    def test_a_tool_that_must_be_installed_is_named(
+        self, info, facts, tmp_path, monkeypatch, tool, flag, named
+    ):
+        monkeypatch.setenv("PATH", str(tmp_path))  # nothing is installed
         edits = {
-            "<CoSimulation ": '<CoSimulation needsExecutionTool="true" ',
+            "<CoSimulation ": f'<CoSimulation needsExecutionTool="{flag}" ',
             'fmiVersion="2.0"': f'fmiVersion="2.0" generationTool="{tool}"',
         }
         path = probe_fmu(tmp_path, 2, edits)
-        assert f": runs here if it is installed: {named}" in info(path)
-        assert named in facts(path)["execution_tool"]
+        end = f": runs here if it is installed: {named}\n" if named else ": runs here\n"
+        assert end in info(path)
+        assert facts(path)["missing_tool"] == named
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="programs of Unix")
+    def test_a_tool_that_is_installed_is_not(self, info, tmp_path, monkeypatch):
+        program = tmp_path / "energyplus"
+        program.touch(0o755)
+        monkeypatch.setenv("PATH", str(tmp_path))
+        edits = {'fmiVersion="2.0"': 'fmiVersion="2.0" generationTool="EnergyPlus 23.1"'}
+        assert ": runs here\n" in info(probe_fmu(tmp_path, 2, edits))
 
     def test_a_library_of_another_processor_does_not_run_here(self, info, facts, tmp_path):
         library = bytearray(read_fmu(probe_fmu(tmp_path))[library_name(2)])

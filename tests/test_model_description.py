@@ -288,7 +288,7 @@ class TestRefused:
     def test_markup_that_would_fill_the_memory(self, tmp_path):
         """Four bytes of an element are a quarter of a kilobyte once they are parsed."""
         path = with_xml(tmp_path, f"<fmiModelDescription>{'<a/>' * 10_000}</fmiModelDescription>")
-        with pytest.raises(FMULoadError, match=r"some 10002 elements.* the limit is 1250; .*max_v"):
+        with pytest.raises(FMULoadError, match=r"some 1000\d elements.* limit is 1250; .*max_v"):
             FMU(path, limits=ArchiveLimits(max_variables=10))
 
     @pytest.mark.parametrize(

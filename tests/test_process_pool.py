@@ -601,7 +601,7 @@ class WorkerThread:
         with contextlib.suppress(OSError):
             self._end.shutdown(socket.SHUT_RDWR)
 
-    def exit_status(self):
+    def exit_status(self, patience):
         self._thread.join()
         self._end.close()
         self._memory.close()

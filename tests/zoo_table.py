@@ -13,6 +13,7 @@ from zoo_tools import CALLS, FAULTS
 
 SETTINGS = ("single", "vector", "process", "process vector")
 _SAME = "the same"
+ANYWHERE = CALLS[1:]
 NOT_FINE = (2, 3, 4, 5, 99, -1)
 """Discard, Error, Fatal, Pending, and two that are none of FMI's."""
 
@@ -30,7 +31,6 @@ HARMS = {
     "": "",
     "open files": "your files are closed",
     "standard streams": "your standard streams are closed",
-    "rounding mode": "your rounding mode changes",
     "working directory": "your working directory changes",
     "environment": "your environment changes",
     "memory": "your memory grows",
@@ -320,7 +320,13 @@ SPECIMENS = (
         Outcome("told", "hello from another thread"),
         fault="log_from_thread",
     ),
-    survives("changes the rounding mode", "rounding mode", fault="round_up"),
+    same("changes the rounding mode, in any call", FINE, fault="round_up", calls=ANYWHERE),
+    same(
+        "lets denormal numbers count as zero, in any call",
+        FINE,
+        fault="flush_denormals",
+        calls=ANYWHERE,
+    ),
     survives("changes the working directory", "working directory", fault="change_directory"),
     survives("changes the environment", "environment", fault="change_environment"),
     survives("closes standard streams", "standard streams", fault="close_standard"),

@@ -25,7 +25,7 @@ CALLS = (
 FAULTS = (
     *("none", "segv", "fpe", "ill", "bus", "abort", "leave", "overflow", "loop", "sleep"),
     *("close_standard", "close_others", "status", "not_a_number", "infinite"),
-    *("print", "print_no_newline", "print_much", "log_from_thread", "round_up"),
+    *("print", "print_no_newline", "print_much", "log_from_thread", "round_up", "flush_denormals"),
     *("change_directory", "change_environment", "leak", "do_nothing"),
     *("fork", "fork_and_crash", "fork_and_loop", "fork_a_twin"),
 )
@@ -291,6 +291,7 @@ class Harm:
             "working directory": os.getcwd(),
             "environment": ctypes.CDLL(None).getenv(b"ZOO"),
             "rounding mode": 1.0 + tiny > 1.0,
+            "denormal numbers": float("4e-324") * 1.0,
             "standard streams": all(map(_is_open, range(3))),
             "open files": _is_open(self._descriptor),
         }

@@ -165,7 +165,7 @@ class FMU(LoadableFMU):
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
         super().__init__(file, read_model_description(self._archive, self.limits), libraries)
-        self._library_place, note = find_library(list(self._archive.files), self.library)
+        self._library_place, note = _find_library(list(self._archive.files), self.library)
         self.findings = (*self._archive.notes, *note, *self.description.findings)
         self._folder: Path | None = None
         self._remove_folder: weakref.finalize[..., FMU] | None = None
@@ -321,7 +321,7 @@ class FMU(LoadableFMU):
             self._remove_folder()
 
 
-def find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:
+def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:
     """Find the library for this platform, which some tools give another name.
 
     Args:

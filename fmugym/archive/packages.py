@@ -1,12 +1,13 @@
-"""Which package has a shared library that an FMU needs."""
+"""Where the libraries and tools come from that an FMU needs."""
 
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-__all__ = ["Source", "describe_missing", "source_of"]
+__all__ = ["Source", "describe_missing", "missing_tool", "source_of"]
 
 
 class Source(NamedTuple):
@@ -67,6 +68,36 @@ _SOURCES: Final[tuple[tuple[str, Source], ...]] = (
     ),
     (r"ld-musl-.*", Source("musl", "", "the FMU was built for Alpine Linux")),
 )
+
+
+_TOOLS: Final = (
+    (r"energyplus", "EnergyPlus", "energyplus"),
+    (r"overture|into-cps|vdmj", "Java", "java"),
+    (r"fmi4j|fmu4j|javafmi", "Java", "java"),
+    (r"matlab|simulink", "MATLAB", "matlab"),
+    (r"scilab|xcos", "Scilab", "scilab"),
+)
+"""Pattern of the generation tool, the tool that such an FMU starts, and its program."""
+
+_START_ALWAYS: Final = {"EnergyPlus", "Java"}
+"""Tools whose FMUs start them without saying so by ``needsExecutionTool``."""
+
+
+def missing_tool(generation_tool: str, needs_execution_tool: bool) -> str | None:
+    """Name the tool that an FMU starts, unless its program is found.
+
+    Args:
+        generation_tool: The tool that made the FMU, the only hint at what it starts.
+        needs_execution_tool: The FMU's flag.
+
+    Returns:
+        The tool, or None if the FMU starts none or its program is in the search path.
+    """
+    for pattern, tool, program in _TOOLS:
+        if re.search(pattern, generation_tool, re.IGNORECASE):
+            needed = needs_execution_tool or tool in _START_ALWAYS
+            return tool if needed and shutil.which(program) is None else None
+    return (generation_tool or "the tool that exported it") if needs_execution_tool else None
 
 
 def source_of(library: str) -> Source:

@@ -25,16 +25,17 @@ _XML: Final = "modelDescription.xml"
 _MARKUP_PER_VARIABLE: Final = 25
 """Elements and attributes that a file may have for each of ``max_variables``."""
 
+_UTF_8_MARK: Final = b"\xef\xbb\xbf"
 _BYTE_ORDER_MARKS: Final = {
-    b"\xef\xbb\xbf": "utf-8-sig",
+    _UTF_8_MARK: "utf-8",
     b"\xff\xfe": "utf-16",
     b"\xfe\xff": "utf-16",
     b"<\0": "utf-16-le",
     b"\0<": "utf-16-be",
 }
-_DECLARATION: Final = re.compile(r"\A<\?xml\s[^>]*\?>")
+_DECLARATION: Final = re.compile(rb"\A(<\?xml\s[^>]*\?>)?")
 _ENCODING: Final = re.compile(rb"""<\?xml[^>]*?\bencoding\s*=\s*["']([^"'>]*)["']""")
-_DEPENDENCIES: Final = re.compile(r"""\sdependencies(Kind)?\s*=\s*("[^"]*"|'[^']*')""")
+_DEPENDENCIES: Final = re.compile(rb"""\sdependencies(Kind)?\s*=\s*("[^"]*"|'[^']*')""")
 _ENCODINGS: Final = re.compile(r"utf-?8|(us-)?ascii|iso-?8859-\d+|(windows-|cp)125\d", re.I)
 """Encodings in which neither ``<`` nor ``=`` can hide. FMI 2.0 and 3.0 ask for UTF-8."""
 
@@ -57,9 +58,9 @@ def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDesc
             FMU.
     """
     name = archive.path.name
-    text = _read_text(archive, limits.max_xml_bytes)
-    _check_text(name, text, limits.max_variables)
-    content = _without_dependencies(text).encode("utf-8", "surrogatepass")
+    content = _read_xml(archive, limits.max_xml_bytes)
+    _check_markup(name, content, limits.max_variables)
+    content = _without_dependencies(content)
     root = _parse(name, content)
     _check_root(name, root, limits.max_variables)
     try:
@@ -72,7 +73,7 @@ def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDesc
         ) from error
 
 
-def _read_text(archive: SafeZip, limit: int) -> str:
+def _read_xml(archive: SafeZip, limit: int) -> bytes:
     if _XML not in archive.files:
         raise FMULoadError(f"{archive.path.name} is not an FMU: it has no {_XML}{_hint(archive)}")
     content = archive.read(_XML, limit)
@@ -80,7 +81,7 @@ def _read_text(archive: SafeZip, limit: int) -> str:
         size = max(len(content), archive.files[_XML].file_size)
         raise over_limit(f"{archive.path.name}: {_XML} has {size} bytes", limit, "max_xml_bytes")
     try:
-        return _decoded(content)
+        return _as_utf_8(content)
     except (UnicodeError, LookupError) as error:
         raise FMULoadError(f"{archive.path.name}: {_XML} is not valid XML: {error}") from None
 
@@ -94,41 +95,58 @@ def _hint(archive: SafeZip) -> str:
     return f", but {inside!r}; pack the files in the folder {folder!r}, not the folder itself"
 
 
-def _decoded(content: bytes) -> str:
-    """Decode the text by its byte order mark or its declaration, and drop the declaration."""
+def _as_utf_8(content: bytes) -> bytes:
+    """Convert the text to UTF-8, with a declaration that says so and is the only one.
+
+    The parsers would find the encoding by themselves, but not all of them the same one.
+    """
+    encoding = _encoding_of(content)
+    if not re.fullmatch("utf-?8", encoding, re.IGNORECASE):
+        content = content.decode(encoding).encode()
+    text = content.removeprefix(_UTF_8_MARK).lstrip()
+    return _DECLARATION.sub(b'<?xml version="1.0" encoding="UTF-8"?>', text, count=1)
+
+
+def _encoding_of(content: bytes) -> str:
+    """The encoding by the byte order mark or else the declaration.
+
+    Raises:
+        LookupError: If markup could hide in it.
+    """
     encoding = next((e for m, e in _BYTE_ORDER_MARKS.items() if content.startswith(m)), None)
     if encoding is None:
         declared = _ENCODING.match(content.lstrip()[:1000])
         encoding = declared[1].decode("ascii", "replace") if declared else "utf-8"
         if not _ENCODINGS.fullmatch(encoding):
             raise LookupError(f"its encoding is {encoding[:40]!r}, expected 'UTF-8'")
-    text = content.decode(encoding).lstrip("\ufeff \t\r\n")
-    return _DECLARATION.sub("", text, count=1)
+    return encoding
 
 
-def _check_text(name: str, text: str, max_variables: int) -> None:
-    if re.search(r"<!\s*DOCTYPE", text, re.IGNORECASE):  # its entities could grow without end
+def _check_markup(name: str, content: bytes, max_variables: int) -> None:
+    if re.search(rb"<!\s*DOCTYPE", content, re.IGNORECASE):  # its entities could grow without end
         raise FMULoadError(f"{name}: {_XML} has a DOCTYPE, which FMI forbids")
-    count, limit = text.count("<") + text.count("="), _MARKUP_PER_VARIABLE * max_variables + 1000
+    count = content.count(b"<") + content.count(b"=")
+    limit = _MARKUP_PER_VARIABLE * max_variables + 1000
     if count > limit:
         found = f"{name}: {_XML} has some {count} elements and attributes"
         raise over_limit(found, limit, "max_variables")
 
 
-def _without_dependencies(text: str) -> str:
+def _without_dependencies(content: bytes) -> bytes:
     """Leave out on what the unknowns depend.
 
     No environment needs it, and FMPy makes millions of objects of a few megabytes of numbers. Line
     breaks stay, since findings have the numbers of lines.
     """
-    start = text.rfind("<ModelStructure")
+    start = content.rfind(b"<ModelStructure")
     if start < 0:
-        return text
-    return text[:start] + _DEPENDENCIES.sub(lambda m: "\n" * m[0].count("\n"), text[start:])
+        return content
+    rest = _DEPENDENCIES.sub(lambda match: b"\n" * match[0].count(b"\n"), content[start:])
+    return content[:start] + rest
 
 
 def _parse(name: str, content: bytes) -> Any:
-    parser = etree.XMLParser(encoding="utf-8", resolve_entities=False, no_network=True)
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         return etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:

@@ -188,7 +188,8 @@ class SafeZip:
 
     def _follow_links(self) -> None:
         """Let each symbolic link stand for the file of the archive that it points to."""
-        targets = {place: self._link_target(place) for place in self._links}
+        with self._opened() as archive:
+            targets = {place: _link_target(archive, place, e) for place, e in self._links.items()}
         for place, entry in self._links.items():
             target = targets[place]
             for _ in range(_MOST_LINKS):
@@ -200,23 +201,17 @@ class SafeZip:
                 )
             self.files[place] = copy.copy(self.files[target])
 
-    def _link_target(self, place: str) -> str:
-        entry = self._links[place]
-        with self._opened() as archive, archive.open(entry) as file:
-            target = os.fsdecode(_read_at_most(cast(BinaryIO, file), _LONGEST_TARGET))
-        return posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
-
     def _check_folders(self) -> None:
         """Find files where a folder has to be, and places that are one place on this system.
 
         Some tools leave out the slash at the end of a folder's name. Such an entry is empty.
         """
-        for folder in _folders_of([*self.files, *(f"{folder}/." for folder in self.folders)]):
-            entry = self.files.get(folder)
-            if entry is not None and entry.file_size:
-                raise self._refusal(entry, "is a file, but other files lie inside of it")
-            if entry is not None:
-                del self.files[folder]
+        for place in [*self.files, *(f"{folder}/" for folder in self.folders)]:
+            for folder in _folders_above(place):
+                entry = self.files.get(folder)
+                if entry is not None and entry.file_size:
+                    raise self._refusal(entry, "is a file, but other files lie inside of it")
+                self.files.pop(folder, None)
         self._check_case()
 
     def _check_case(self) -> None:
@@ -365,15 +360,18 @@ def _escapes(name: str) -> bool:
     return name.startswith("/") or name[1:2] == ":" or ".." in name.split("/")
 
 
-def _folders_of(places: Iterable[str]) -> set[str]:
-    """Find all folders above places; each is looked at once."""
-    folders: set[str] = set()
-    for place in places:
-        folder = posixpath.dirname(place)
-        while folder and folder not in folders:
-            folders.add(folder)
-            folder = posixpath.dirname(folder)
-    return folders
+def _folders_above(place: str) -> Iterator[str]:
+    folder = posixpath.dirname(place)
+    while folder:
+        yield folder
+        folder = posixpath.dirname(folder)
+
+
+def _link_target(archive: zipfile.ZipFile, place: str, link: zipfile.ZipInfo) -> str:
+    """The place that a symbolic link points to, which may be outside of the archive."""
+    with archive.open(link) as file:
+        target = os.fsdecode(_read_at_most(cast(BinaryIO, file), _LONGEST_TARGET))
+    return posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
 
 
 def _quoted(name: str) -> str:

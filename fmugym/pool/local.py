@@ -1,4 +1,4 @@
-"""Pools in the process of the caller: native where the extension was built, else in Python."""
+"""Pools in the caller's process: native if the extension was built, otherwise in Python."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def local_pool(
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        native: Whether to take the native pool; by default where the extension was built.
+        native: Whether to take the native pool; by default, if the extension was built.
         threads: See ``NativePool``; the Python pool has one thread.
         private_libraries: See ``NativePool``; the Python pool has one library.
         first_index: See ``NativePool``.
         counts: See ``NativePool``.
 
     Raises:
-        FMULoadError: If the FMU cannot be loaded or instantiated, or private libraries are not to
-            be had.
+        FMULoadError: If the FMU cannot be loaded or instantiated, or if the Python pool is asked
+            for private libraries.
     """
     if has_native_pool() if native is None else native:
         from fmugym.pool.native import NativePool

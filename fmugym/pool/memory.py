@@ -1,4 +1,4 @@
-"""How much memory this process takes, and how much of it is in use."""
+"""How much memory this process takes, and how much of its heap is in use."""
 
 from __future__ import annotations
 

@@ -167,9 +167,9 @@ class NativePool(CountedPool):
                     "substeps": spec.substeps,
                     "warm_up_steps": spec.warm_up_steps,
                     "retries": spec.fault_retries,
-                    "restores": method is ResetMethod.RESTORE,
+                    "restores": method == ResetMethod.RESTORE,
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
-                    "reloads": method is ResetMethod.LIBRARY,
+                    "reloads": method == ResetMethod.LIBRARY,
                 },
                 variables={
                     "inputs": self._access(spec.inputs),

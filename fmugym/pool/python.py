@@ -1,4 +1,4 @@
-"""The pool in Python: FMPy's functions with buffers made beforehand, one instance after another."""
+"""The pool in Python: it calls FMPy's functions with prepared buffers, instance by instance."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PythonPool(CountedPool):
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        counts: Where to count what is in ``health``, shape (N, HEALTH_COUNTS).
+        counts: Gets the counts of ``health``, shape (N, HEALTH_COUNTS).
 
     Raises:
         FMULoadError: If the FMU cannot be loaded or instantiated.
@@ -48,7 +48,7 @@ class PythonPool(CountedPool):
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
-        # One row an instance, so that the FMU reads and writes this memory without a copy.
+        # One row per instance, so that the FMU reads and writes this memory without a copy.
         input_rows = np.zeros((num_instances, len(spec.inputs)))
         output_rows = np.zeros((num_instances, len(spec.outputs)))
         self.inputs, self.outputs = input_rows.T, output_rows.T

@@ -1,4 +1,4 @@
-"""One place of a pool in Python: an instance with its buffers, replaced when it is past mending."""
+"""One place of a pool in Python: an instance with its buffers, replaced if a reset cannot help."""
 
 from __future__ import annotations
 
@@ -50,7 +50,20 @@ def _is_fine(status: int) -> bool:
 
 
 class Slot:
-    """One place of the pool: its instance, which is replaced when it is past mending."""
+    """One place of the pool: its instance, which is replaced if a reset cannot help.
+
+    Args:
+        library: The FMU's library.
+        spec: What to do at each reset and step.
+        input_row: The inputs of the instance, shape (k_in,).
+        output_row: Its outputs, shape (k,).
+        counts: Its counts, shape (HEALTH_COUNTS,).
+        states: What the pool's instances know about FMU states.
+
+    Attributes:
+        failure: Why the last status was worse than a warning.
+        is_due: Whether the next reset replaces the instance.
+    """
 
     def __init__(
         self,
@@ -68,7 +81,7 @@ class Slot:
         self._spec = spec
         self._input_row, self._output_row = input_row, output_row
         self._step_size = spec.communication_step_size
-        self._restores = library.can_save_state and spec.reset_method is ResetMethod.RESTORE
+        self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
         self._build()
 
     def _build(self) -> None:
@@ -104,7 +117,7 @@ class Slot:
         return self._read_outputs(Status.OK)
 
     def count_steps(self) -> None:
-        """Let the counts have all steps until now."""
+        """Add the steps until now to the counts."""
         self._counts[Column.STEPS] += self._count - self._counted
         self._counted = self._count
 
@@ -127,7 +140,7 @@ class Slot:
             return False
         try:
             self._instance.restore_state(self._saved)
-        except SimulationError:  # a reset and an initialization may still do
+        except SimulationError:  # a reset and an initialization may still work
             self._saved = None
         return self._saved is not None
 
@@ -151,7 +164,7 @@ class Slot:
         self._warm_up()
 
     def _return_to_instantiated(self) -> None:
-        """Reset the instance, or replace it where it refuses or is past any reset."""
+        """Reset the instance, or replace it if it refuses or must not be reset."""
         if self._instance.phase is Phase.INSTANTIATED:
             return
         try:
@@ -181,9 +194,9 @@ class Slot:
                 raise SimulationError(f"the warm-up failed: {self.failure}")
 
     def step(self) -> int:
-        """Set the inputs, step, get the outputs."""
+        """Set the inputs, step, and get the outputs; returns the status."""
         if self._instance.phase is not _STEPPING:
-            return self._failed("a step was asked for before a reset has mended the instance")
+            return self._failed("the instance needs a reset before it can be stepped")
         inputs = self._input_row.tolist()
         if not _all_finite(inputs):
             return self._not_finite("inputs", self._spec.inputs, inputs)
@@ -196,7 +209,7 @@ class Slot:
         if status and not _is_fine(status) and status != Status.TERMINATED:
             return status
         result = self._read_outputs(status)
-        if result > _WARNING and result != Status.NOT_FINITE:  # the step may have been the last
+        if result > _WARNING and result != Status.NOT_FINITE:  # this may have been the last step
             self._instance.forbid_steps()
         return result
 
@@ -214,7 +227,10 @@ class Slot:
         return status
 
     def _step_with_retries(self, time: float, step_size: float) -> int:
-        """Each try begins at the state before the first: from a discarded step none may go on."""
+        """Repeat a discarded step as smaller ones.
+
+        Each attempt begins at the state before the first one: no step may follow a discarded one.
+        """
         instance = self._instance
         try:
             before = instance.save_state()
@@ -240,7 +256,7 @@ class Slot:
         return status
 
     def _read_outputs(self, status: int) -> int:
-        """Read into the row; what is not finite is replaced by what was there before."""
+        """Read the outputs into the row; if any is not finite, keep the last good ones."""
         got = self._outputs.get()
         if got and not _is_fine(got):
             return self._failed_call("reading the outputs", got)
@@ -272,7 +288,7 @@ class Slot:
         return Snapshot(self._instance, self._instance.save_state(), self._count)
 
     def require_own(self, snapshot: Snapshot) -> None:
-        """Refuse a state of another instance, which FMUs accept silently."""
+        """Refuse a state of another instance, since FMUs accept it silently."""
         if snapshot.instance is not self._instance:
             raise SimulationError("the snapshot is of another instance than this one")
 
@@ -289,7 +305,7 @@ class Slot:
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""
         if not self._instance.can_read:
-            raise SimulationError("nothing can be read before a reset has mended the instance")
+            raise SimulationError("the instance needs a reset before anything can be read")
         access = Access(self._instance, variables)
         self._instance.check("reading variables", access.get())
         return access.values

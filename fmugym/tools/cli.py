@@ -24,7 +24,7 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
   with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``
-- ``execution_tool``: the tool that must be installed; null if the FMU needs none
+- ``missing_tool``: the tool that must be installed as well; null if none is known to be missing
 - ``trial``: what the first meeting on this machine has shown: ``deterministic``, the grades of
   ``resets`` by method, the ``reset_method``, what ``several_instances`` need, ``isolate``, and the
   ``deaths`` of workers; null before

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
-from fmugym.archive.packages import source_of
+from fmugym.archive.packages import missing_tool, source_of
 from fmugym.errors import FMULoadError, printable
 from fmugym.trial.trial import known_verdict
 
@@ -66,7 +66,9 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         "runs_here": fmu.runs_here,
         "obstacles": list(fmu.obstacles),
         "missing_libraries": [_library_row(name) for name in _missing_libraries(fmu)],
-        "execution_tool": _execution_tool(fmu),
+        "missing_tool": missing_tool(
+            description.generation_tool, description.capabilities.needs_execution_tool
+        ),
         "capabilities": asdict(description.capabilities),
         "default_experiment": {name: getattr(description, name) for name in _TIMES},
         "fixed_internal_step_size": description.fixed_internal_step_size,
@@ -101,13 +103,6 @@ def _missing_libraries(fmu: FMU) -> tuple[str, ...]:
 
 def _library_row(name: str) -> dict[str, str]:
     return {"name": name, **source_of(name)._asdict()}
-
-
-def _execution_tool(fmu: FMU) -> str | None:
-    """Name the tool that must be installed; the generation tool is the only hint at it."""
-    if not fmu.description.capabilities.needs_execution_tool:
-        return None
-    return fmu.description.generation_tool or "the tool that exported it"
 
 
 _TEXTS: Final = (
@@ -211,7 +206,7 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _this_machine(facts: Mapping[str, Any]) -> str:
-    platform, tool = facts["platform"], facts["execution_tool"]
+    platform, tool = facts["platform"], facts["missing_tool"]
     if not facts["runs_here"]:
         return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
     return f"{platform}: runs here" + (f" if it is installed: {tool}" if tool else "")

@@ -11,6 +11,9 @@
 #include <string.h>
 #include <time.h>
 #include <unistd.h>
+#if defined __x86_64__
+#include <xmmintrin.h>
+#endif
 
 enum { LEAKED_BYTES = 4 << 20, PAGE = 4096, LINES = 20000, MESSAGES = 200, DESCRIPTORS = 200,
        SECONDS = 30 };
@@ -151,6 +154,17 @@ static void die(int fault) {
     }
 }
 
+/* As code does that was compiled with -ffast-math, when its library is loaded. */
+static void flush_denormals(void) {
+#if defined __x86_64__
+    _mm_setcsr(_mm_getcsr() | 0x8040);
+#elif defined __aarch64__
+    unsigned long control;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(control));
+    __asm__ volatile("msr fpcr, %0" : : "r"(control | 1ul << 24));
+#endif
+}
+
 /* Faults that the process survives; a call returns what this does. */
 static int misbehave(Animal *me, int fault) {
     switch (fault) {
@@ -183,6 +197,9 @@ static int misbehave(Animal *me, int fault) {
         break;
     case ROUND_UP:
         fesetround(FE_UPWARD);
+        break;
+    case FLUSH_DENORMALS:
+        flush_denormals();
         break;
     case CHANGE_DIRECTORY:
         return chdir("/") == 0 ? OK : ERROR;

@@ -1,8 +1,8 @@
 """Messages between the pool of processes and one of its workers, over a pair of sockets.
 
-A message is one byte, its code, or a code and a pickled object. The step of a trivial FMU takes a
-microsecond, so that the most frequent messages are bare codes. Both ends trust each other: they run
-the same program of the same user.
+A message is a code of one byte, or a code and a pickled object. The step of a trivial FMU takes a
+microsecond, so the most frequent messages are bare codes. Both ends trust each other, because they
+run the same program of the same user.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ __all__ = ["Channel", "Code"]
 _LENGTH: Final = struct.Struct("<Q")
 
 _LOOKS: Final = 60
-"""How often a process looks before it goes to sleep; all looks together take some 40 us."""
+"""How often a process looks before it goes to sleep; all looks take about 40 us."""
 
 _LONGEST_WAIT: Final = 1e6
 """Seconds of one wait: ``poll`` takes at most 2**31 ms."""
 
 _AT_ONCE: Final = getattr(socket, "MSG_DONTWAIT", 0)
-"""Lets a call fail that would have to wait."""
+"""Makes a call fail instead of waiting."""
 
 _give_way: Final = getattr(os, "sched_yield", lambda: time.sleep(0.0))
 
 
 class Code:
-    """The codes; those of replies have capital letters."""
+    """The codes. Those of replies are capital letters."""
 
     STEP = b"s"
     """Step all instances."""
     STEP_SOME = b"k"
-    """Step all instances but those in the mask."""
+    """Step all instances except those in the mask."""
     REQUEST = b"r"
-    """Call a method of the worker; with its name and arguments."""
+    """Call a method of the worker. The object is its name and arguments."""
     RELEASE = b"f"
-    """Free snapshots; with their numbers. There is no reply."""
+    """Free snapshots. The object is their numbers. There is no reply."""
 
     FINE = b"F"
     """The step was done, and no status is worse than a warning."""
     TROUBLE = b"T"
-    """The step was done, and the statuses tell what is wrong."""
+    """The step was done, and some statuses are worse than a warning."""
     RESULT = b"R"
-    """With what the method returned."""
+    """The object is what the method returned."""
     ERROR = b"E"
-    """With what it raised."""
+    """The object is what the method raised."""
     LOG = b"L"
-    """A message of the FMU, with its level; comes at any time."""
+    """The object is a message of the FMU and its level. It may come at any time."""
 
 
 class Channel:
@@ -119,7 +119,7 @@ class Channel:
         return self._receive(1, _AT_ONCE)
 
     def send_object(self, code: bytes, content: Any) -> None:
-        """Send a code and an object; what several threads send does not mix."""
+        """Send a code and an object; messages of several threads do not mix."""
         data = pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
         with self._lock:
             self._send_all(b"".join((code, _LENGTH.pack(len(data)), data)))
@@ -141,7 +141,7 @@ class Channel:
         """Receive the object that follows a code.
 
         Raises:
-            EOFError: If the other end is gone before all of it has come.
+            EOFError: If the other end is gone before the whole object has come.
         """
         (length,) = _LENGTH.unpack(self._receive_exactly(_LENGTH.size))
         return pickle.loads(self._receive_exactly(length))
@@ -168,10 +168,10 @@ class Channel:
                 has_ended = self._has_ended()
 
     def require_open(self) -> None:
-        """Make sure that nobody has closed this end behind our back, as an FMU may.
+        """Make sure that this end is open: an FMU may have closed its descriptor.
 
         Raises:
-            OSError: If somebody has.
+            OSError: If it is closed.
         """
         os.fstat(self._descriptor)
 
@@ -181,7 +181,7 @@ class Channel:
 
 
 def _poller(*descriptors: int | None) -> Callable[[float | None], Any]:
-    """Make a function that waits for one of several to be readable, at most for some ms."""
+    """Make a function that waits until one descriptor is readable, at most for some ms."""
     known = [descriptor for descriptor in descriptors if descriptor is not None]
     if not hasattr(select, "poll"):
         return lambda ms: select.select(known, [], [], None if ms is None else 1e-3 * ms)[0]

@@ -41,7 +41,7 @@ class Crew:
 
     Attributes:
         supervisors: One for each worker, in the order of the instances.
-        lost: Which instances have no process or were not reset since it started, shape (N,).
+        lost: Which instances have no process, or were not reset since it started, shape (N,).
         any_lost: Whether there are any.
         able: The supervisors of blocks that are not wholly lost.
         refusal: Why nothing can be done any more; empty before.
@@ -96,14 +96,14 @@ class Crew:
 
         Args:
             doing: What they do, for the cause of deaths.
-            supervisors: Theirs.
-            tell: Tells one.
+            supervisors: The supervisors of these workers.
+            tell: Sends the request to a worker.
 
         Returns:
-            What the living ones reply. The instances of the others are lost.
+            The replies of the workers that live. The instances of the others are lost.
 
         Raises:
-            SimulationError: If a worker raises it, or the pool is closed.
+            SimulationError: If a worker reports an error, or the pool is closed.
         """
         if self.refusal:
             raise SimulationError(self.refusal)
@@ -124,7 +124,7 @@ class Crew:
         return replies
 
     def _lose(self, supervisor: Supervisor) -> None:
-        """Note the loss of a block, and start its next worker before anybody waits for it."""
+        """Note the loss of a block, and start its next worker before it is needed."""
         block, arrays = supervisor.block, self._arrays
         arrays.counts[block, Column.DEATHS] += 1
         self.lost[block] = True
@@ -141,17 +141,17 @@ class Crew:
         self.note_lost()
 
     def note_lost(self) -> None:
-        """Take notice of a change of ``lost``."""
+        """Update what depends on ``lost``."""
         self.any_lost = bool(self.lost.any())
         self.able = [s for s in self.supervisors if not self.lost[s.block].all()]
         self._arrays.statuses[self.lost] = Status.FATAL
 
     def revive(self, supervisors: Iterable[Supervisor]) -> list[Supervisor]:
-        """Start the workers that are missing; returns the supervisors that have one then."""
+        """Start missing workers; returns the supervisors that have a worker now."""
         return [supervisor for supervisor in supervisors if _is_revived(supervisor)]
 
     def retire(self, supervisor: Supervisor, reason: str) -> None:
-        """Replace a worker that has done no wrong; its instances are lost until their reset."""
+        """End a worker that has not failed; its instances are lost until their reset."""
         block = supervisor.block
         supervisor.retire(reason, self._deadline())
         self.lost[block] = True
@@ -171,7 +171,7 @@ class Crew:
         self._close()
 
     def forget(self) -> None:
-        """Let go of the workers: this process is a fork of the one that they belong to."""
+        """Let go of the workers, because this process is a fork of the one that started them."""
         self.refusal = "the pool belongs to the process that this one was forked from"
         self._close.detach()
         for supervisor in self.supervisors:

@@ -1,9 +1,8 @@
 """A process that has everything imported and forks a worker within milliseconds.
 
-It is started with an interpreter of its own: a fork of the user's process would copy its threads'
-locks, and a worker should not run the user's program again, as those of ``multiprocessing`` do. It
-ends as soon as its parent does, whatever the reason. Then it ends the workers and removes the
-folders they worked in.
+It has an interpreter of its own. A fork of the user's process would copy the locks of its threads,
+and a spawned worker of ``multiprocessing`` would run the user's program again. The server ends as
+soon as its parent does, whatever the reason. Then it ends the workers and removes their folders.
 
 Each request comes with a socket, the worker's lifeline. The server answers through it with the
 worker's process number, and with its exit status when it has ended. The parent shuts the lifeline
@@ -32,21 +31,21 @@ from fmugym.pool.process.worker import run_worker
 __all__ = ["ANSWER", "LARGEST_REQUEST", "main"]
 
 LARGEST_REQUEST: Final = 65536
-"""In bytes; it is sent and received as a whole."""
+"""In bytes. A request is sent and received as a whole."""
 
 ANSWER: Final = struct.Struct("<q")
-"""A process number, or minus an error number; and an exit status, negative for a signal."""
+"""First the process number or minus an error number, then the exit status, negative for signals."""
 
 _PR_SET_PDEATHSIG: Final = 1
 _DESCRIPTORS: Final = 3
-"""Those of a request: the lifeline, the channel and the memory."""
+"""The descriptors of a request: the lifeline, the channel and the memory."""
 
 
 def main(descriptor: int, parent: int) -> NoReturn:
     """Serve the parent until it ends.
 
     Args:
-        descriptor: Of the socket from which requests come.
+        descriptor: The file descriptor of the socket from which requests come.
         parent: The parent's process number.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -73,7 +72,7 @@ class _Worker(NamedTuple):
 
     def kill(self) -> None:
         _kill_group(self.pid)
-        os.kill(self.pid, signal.SIGKILL)  # it leads no group before it has begun
+        os.kill(self.pid, signal.SIGKILL)  # a new process leads no group yet
 
 
 class _Server:
@@ -95,7 +94,7 @@ class _Server:
         self._poll.register(self._ended, select.POLLIN)
 
     def serve(self) -> None:
-        """Do what is asked for until the parent ends."""
+        """Answer requests until the parent ends."""
         while True:
             # One event at a time: what comes next may concern a descriptor that this one closes.
             descriptor, _ = self._poll.poll()[0]
@@ -113,13 +112,13 @@ class _Server:
             return False
         if len(descriptors) == _DESCRIPTORS:
             self._start(*pickle.loads(data), *descriptors)
-        else:  # out of descriptors: the parent finds the lifeline cut
+        else:  # no descriptors are left: the parent finds that the lifeline is cut
             for descriptor in descriptors:
                 os.close(descriptor)
         return True
 
     def _start(self, folder: str, size: int, lifeline: int, channel: int, memory: int) -> None:
-        """Fork a worker and tell its process number."""
+        """Fork a worker and send its process number."""
         answers = socket.socket(fileno=lifeline)
         server = os.getpid()
         try:
@@ -144,14 +143,14 @@ class _Server:
         try:
             self._let_go()
             memory.close()
-            os.setpgid(0, 0)  # a session would have a share of the processor time of its own
+            os.setpgid(0, 0)  # not a session: Linux schedules each by itself
             if _end_with_parent(server):
                 status = run_worker(socket.socket(fileno=channel), memory)
         finally:
             os._exit(status)
 
     def _let_go(self) -> None:
-        """Close what belongs to the server: this process is a fork of it."""
+        """Close what belongs to the server, as a fork of it."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         self._requests.close()
@@ -162,12 +161,12 @@ class _Server:
                 os.close(descriptor)
 
     def _kill(self, descriptor: int) -> None:
-        """The parent does not want a worker any more; its end will be told like any other."""
+        """Kill a worker that the parent has given up; its end is reported like any other."""
         self._poll.unregister(descriptor)
         self._workers[descriptor].kill()
 
     def _bury(self) -> None:
-        """Tell the exit status of each worker that has ended."""
+        """Report the exit status of each worker that has ended."""
         with contextlib.suppress(BlockingIOError):
             os.read(self._ended, 4096)
         with contextlib.suppress(ChildProcessError):
@@ -185,7 +184,7 @@ class _Server:
                 worker.lifeline.close()
 
     def clean_up(self) -> None:
-        """End all workers and remove what they leave."""
+        """End all workers and remove their folders."""
         for worker in self._workers.values():
             worker.kill()
         for folder in self._folders:
@@ -198,7 +197,7 @@ def _send(lifeline: socket.socket, answer: int) -> None:
 
 
 def _end_with_parent(parent: int) -> bool:
-    """Let the system end this process with its parent; returns whether that still lives."""
+    """Let the system end this process with its parent; returns whether the parent still lives."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent

@@ -1,4 +1,4 @@
-"""What is left of a process that died: why, and what it last said."""
+"""Why a process died, and what it said last."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def describe_exit(return_code: int) -> str:
 
 
 class OutputTail:
-    """Reads a pipe to its end on a thread and keeps the last lines, however much there is.
+    """Reads a pipe to its end on a thread, and keeps only the last lines.
 
     Args:
-        pipe: The reading end; closed at its end.
+        pipe: The reading end. It is closed when everything has been read.
     """
 
     def __init__(self, pipe: BinaryIO) -> None:
@@ -59,8 +59,8 @@ class OutputTail:
         """The last lines, made printable, once the pipe has ended.
 
         Args:
-            timeout: Seconds to wait for the end; a process that the dead one started may keep the
-                pipe open.
+            timeout: Seconds to wait for the end. A process that the dead one has started may keep
+                the pipe open.
         """
         self._thread.join(timeout)
         return [printable(line.decode(errors="replace").strip()) for line in tuple(self._lines)]

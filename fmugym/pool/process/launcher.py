@@ -1,4 +1,4 @@
-"""How the processes of workers are started: by a fork server, or by spawning where none can be."""
+"""Starts the processes of workers: with a fork server, or by spawning where there is none."""
 
 from __future__ import annotations
 
@@ -17,17 +17,13 @@ import threading
 import weakref
 from multiprocessing.reduction import DupFd
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 from fmugym.pool.process.fork_server import ANSWER
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
 __all__ = ["Process", "launch"]
-
-
-_PATIENCE: Final = 0.05
-"""How long a worker that has closed its channel may take to end, in seconds."""
 
 
 class Process(Protocol):
@@ -43,15 +39,15 @@ class Process(Protocol):
     sentinel: int | None
 
     def kill(self) -> None:
-        """End it at once, whatever it does."""
+        """End the process at once, whatever it does."""
         ...
 
-    def exit_status(self) -> int | None:
-        """The exit status, negative for a signal; None if it has not ended after a moment."""
+    def exit_status(self, patience: float) -> int | None:
+        """Return the exit status, negative for a signal; None if it has not ended in time."""
         ...
 
     def forget(self) -> None:
-        """Let go of it, without a word to it."""
+        """Close what belongs to the process in this one, without ending it."""
         ...
 
 
@@ -59,9 +55,9 @@ def launch(end: socket.socket, memory: Memory, folder: Path) -> Process:
     """Start a worker.
 
     Args:
-        end: Its end of the channel; it may be closed afterwards.
-        memory: Shared with it.
-        folder: Where its FMU was extracted to; removed should this process be killed.
+        end: The worker's end of the channel. The caller may close it afterwards.
+        memory: Shared with the worker.
+        folder: Where its FMU was extracted to. It is removed if this process is killed.
 
     Raises:
         OSError: If the system refuses.
@@ -72,7 +68,7 @@ def launch(end: socket.socket, memory: Memory, folder: Path) -> Process:
 
 
 class _ForkServer:
-    """This end of ``fmugym.pool.process.fork_server``, of which one process has one."""
+    """This end of ``fmugym.pool.process.fork_server``; a process has at most one server."""
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
@@ -80,12 +76,12 @@ class _ForkServer:
             process = _run_fork_server(theirs)
             self._requests = ours.detach()  # a socket would complain at the interpreter's end
         self.pid = process.pid
-        process.returncode = 0  # for Popen, it may outlive this object
+        process.returncode = 0  # or else Popen would complain that it still runs
         self._stop = weakref.finalize(self, _stop, self._requests, self.pid)
-        self._stop.atexit = False  # pools may still want to end their workers in order then
+        self._stop.atexit = False  # pools may still have to close their workers then
 
     def start(self, folder: Path, size: int, descriptors: tuple[int, int]) -> _ForkedProcess:
-        """Start a worker; each has a lifeline of its own, so that threads do not mix.
+        """Start a worker with a lifeline of its own, so that threads do not mix.
 
         Raises:
             EOFError: If the server has ended.
@@ -102,7 +98,7 @@ class _ForkServer:
             raise
 
     def forget(self) -> None:
-        """Let go of the server: this process is a fork of the one that it belongs to."""
+        """Let go of the server, because this process is a fork of the one that started it."""
         self._stop.detach()
         os.close(self._requests)
 
@@ -137,13 +133,13 @@ _making = threading.Lock()
 
 
 def _fork_server() -> _ForkServer:
-    """The server of this process, whichever of its threads asks first."""
+    """Return the server of this process; several threads may ask at the same time."""
     with _making:
         return _cached_fork_server()
 
 
 def _start(folder: Path, size: int, descriptors: tuple[int, int]) -> _ForkedProcess:
-    """Start a worker by the fork server, or by a new one if somebody has ended it."""
+    """Start a worker with the fork server, or with a new one if the old one has ended."""
     try:
         return _fork_server().start(folder, size, descriptors)
     except (EOFError, BrokenPipeError, ConnectionResetError):
@@ -170,7 +166,7 @@ class _ForkedProcess:
     """A worker of the fork server.
 
     Args:
-        lifeline: Tells its number and its exit status; closed with it.
+        lifeline: Gives the process number and the exit status. It is closed with the process.
 
     Raises:
         EOFError: If the server has ended.
@@ -198,10 +194,10 @@ class _ForkedProcess:
         with contextlib.suppress(OSError):  # the fork server has ended, and it has with it
             self._lifeline.shutdown(socket.SHUT_WR)
 
-    def exit_status(self) -> int | None:
+    def exit_status(self, patience: float) -> int | None:
         poll = select.poll()
         poll.register(self._lifeline, select.POLLIN)
-        if not poll.poll(1e3 * _PATIENCE):
+        if not poll.poll(1e3 * patience):
             return None
         status = self._answer()
         self.forget()
@@ -227,12 +223,12 @@ class _SpawnedProcess:
     def kill(self) -> None:
         self._process.kill()
 
-    def exit_status(self) -> int | None:
-        self._process.join(_PATIENCE)
+    def exit_status(self, patience: float) -> int | None:
+        self._process.join(patience)
         return self._process.exitcode
 
     def forget(self) -> None:
-        """Do nothing: ``multiprocessing`` itself forgets processes of another process."""
+        """Do nothing: ``multiprocessing`` itself forgets the processes of another process."""
 
 
 def _run_spawned(end: socket.socket, size: int, shared: Any) -> None:

@@ -1,4 +1,4 @@
-"""The pool of processes: whatever an FMU does to its process, it is not this one.
+"""The pool of processes: an FMU may harm its own process, but not the caller's.
 
 Each worker process has a block of the instances in a pool of its own (``NativePool`` or
 ``PythonPool``) and shares its inputs and outputs through memory. A worker that dies or hangs is
@@ -106,12 +106,12 @@ class ProcessPool(CountedPool):
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``; a worker that dies of it is replaced, and has a second try."""
+        """See ``Pool.reset``; if a worker dies in it, a new worker tries again."""
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
             concerned = self._crew.of_any(mask)
-            if self._spec.reset_method is ResetMethod.PROCESS:
+            if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
             self._retire_grown(concerned, mask)
             for _ in range(2):
@@ -131,7 +131,7 @@ class ProcessPool(CountedPool):
         values: FloatArray,
         mask: MaskArray,
     ) -> list[Supervisor]:
-        """Reset blocks; returns those that could be reset by a new worker."""
+        """Reset blocks; returns those that lost a used worker, since a new one may succeed."""
         number = self._numbers.setdefault(variables, len(self._numbers))
         used = [s for s in supervisors if not s.is_new]
         alive = self._crew.revive(supervisors)
@@ -228,7 +228,7 @@ class ProcessPool(CountedPool):
     def restore(
         self, snapshot: _Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.restore``; a state goes with the process that it was saved in."""
+        """See ``Pool.restore``; a state is lost with the process that saved it."""
         mask = self._as_mask(mask)
         parts = snapshot.parts if isinstance(snapshot, _Snapshot) else {}
         if parts.keys() != set(self._crew.supervisors):
@@ -260,7 +260,7 @@ class ProcessPool(CountedPool):
             return supervisor.reason
 
     def _count_steps(self) -> None:
-        """A worker that dies does not tell of its last episode's steps."""
+        """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
         with self._lock:
             if not self._crew.refusal:
                 self._crew.run("a question", self._crew.able, lambda s: s.tell("count_steps"))
@@ -287,7 +287,7 @@ class ProcessPool(CountedPool):
             self._crew.close()
 
     def processes(self) -> list[int]:
-        """The process numbers of the workers; 0 where one was given up."""
+        """Return the process numbers of the workers; 0 for a worker that was given up."""
         return [supervisor.pid for supervisor in self._crew.supervisors]
 
     def _require_present(self, mask: MaskArray | None = None) -> None:

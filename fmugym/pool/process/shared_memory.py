@@ -1,7 +1,7 @@
 """Arrays that several processes share, in memory without a name.
 
-Memory that has no name in the file system goes with the last process that uses it, however that
-one ends: there is nothing to be unlinked and nothing that could be left behind.
+Memory without a name in the file system is freed with the last process that uses it, however that
+process ends. Nothing has to be unlinked, and nothing can be left behind.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from fmugym.pool.health import HEALTH_COUNTS, HealthArray
 __all__ = ["Arrays", "Memory", "make_arrays", "make_echo", "size_for"]
 
 _ALIGNMENT: Final = 64
-"""Of each array, in bytes: a cache line."""
+"""The alignment of each array, in bytes: a cache line."""
 
 
 _ECHO_SIZE: Final = 4096
-"""Bytes for what the FMUs of a worker said last."""
+"""Bytes for the last words of a worker's FMUs."""
 
 
 class Arrays(NamedTuple):
@@ -46,7 +46,7 @@ class Arrays(NamedTuple):
     counts: HealthArray
 
     def block(self, columns: slice) -> Arrays:
-        """The parts of some of the instances."""
+        """Return the parts that belong to some of the instances."""
         return Arrays(
             self.inputs[:, columns],
             self.outputs[:, columns],
@@ -78,12 +78,12 @@ def _size_of_arrays(spec: PoolSpec, count: int) -> int:
 
 
 def size_for(spec: PoolSpec, count: int, workers: int) -> int:
-    """Bytes that a pool of ``count`` instances needs."""
+    """Return the bytes that a pool of ``count`` instances needs."""
     return _size_of_arrays(spec, count) + workers * _ECHO_SIZE
 
 
 def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
-    """Lay the arrays of a pool of ``count`` instances out in memory, which they keep alive."""
+    """Place the arrays of a pool of ``count`` instances in memory, which they keep alive."""
     arrays: list[Any] = []
     offset = 0
     for shape, dtype in _layout(spec, count):
@@ -93,18 +93,21 @@ def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
 
 
 def make_echo(memory: Memory, spec: PoolSpec, count: int, worker: int) -> npt.NDArray[np.uint8]:
-    """Where a worker's FMUs leave their last words, a text that ends with 0."""
+    """Return where a worker's FMUs leave their last words, a text that ends with a zero byte."""
     offset = _size_of_arrays(spec, count) + worker * _ECHO_SIZE
     return np.ndarray(_ECHO_SIZE, np.uint8, memory.map, offset)
 
 
 class Memory:
-    """Zeros, to be shared.
+    """Shared memory, filled with zeros.
 
     Args:
         size: In bytes, not 0.
-        descriptor: The file descriptor of memory that was made elsewhere.
-        tag: Its name instead, on Windows, which forgets a name together with its memory.
+        descriptor: The file descriptor of memory that another process has made.
+        tag: Its name instead, on Windows, which frees the name together with the memory.
+
+    Raises:
+        OSError: If the system refuses.
 
     Attributes:
         size: In bytes.
@@ -124,7 +127,7 @@ class Memory:
             self.map = mmap.mmap(self.descriptor, size)
 
     def close(self) -> None:
-        """Close the file descriptor; what is mapped stays so as long as it is in use."""
+        """Close the file descriptor; the mapped memory stays as long as it is in use."""
         if self.descriptor >= 0:
             os.close(self.descriptor)
             self.descriptor = -1

@@ -1,4 +1,4 @@
-"""The parent's side of one worker: what it is told, how long it may take, and why it died."""
+"""The parent's side of one worker: requests, time limits, and the causes of deaths."""
 
 from __future__ import annotations
 
@@ -20,35 +20,41 @@ from fmugym.pool.process.worker import Setup
 __all__ = ["LostError", "Supervisor"]
 
 _MOST_DEATHS: Final = 5
-"""In a row, without a reset that succeeded; then a worker is given up."""
+"""Deaths in a row, without a successful reset, after which no worker is started any more."""
 
 _FIRST_PAUSE: Final = 0.05
-"""Before a worker is started after its second death in a row, in seconds; then twice that..."""
+"""Seconds before a worker is started after its second death in a row; doubled for each more."""
+
+_LAST_MOMENT: Final = 0.05
+"""Seconds that a worker that has closed its channel may take to end."""
+
+_LONGEST_KILL: Final = 2.0
+"""Seconds that a killed process may take to end; a system call may hold it for longer."""
 
 _TAIL: Final = 10
-"""How many of the FMU's last messages the cause of a death cites."""
+"""How many of the FMU's last messages the cause of a death quotes."""
 
 
 class LostError(Exception):
-    """The worker is gone, and all of its instances with it; the text is the cause."""
+    """The worker and all of its instances are lost; the text is the cause."""
 
 
 class Supervisor:
-    """Keeps one worker and knows what became of it.
+    """Runs one worker, in one process after another.
 
     Args:
-        setup: What the worker gets to know.
-        memory: What it shares.
+        setup: What the worker needs to know.
+        memory: Shared with the worker.
         log: Gets the FMU's messages.
 
     Attributes:
-        block: The indices of its instances.
-        generation: Differs between two processes.
+        block: The indices of the worker's instances.
+        generation: The number of processes that have ended.
         reason: Why the last process died.
-        growth: By how many bytes it has grown since its first resets.
+        growth: By how many bytes the process has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
-        known: The numbers of the lists of variables that were told to this process.
-        released: The snapshots that nobody refers to any more, by generation and number.
+        known: The numbers of the lists of variables that this process knows.
+        released: The snapshots without any reference left, by generation and number.
     """
 
     def __init__(self, setup: Setup, memory: Memory, log: logging.Logger) -> None:
@@ -67,16 +73,16 @@ class Supervisor:
 
     @property
     def pid(self) -> int:
-        """The worker's process number; 0 if there is no process."""
+        """The process number of the worker; 0 if there is no process."""
         return 0 if self._process is None else self._process.pid
 
-    # Its life.
+    # The life of the process.
 
     def start(self) -> None:
         """Start a process, without waiting until it is ready.
 
         Raises:
-            LostError: If there can be none.
+            LostError: If the system refuses.
         """
         try:
             self._process, self._channel = self._launch()
@@ -100,10 +106,10 @@ class Supervisor:
         return process, Channel(end, process.sentinel)
 
     def revive(self) -> None:
-        """Start a process if there is none, later and later if one after the other dies.
+        """Start a process if there is none, with longer and longer pauses between deaths.
 
         Raises:
-            LostError: If too many have died in a row.
+            LostError: If too many have died in a row, or the system refuses.
         """
         if self._process is not None:
             return
@@ -118,17 +124,17 @@ class Supervisor:
             raise
 
     def start_ahead(self) -> None:
-        """Start a process before it is needed, but not again and again."""
+        """Start a process before it is needed, but only after a first death."""
         if self._process is None and self._deaths == 1:
             with contextlib.suppress(LostError):  # there is time to try again
                 self.start()
 
     def bury(self, reason: str) -> None:
-        """End the process if need be, and free what it took."""
+        """End the process if there is one, and free its resources."""
         if self._process is None:
             return
         self._process.kill()
-        self._process.exit_status()
+        self._process.exit_status(_LONGEST_KILL)
         self._forget_process(reason)
 
     def _forget_process(self, reason: str) -> None:
@@ -141,33 +147,33 @@ class Supervisor:
         self.reason = prefix + reason
 
     def retire(self, reason: str, deadline: float) -> None:
-        """End a process that has done no wrong, in order."""
+        """End a process that has not failed, in an orderly way."""
         deaths = self._deaths
         self.begin_closing()
         self.close(deadline)
         self._deaths, self.reason = deaths, f"{self._setup.path.name}: {reason}"
 
     def note_success(self) -> None:
-        """Keep that a reset has succeeded."""
+        """Remember that a reset has succeeded."""
         self.is_new = False
         self._deaths = 0
 
     def forget(self) -> None:
-        """Let go of the worker: this process is a fork of the one that it belongs to."""
+        """Let go of the process without ending it, as a fork of this process has to."""
         if self._process is not None:
             self._channel.close()
             self._process.forget()
             self._process = None
 
     def begin_closing(self) -> None:
-        """Let the worker free its instances; end it at once if it has not made them yet."""
+        """Ask the worker to free its instances; end it at once if it has not made them yet."""
         if self._opening:
             self.bury("the pool was closed")
         if self._process is not None:
             self.tell("close")
 
     def close(self, deadline: float) -> None:
-        """Wait until it has done so, and end it if that takes too long."""
+        """Wait until it has freed them, and end it if this takes too long."""
         if self._process is None:
             return
         try:
@@ -176,15 +182,15 @@ class Supervisor:
             self._log.warning("%s", error)
         self.bury("the pool was closed")
 
-    # What it does.
+    # Requests and replies.
 
     @property
     def is_busy(self) -> bool:
-        """Whether a reply is to come."""
+        """Whether a reply is due."""
         return self._busy
 
     def step(self, code: bytes) -> None:
-        """Let the worker step; it never raises, as the reply will tell."""
+        """Ask the worker to step; failures show in the reply."""
         self._busy = True
         try:
             if self.released:
@@ -194,7 +200,7 @@ class Supervisor:
             return
 
     def tell(self, name: str, *arguments: Any) -> None:
-        """Call a method of the worker; it never raises, as the reply will tell."""
+        """Ask for a call of one of the worker's methods; failures show in the reply."""
         self._busy = True
         with contextlib.suppress(OSError):
             if self.released:
@@ -212,15 +218,15 @@ class Supervisor:
         """Wait for the reply.
 
         Args:
-            deadline: Until when, as ``time.monotonic`` counts.
-            doing: What the worker was told, for the cause of a death.
+            deadline: Until when, in the time of ``time.monotonic``.
+            doing: What the worker does, for the cause of a death.
 
         Returns:
             ``Code.FINE`` or ``Code.TROUBLE`` for a step; what the method returned; or the
             exception that it raised.
 
         Raises:
-            LostError: If the worker died or was late.
+            LostError: If the worker has died or is late.
         """
         if self._opening:
             self.finish_opening(deadline)
@@ -232,7 +238,7 @@ class Supervisor:
         """Wait until a new worker has made its instances.
 
         Raises:
-            LostError: If it could not.
+            LostError: If it could not make them.
         """
         result = self._receive(deadline, "the instantiation")
         self._opening = False
@@ -264,16 +270,16 @@ class Supervisor:
 
     def _explain_death(self, doing: str) -> None:
         assert self._process is not None
-        pid, status = self._process.pid, self._process.exit_status()
+        pid, status = self._process.pid, self._process.exit_status(_LAST_MOMENT)
         if status is None:
             self._process.kill()
-            self._process.exit_status()
+            self._process.exit_status(_LONGEST_KILL)
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
         raise LostError(self.reason)
 
     def _end_hang(self, doing: str) -> None:
-        """Only what has come until now is read of its messages."""
+        """End a worker that is late; messages that it has not sent yet are lost."""
         what = f"worker process {self.pid} took longer than call_timeout for {doing} and was ended"
         self.bury(self._cause(what))
         raise LostError(self.reason)
@@ -286,7 +292,7 @@ class Supervisor:
 
 
 def _is_debugged(pid: int) -> bool:
-    """Whether a debugger holds the process, which may take its time then; Linux tells."""
+    """Whether a debugger holds the process, which may then take its time; known on Linux only."""
     try:
         status = Path(f"/proc/{pid}/status").read_text()
     except OSError:

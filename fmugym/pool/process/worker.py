@@ -1,7 +1,7 @@
-"""The worker of a pool of processes: a pool of its own, for a block of the instances.
+"""The worker of a pool of processes: it has a pool of its own for a block of the instances.
 
-It does what it is told through its channel until the other end is closed. The arrays of its block
-are copied from and to shared memory here, so that the workers do it at the same time.
+It answers the requests of its channel until the other end is closed. The arrays of its block are
+copied from and to shared memory here, so that all workers copy at the same time.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Setup:
         limits: See ``FMU``.
         preload: See ``FMU``.
         spec: What to do at each reset and step.
-        num_instances: N, of all workers together.
-        log_level: Of the messages that are passed on.
+        num_instances: N, the instances of all workers together.
+        log_level: The level of the messages that are passed on.
         directory: The working directory.
         environment: The environment variables.
         block: The indices of the worker's instances.
@@ -78,7 +78,7 @@ class Setup:
 
     @classmethod
     def of(cls, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> Setup:
-        """What a worker for all instances of an FMU needs to know, which is extracted."""
+        """Extract an FMU, and say what a worker for all of its instances needs to know."""
         return cls(
             path=fmu.path,
             description=fmu.description,
@@ -95,7 +95,7 @@ class Setup:
 
 
 class _Forwarder(logging.Handler):
-    """Sends messages to the parent at once: the next call may be the last."""
+    """Sends messages to the parent at once, since the next call may be the last."""
 
     def __init__(self, channel: Channel) -> None:
         super().__init__()
@@ -103,7 +103,7 @@ class _Forwarder(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send one message."""
-        with contextlib.suppress(OSError):  # the parent is gone, or the FMU closed the channel
+        with contextlib.suppress(OSError):  # the parent has ended, or an FMU closed it
             self._channel.send_object(Code.LOG, (record.levelno, record.getMessage()))
 
 
@@ -125,7 +125,7 @@ class BlockWorker:
         self._process = os.getpid()
 
     def serve(self) -> None:
-        """Do what comes through the channel until it says ``close`` or is closed."""
+        """Answer requests until one is ``close`` or the channel is closed."""
         actions: dict[bytes, Callable[[], None]] = {
             Code.STEP: self._step,
             Code.STEP_SOME: self._step_some,
@@ -156,12 +156,12 @@ class BlockWorker:
         self._note(int(np.count_nonzero(pool.statuses > Status.WARNING)))
 
     def _end_twin(self) -> None:
-        """End this process if an FMU has made it by a fork and came back from its function."""
+        """End this process if an FMU has forked it and returned in it as well."""
         if os.getpid() != self._process:
             os._exit(0)
 
     def _note(self, troubled: int) -> None:
-        self._channel.require_open()  # else the outputs would be those of a step that is lost
+        self._channel.require_open()  # or else outputs of a lost step would be published
         self._publish()
         self._channel.send_code(Code.TROUBLE if troubled else Code.FINE)
 
@@ -176,10 +176,10 @@ class BlockWorker:
         for number in self._channel.receive_object():
             del self._snapshots[number]
 
-    # What the parent calls by name.
+    # The methods that the parent calls by name.
 
     def open(self, setup: Setup) -> None:
-        """Make the pool; before anything else."""
+        """Make the pool; the first call."""
         os.chdir(setup.directory)
         os.environ.update(setup.environment)
         log = logging.getLogger(__name__)
@@ -190,7 +190,7 @@ class BlockWorker:
             _native_echo_to(make_echo(self._memory, setup.spec, setup.num_instances, setup.number))
         self._pool = _make_pool(setup, log, self._block.counts)
         self._growth = ProcessGrowth(self._pool.num_instances)
-        np.copyto(self._pool.outputs, self._block.outputs)  # of a predecessor that died
+        np.copyto(self._pool.outputs, self._block.outputs)  # those of the worker before
 
     def reset(
         self,
@@ -199,7 +199,13 @@ class BlockWorker:
         values: FloatArray,
         mask: MaskArray,
     ) -> int:
-        """See ``Pool.reset``; a list of variables is told once, and has a number from then on.
+        """See ``Pool.reset``.
+
+        Args:
+            number: The number of the list of variables.
+            variables: The list; None if this process knows it already.
+            values: As for ``Pool.reset``.
+            mask: As for ``Pool.reset``.
 
         Returns:
             By how many bytes this process has grown since its first resets.
@@ -211,7 +217,7 @@ class BlockWorker:
         return self._growth.after(int(np.count_nonzero(mask)))
 
     def save(self) -> int:
-        """See ``Pool.save``; the snapshot stays here and has a number."""
+        """See ``Pool.save``; the snapshot stays here, and its number is returned."""
         number = next(self._numbers)
         self._snapshots[number] = self._pool.save()
         return number
@@ -222,11 +228,11 @@ class BlockWorker:
         self._publish()
 
     def count_steps(self) -> None:
-        """Let the shared counts have all steps until now."""
+        """Add the steps until now to the shared counts."""
         self._pool.health()
 
     def failure(self, index: int) -> str:
-        """See ``Pool.failure``; the index is that in the block."""
+        """See ``Pool.failure``; the index counts from the begin of the block."""
         return self._pool.failure(index)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
@@ -241,7 +247,7 @@ class BlockWorker:
 
 
 def _native_echo_to(memory: npt.NDArray[np.uint8]) -> None:
-    """The native pool hands messages over after a call only, which the process may not survive."""
+    """Keep a copy of messages: the native pool logs after a call, which may end the process."""
     from fmugym import _native
 
     _native.echo_to(memory)
@@ -261,7 +267,7 @@ def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> Pool:
 
 
 def run_worker(end: socket.socket, memory: Memory) -> int:
-    """Be a worker.
+    """Be a worker until the parent closes the channel.
 
     Returns:
         The exit status of the process.
@@ -274,7 +280,7 @@ def run_worker(end: socket.socket, memory: Memory) -> int:
     root.handlers, root.propagate = [_Forwarder(channel)], False
     try:
         BlockWorker(channel, memory).serve()
-    except (EOFError, OSError):  # the parent is gone
+    except (EOFError, OSError):  # the parent has ended
         return 0
     except BaseException:
         root.critical("the worker failed:\n%s", traceback.format_exc())

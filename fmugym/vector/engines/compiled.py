@@ -186,7 +186,7 @@ class CompiledEngine(BatchEngine):
         try:
             troubled, ended = play(actions, *arrays, drawn)
         except (TypeError, ValueError, BufferError):
-            actions = np.ascontiguousarray(self._checked(actions), np.int64)
+            actions = np.require(self._checked(actions), np.int64, ["C", "A"])
             troubled, ended = play(actions, *arrays, drawn)
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}

@@ -1,0 +1,301 @@
+"""What the native pool survives: wrong arrays, unsound programs, too little memory, bad FMUs."""
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import zoo_tools
+from fmugym.adapters import Status
+from fmugym.vector.trace import OPERATIONS
+from test_native_pool import LOG, make, on_linux
+from test_native_threads import run_python
+
+import fmugym
+from fmugym import FMU, bundled_fmu
+from fmugym import pool as pools
+from fmugym.envs import CartPoleEnv
+from fmugym.pool import PoolSpec
+from fmugym.pool.health import no_counts
+
+pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
+if pools.has_native_pool():
+    from fmugym.pool.native import NativePool
+
+
+@pytest.fixture
+def cart_poles():
+    pool = make(NativePool, bundled_fmu("CartPole"), ["f"], ["x", "theta"], 6)
+    pool.reset((), np.zeros((0, 6)))
+    yield pool
+    pool.close()
+
+
+# Arrays
+
+
+def misaligned(shape, dtype):
+    """Zeros that begin in the middle of an item."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    return np.frombuffer(bytearray(size + 1), dtype, offset=1).reshape(shape)
+
+
+class TestArrays:
+    def test_inputs_at_any_address(self, cart_poles):
+        cart_poles.step_into(misaligned((1, 6), np.float64))
+        assert not cart_poles.statuses.any()
+
+    def test_observations_that_are_not_aligned(self, cart_poles):
+        with pytest.raises(ValueError, match="observations must begin at a multiple of 4 bytes"):
+            cart_poles.step_into(None, None, misaligned((6, 2), np.float32))
+
+    def test_health_that_is_not_aligned(self):
+        fmu = FMU(bundled_fmu("CartPole"))
+        counts = misaligned(no_counts(1).shape, np.int64)
+        with pytest.raises(ValueError, match="health must begin at a multiple of 8 bytes"):
+            NativePool(fmu, PoolSpec((), (), 0.1), 1, LOG, counts=counts)
+
+    def test_an_item_size_that_its_format_does_not_have_everywhere(self):
+        """A long has 4 bytes on Windows, and in the standard sizes of struct."""
+        testbuffer = pytest.importorskip(
+            "_testbuffer", reason="this Python was built without its test modules"
+        )
+        fmu = FMU(bundled_fmu("CartPole"))
+        names = no_counts(1).size
+        flags = testbuffer.ND_WRITABLE
+        counts = testbuffer.ndarray([0] * names, shape=[1, names], format="=l", flags=flags)
+        with pytest.raises(
+            TypeError, match="health must be an array of int64, not of type '=l' with 4 bytes"
+        ):
+            NativePool(fmu, PoolSpec((), (), 0.1), 1, LOG, counts=counts)
+
+    def test_actions_that_are_not_aligned(self):
+        with_these, with_others = (
+            fmugym.FMUVectorEnv(CartPoleEnv, 6, hooks="compiled") for _ in range(2)
+        )
+        actions = misaligned(6, np.int64)
+        actions[:] = [0, 1, 0, 1, 1, 0]
+        for envs in (with_these, with_others):
+            envs.reset(seed=0)
+        expected = with_others.step(actions.copy())[0]
+        np.testing.assert_array_equal(with_these.step(actions)[0], expected)
+        with_these.close()
+        with_others.close()
+
+
+# Programs
+
+
+def program(*rows, constants=(1.0,), results=(0,)):
+    return SimpleNamespace(
+        code=np.array(rows, np.uint16),
+        constants=np.array(constants),
+        results=np.array(results, np.uint16),
+    )
+
+
+def prepare(pool, inputs, judgement=None, rows=(0,)):
+    n, draws = pool.num_instances, len(rows)
+    constant = [OPERATIONS.index("constant"), 0, 0, 0]
+    pool.prepare_play(
+        (pool.variable("theta_0"),),
+        (inputs, judgement or program(constant, results=(0, 0, 0))),
+        (0, 1),
+        np.zeros((1, n)),
+        (
+            np.zeros((n, 2, draws)),
+            np.full(n, 2),
+            np.zeros(draws),
+            np.ones(draws),
+            np.array(rows, np.int64),
+        ),
+        (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
+    )
+
+
+ACTION = [OPERATIONS.index("action"), 0, 0, 0]
+
+
+class TestPrograms:
+    def test_a_sound_one(self, cart_poles):
+        prepare(cart_poles, program(ACTION))
+
+    @pytest.mark.parametrize(
+        "row",
+        [
+            ("action", 1, 0, 0),
+            ("action", 0, 7, 0),
+            ("step_count", 3, 0, 0),
+            ("constant", 0, 0, 9),
+            ("output", 0, 60000, 0),
+            ("negative", 0, 60000, 0),
+            ("square_root", 0, 0, 60000),
+            ("add", 0, 0, 60000),
+        ],
+        ids=str,
+    )
+    def test_operands_that_an_operation_does_not_have(self, cart_poles, row):
+        name, *operands = row
+        with pytest.raises(ValueError, match="a program does not fit the pool"):
+            prepare(cart_poles, program(ACTION, [OPERATIONS.index(name), *operands]))
+
+    @pytest.mark.parametrize("part", ["code", "constants", "results"])
+    @pytest.mark.parametrize("extra", [1, 3])
+    def test_lengths_in_bytes(self, cart_poles, part, extra):
+        odd = program(ACTION)
+        setattr(odd, part, np.append(getattr(odd, part).view(np.uint8), np.zeros(extra, "u1")))
+        with pytest.raises(ValueError, match=f"the {part} of a program"):
+            prepare(cart_poles, odd)
+
+    @pytest.mark.parametrize("part", ["code", "constants", "results"])
+    def test_too_long_ones(self, cart_poles, part):
+        shape = (129, 4) if part == "code" else 129
+        long = program(ACTION)
+        setattr(long, part, np.zeros(shape, getattr(long, part).dtype))
+        with pytest.raises(ValueError, match=f"the {part} of a program"):
+            prepare(cart_poles, long)
+
+    def test_rows_that_change_later_are_those_from_before(self, cart_poles):
+        """They say where in memory draws are written."""
+        rows = np.zeros(1, np.int64)
+        prepare(cart_poles, program(ACTION), rows=rows)
+        with pytest.raises(ValueError, match="a program does not fit the pool"):
+            prepare(cart_poles, program(ACTION), rows=(1,))
+
+    def test_no_number_of_used_episodes_leads_out_of_the_block(self, cart_poles):
+        n = cart_poles.num_instances
+        used, rows, block = np.full(n, 2), np.zeros(1, np.int64), np.zeros((n, 2, 1))
+        constant = program([OPERATIONS.index("constant"), 0, 0, 0], results=(0, 0, 0))
+        play = cart_poles.prepare_play(
+            (cart_poles.variable("theta_0"),),
+            (program(ACTION), constant),
+            (0, 1),
+            np.zeros((1, n)),
+            (block, used, np.zeros(1), np.ones(1), rows),
+            (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
+        )
+        cart_poles.set_streams([np.random.PCG64(i) for i in range(n)])
+        used[:] = [-1, 2**62, -(2**63), 3, 2, 10**9]
+        rows[:] = 2**40
+        drawn, flags = np.empty((1, n)), (np.empty(n, np.bool_), np.empty(n, np.bool_))
+        play(np.zeros(n, np.int64), np.empty((n, 2), "f4"), np.empty(n), *flags, drawn)
+        first = [np.random.Generator(np.random.PCG64(i)).random() for i in range(n)]
+        assert drawn[0].tolist() == first
+        assert used.tolist() == [1] * n
+
+
+# Memory
+
+SCARCE = """
+import json, resource, sys
+from test_native_pool import FMU, LOG, FMULoadError, NativePool, PoolSpec, bundled_fmu
+n = 200_000
+results = []
+
+def attempt():
+    fmu = FMU(bundled_fmu("CartPole"))
+    spec = PoolSpec((), (fmu.variable("x"),), 0.05, num_observed=1)
+    limited = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    return fmu, spec, limited
+
+for extra in range(0, 120, 3):
+    fmu, spec, size = attempt()
+    limit = size + extra * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+    try:
+        pool = NativePool(fmu, spec, n, LOG, threads=1)
+        result = "made"
+    except (MemoryError, FMULoadError) as error:
+        result = type(error).__name__
+    except BaseException as error:
+        result = repr(error)
+    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    pool = None
+    results.append(result)
+print(json.dumps(results))
+"""
+
+
+@on_linux
+def test_want_of_memory_in_any_part_of_a_pool():
+    done = run_python("-c", SCARCE)
+    assert done.returncode == 0, done.stderr[-2000:]
+    results = json.loads(done.stdout)
+    assert set(results) <= {"MemoryError", "FMULoadError", "made"}, results
+    assert "made" in results, "there was enough memory at last"
+    assert results.index("made") > 5, "there was too little at first"
+
+
+# Libraries and calls
+
+
+def test_a_library_that_cannot_be_bound_when_it_is_loaded_anew(probe, temp_root):
+    pool = make(NativePool, probe(), ["a"], ["sum"], 2, private_libraries=True)
+    variables = tuple(map(pool.variable, ("fault", "fault_step")))
+    pool.reset(variables, np.array([[4.0, 0.0], [1.0, 1.0]]))
+    assert pool.step()[1].tolist() == [Status.FATAL, Status.OK]
+    (copy,) = (p for p in temp_root.rglob("*") if p.is_file() and p.parts[-2:-1] == ("0",))
+    copy.unlink()
+    copy.write_bytes(Path(_library_without_fmi()).read_bytes())
+    for _ in range(2):
+        statuses = pool.reset((), np.zeros((0, 2)), np.array([True, False]))[1]
+        assert statuses.tolist() == [Status.FATAL, Status.OK]
+        assert "cannot be loaded anew" in pool.failure(0)
+    assert pool.step()[1].tolist()[1] == Status.OK
+    pool.close()
+
+
+def _library_without_fmi():
+    """Any library that has nothing of FMI."""
+    import fmugym._native
+
+    return fmugym._native.__file__
+
+
+def test_after_an_error_no_other_type_is_set(probe):
+    """The standard allows only a reset then."""
+    pool = make(NativePool, probe(), ["a", "n", "on"], ["illegal"], 1)
+    pool.reset((pool.variable("set_status"),), np.array([[3.0]]))
+    assert pool.step()[1].tolist() == [Status.ERROR]
+    pool.reset((), np.zeros((0, 1)))
+    pool.step()
+    assert pool.outputs.tolist() == [[0.0]]
+    pool.close()
+
+
+# The floating-point environment
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the zoo's faults are those of Linux")
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("substeps", [1, 2])
+@pytest.mark.parametrize("fault", ["round_up", "flush_denormals"])
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_an_instance_that_changes_it_changes_no_other(tmp_path, version, fault, substeps, threads):
+    """The sums of steps of 0.1 and of denormal numbers depend on it."""
+    path = zoo_tools.zoo_fmu(tmp_path, version)
+    n = 90
+    names = ("fault", "call", "at")
+    harmful = np.zeros((3, n))
+    calls = [zoo_tools.CALLS.index(call) for call in ("exit", "set", "step", "get", "reset")]
+    harmful[0, ::3] = zoo_tools.FAULTS.index(fault)
+    harmful[1, ::3] = np.resize(calls, n // 3)
+    inputs = np.where(np.arange(n) % 2, 0.1, 3e-320)[None]
+    outputs = []
+    for values in (np.zeros((3, n)), harmful):
+        pool = make(
+            NativePool, path, ["u"], ["y"], n, time_step=0.3, substeps=substeps, threads=threads
+        )
+        variables = tuple(map(pool.variable, names))
+        for _ in range(3):
+            pool.reset(variables, values)
+            for _ in range(20):
+                pool.step(inputs)
+        outputs.append(pool.outputs[0].copy())
+        pool.close()
+        assert 1.0 + float("1e-30") == 1.0
+        assert float("4e-324") * 1.0 > 0.0
+    others = np.arange(n) % 3 > 0
+    assert outputs[0][others].tobytes() == outputs[1][others].tobytes()

@@ -1,0 +1,332 @@
+"""The native pool against threads, exceptions and signals: nothing that callers do breaks it."""
+
+import contextlib
+import gc
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import foreign_tank
+import numpy as np
+import pytest
+from pythonfmu.builder import FmuBuilder
+from test_native_pool import busy_fmu, make
+
+from fmugym import FMU, SimulationError
+from fmugym import pool as pools
+from fmugym.pool import PoolSpec
+
+pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
+if pools.has_native_pool():
+    from fmugym.pool.native import NativePool
+
+HERE = Path(__file__).parent
+on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+on_posix = pytest.mark.skipif(os.name != "posix", reason="Windows has no timer signals")
+
+
+def run_python(*command, timeout=100):
+    """Run Python in a process of its own."""
+    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path, "MALLOC_PERTURB_": "85"}
+    return subprocess.run(
+        [sys.executable, *command],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+# All calls against each other
+
+
+@on_posix
+@pytest.mark.parametrize("options", [("1",), ("2", "python")], ids=["C", "Python"])
+def test_stress(options):
+    """A short form of what ``sanitize.py`` does with sanitizers."""
+    done = run_python(str(HERE / "native_stress.py"), "3", *options)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert json.loads(done.stdout.splitlines()[-1])["played"] > 10
+
+
+def test_a_call_that_waits_while_another_closes(busy):
+    """Those that come after the close are refused; none of them uses what is freed."""
+    pool = make(NativePool, busy, ["work"], ["steps"], 2)
+    pool.reset((), np.zeros((0, 2)))
+    pool.step(np.full((1, 2), 1e3))
+    refused = []
+
+    def step():
+        try:
+            pool.step(np.full((1, 2), 5e4))
+        except SimulationError as error:
+            refused.append(str(error))
+
+    threads = [threading.Thread(target=step) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    pool.close()
+    for thread in threads:
+        thread.join()
+    assert set(refused) <= {"the pool is closed"}
+    for call in (pool.step_own, pool.save, pool.recycle, lambda: pool.read(())):
+        with pytest.raises(SimulationError, match="closed"):
+            call()
+
+
+@pytest.fixture(scope="session")
+def busy(tmp_path_factory):
+    return busy_fmu(tmp_path_factory.mktemp("busy"))
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory):
+    path = FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path_factory.mktemp("tank"))
+    if not FMU(path).runs_here:
+        pytest.skip("pythonfmu has no binary for this platform")
+    return path
+
+
+DEADLOCK = """
+import sys, threading
+import numpy as np
+from test_native_pool import NativePool, make
+from native_stress import counts
+
+pool = make(NativePool, sys.argv[1], ["inflow"], ["level"], 3, threads=2)
+pool.reset((), np.zeros((0, 3)))
+sys.setswitchinterval(1e-5)
+
+def step():
+    for _ in range(2000):
+        pool.step_own()
+        counts["steps"] += 1
+
+def ask():
+    while thread.is_alive():
+        pool.failure(0)
+        pool.uses_states, pool.costs, pool.health()
+
+thread = threading.Thread(target=step)
+thread.start()
+ask()
+print(counts["steps"], flush=True)
+import os
+os._exit(0)  # pythonfmu may crash at the end of the interpreter
+"""
+
+
+def test_an_fmu_in_python_and_calls_from_several_threads(tank):
+    """It needs the GIL while it is stepped: who has that must not wait for the pool."""
+    done = run_python("-c", DEADLOCK, str(tank))
+    assert done.stdout == "2000\n", done.stderr[-3000:]
+
+
+REENTRANT = """
+import builtins, os, sys
+import foreign_tank
+import numpy as np
+from pythonfmu.builder import FmuBuilder
+from test_native_pool import NativePool, make
+
+pool = make(NativePool, sys.argv[1], ["inflow"], ["level"], 2, threads=1)
+pool.reset((), np.zeros((0, 2)))
+builtins.pool, builtins.errors = pool, []
+print(pool.step()[1].tolist(), builtins.errors)
+sys.stdout.flush()
+os._exit(0)
+"""
+CALLS_ITS_POOL = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+import builtins
+
+class Selfish(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.inflow = self.level = 0.0
+        self.register_variable(Real("inflow", causality=Fmi2Causality.input))
+        self.register_variable(Real("level", causality=Fmi2Causality.output))
+
+    def do_step(self, current_time, step_size):
+        for call in (builtins.pool.step_own, lambda: builtins.pool.failure(0)):
+            try:
+                call()
+            except RuntimeError as error:
+                builtins.errors.append(str(error))
+        return True
+"""
+
+
+def test_an_fmu_that_calls_its_own_pool_gets_an_error(tmp_path, tank):
+    source = tmp_path / "selfish.py"
+    source.write_text(CALLS_ITS_POOL)
+    path = FmuBuilder.build_FMU(str(source), dest=tmp_path)
+    done = run_python("-c", REENTRANT, str(path))
+    expected = [0, 0], ["an FMU has called the pool that it is in"] * 4
+    assert done.stdout == "{} {}\n".format(*expected), done.stderr[-3000:]
+
+
+def test_a_snapshot_dropped_while_the_pool_is_busy_is_freed_later(probe):
+    pool = make(NativePool, probe(), ["a"], ["live"], 1)
+    pool.reset((), np.zeros((0, 1)))
+    barrier = threading.Barrier(2)
+    snapshots = [pool.save() for _ in range(200)]
+
+    def drop():
+        barrier.wait()
+        while snapshots:
+            snapshots.pop()
+
+    thread = threading.Thread(target=drop)
+    thread.start()
+    barrier.wait()
+    while thread.is_alive():
+        pool.step_own()
+    thread.join()
+    for _ in range(2):
+        pool.step_own()
+    assert pool.outputs.tolist() == [[0.0]]
+    pool.close()
+
+
+# Helpers
+
+
+def helper_masks():
+    """The blocked signals of all threads but the main one."""
+    for task in Path("/proc/self/task").iterdir():
+        if task.name != str(os.getpid()):
+            lines = (task / "status").read_text().splitlines()
+            yield int(next(line.split()[1] for line in lines if line.startswith("SigBlk")), 16)
+
+
+@on_linux
+def test_helpers_block_signals_but_those_of_their_own_faults():
+    script = f"""
+import sys
+sys.path.insert(0, {str(HERE)!r})
+import test_native_pool, test_native_threads
+before = len(list(test_native_threads.helper_masks()))
+pool = test_native_pool.cart_pole(3)
+test_native_pool.rollout(pool)
+print([mask for mask in test_native_threads.helper_masks() if mask][-2:])
+"""
+    masks = json.loads(run_python("-c", script).stdout)
+    assert len(masks) == 2
+    for mask in masks:
+        blocked = {number for number in range(1, 65) if mask >> (number - 1) & 1}
+        assert {signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGCHLD} <= blocked
+        faults = {"SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT"}
+        assert not blocked & {getattr(signal, name) for name in faults}
+
+
+@on_linux
+def test_a_crash_in_a_helper_is_reported_by_faulthandler(tmp_path):
+    path = busy_fmu(tmp_path, "-DCRASH_IN_HELPER")
+    script = f"""
+import sys, faulthandler
+sys.path.insert(0, {str(HERE)!r})
+faulthandler.enable()
+import numpy as np, test_native_pool as t
+pool = t.make(t.NativePool, {str(path)!r}, ["work"], ["steps"], 64, threads=2)
+pool.reset((), np.zeros((0, 64)))
+while True:
+    pool.step(np.full((1, 64), 500.0))
+"""
+    done = run_python("-c", script)
+    assert done.returncode == -signal.SIGSEGV
+    assert "Fatal Python error: Segmentation fault" in done.stderr
+
+
+# Exceptions of the receiver of messages
+
+
+class Raising(logging.Handler):
+    """Raises an exception at some of the messages, and keeps the others."""
+
+    def __init__(self, error, at):
+        super().__init__()
+        self.error, self.at, self.texts = error, at, []
+
+    def emit(self, record):
+        self.texts.append(record.getMessage())
+        if len(self.texts) == self.at:
+            raise self.error
+
+
+def logging_pool(probe, error, at, count=3):
+    """A pool whose instances say something in each step."""
+    log = logging.Logger("raising")
+    handler = Raising(error, at)
+    log.addHandler(handler)
+    fmu = FMU(probe())
+    pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), count, log)
+    pool.reset((fmu.variable("log_status"),), np.ones((1, count)))
+    return pool, handler
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3)], ids=repr)
+def test_an_exit_comes_out_of_the_step_that_was_done(probe, error):
+    pool, handler = logging_pool(probe, error, at=2)
+    with pytest.raises(type(error)) as caught:
+        pool.step()
+    assert caught.value is error
+    assert pool.outputs.tolist() == [[1.0, 1.0, 1.0]]
+    assert len(handler.texts) == 2
+    pool.step()
+    names = [text.split(":")[0] for text in handler.texts]
+    assert names == [f"Probe_{i}" for i in (0, 1, 2, 0, 1, 2)], "those left come first"
+    pool.close()
+
+
+def test_an_exit_while_closing_leaves_nothing_open(probe, temp_root):
+    pool, _ = logging_pool(probe, KeyboardInterrupt(), at=1)
+    with pytest.raises(KeyboardInterrupt):
+        pool.step()
+    pool.close()
+    gc.collect()
+    assert list(temp_root.iterdir()) == []
+
+
+@on_posix
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_a_signal_ends_a_loop_of_steps_that_log(probe, error):
+    """Each step logs, so the handler mostly runs inside of the receiver."""
+    pool, _ = logging_pool(probe, KeyboardInterrupt(), at=-1)
+
+    def handle(*_):
+        raise error
+
+    before = signal.signal(signal.SIGALRM, handle)
+    try:
+        for _ in range(10):
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
+            end = time.monotonic() + 10
+            with contextlib.suppress(error):
+                while time.monotonic() < end:
+                    pool.step_own()
+            assert time.monotonic() < end, "the signal was lost"
+    finally:
+        signal.signal(signal.SIGALRM, before)
+        pool.close()
+
+
+def test_closing_from_inside_of_the_receiver(probe):
+    fmu = FMU(probe())
+    log = logging.Logger("closing")
+    pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), 3, log)
+    handler = logging.Handler()
+    handler.emit = lambda _: pool.close()
+    log.addHandler(handler)
+    pool.reset((fmu.variable("log_status"),), np.ones((1, 3)))
+    assert pool.step_own() == 0
+    with pytest.raises(SimulationError, match="closed"):
+        pool.step_own()
