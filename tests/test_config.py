@@ -161,7 +161,7 @@ class TestRefused:
             ({"episode_variables": None}, "episode_variables must be a dict"),
             ({"episode_variables": {"target": "x"}}, "episode variable 'target' must be a number"),
             ({"episode_variables": {"target": math.nan}}, "'target' must be finite"),
-            ({"time_step": 0}, r"time_step must be .*positive, got 0"),
+            ({"time_step": 0}, r"time_step must be .*positive.*, got 0"),
             ({"time_step": -1}, r"time_step must be .*positive"),
             ({"time_step": math.nan}, r"time_step must be .*positive"),
             ({"time_step": "0.1"}, "time_step must be a number, got '0.1'"),
