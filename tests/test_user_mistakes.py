@@ -63,9 +63,9 @@ def at_construction(error, match, **changes):
             ConfigError, "must be a number, got <class", model_parameters={"gain": fmugym.Uniform}
         ),
         # Types in the config
-        at_construction(ConfigError, "must be a dict with names as keys", model_parameters=[1]),
+        at_construction(ConfigError, "model_parameters must be a dict", model_parameters=[1]),
         at_construction(ConfigError, "time_step must be a number", time_step="0.1"),
-        at_construction(ConfigError, "time_step must be positive", time_step=0),
+        at_construction(ConfigError, r"time_step must be .*positive", time_step=0),
         at_construction(ConfigError, "'time_step' is missing", time_step=None),
         at_construction(ConfigError, "substeps must be a positive integer", substeps=2.0),
         at_construction(ConfigError, "unknown on_fault policy", on_fault="panic"),

@@ -210,6 +210,14 @@ def loaded(env):
     return np.maximum(abs(env.state[0]), -env.parameters["m"])
 
 
+def counting(env):
+    return 1.0 - (env.done & (env.state[0] > 0.5)) + 3.0 * (env.step_count > 5)
+
+
+def unknown(env):
+    return np.where(env.done, np.nan, 1.0)
+
+
 def overflowing(env):
     return np.where(env.done, 1.0, env.state[0] * env.state[0])
 
@@ -221,7 +229,10 @@ def dividing(env):
 @needs_native
 @pytest.mark.parametrize(
     ("reward", "is_finite"),
-    [(constant, True), (loaded, True), (overflowing, False), (dividing, False)],
+    [
+        *[(constant, True), (loaded, True), (counting, True)],
+        *[(overflowing, False), (dividing, False), (unknown, False)],
+    ],
 )
 def test_which_rewards_are_always_finite(reward, is_finite):
     env = type("Other", (Arithmetic,), {"_reward_policy": reward})()

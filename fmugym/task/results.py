@@ -136,7 +136,11 @@ def _of_integers(space: Any) -> Finiteness:
 
 def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
-        if not issubclass(type(observation), Mapping) or observation.keys() != parts.keys():
+        try:
+            fits = observation.keys() == parts.keys()
+        except Exception:  # no mapping, or its own methods fail
+            fits = False
+        if not fits:
             raise ConfigError(
                 f"{_OBSERVE} returned {shown(observation)}, expected a dict with the keys "
                 f"{', '.join(map(repr, parts))}"

@@ -14,7 +14,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.views import copied_attributes, differs
 
-__all__ = ["TOGETHER", "MethodCall", "attribute", "require_settable"]
+__all__ = ["TOGETHER", "MethodCall", "attribute", "checked_name", "require_settable"]
 
 TOGETHER: Final = frozenset({"close", "reset", "step"})
 """Methods that one environment cannot do alone."""
@@ -37,15 +37,24 @@ def require_settable(name: str) -> None:
         raise ConfigError(f"{name!r} cannot be set: every environment keeps it itself")
 
 
+def checked_name(name: Any) -> str:
+    """Return the name of an attribute as plain text.
+
+    Raises:
+        ConfigError: If it is no text.
+    """
+    if not isinstance(name, str):
+        raise ConfigError(f"the name of an attribute must be text, got {shown(name)}")
+    return str.__str__(name)  # a subclass may have odd methods
+
+
 def attribute(env: FMUEnv, name: Any) -> Any:
     """Return an attribute of an environment, or else a parameter of its episode.
 
     Raises:
         ConfigError: If there is none of this name (it is an ``AttributeError``, too).
     """
-    if not isinstance(name, str):
-        raise ConfigError(f"the name of an attribute must be text, got {shown(name)}")
-    name = str.__str__(name)  # a subclass may have odd methods
+    name = checked_name(name)
     if not hasattr(env, name) and name in env.parameters:
         return env.parameters[name]
     try:

@@ -30,7 +30,7 @@ from fmugym.vector.arguments import (
     checked_seeds,
     checked_step_limit,
 )
-from fmugym.vector.calls import TOGETHER, attribute, require_settable
+from fmugym.vector.calls import TOGETHER, attribute, checked_name, require_settable
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.compiled import CompiledEngine, find_programs
@@ -295,6 +295,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: After ``close``.
         """
         self._open_pool("set_attr")
+        name = checked_name(name)
         by_index = self._by_index(name, values)
         if self._is_parameter(name):
             self._set_parameter(name, [by_index[index] for index in range(self.num_envs)])
@@ -316,9 +317,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             )
         return dict(enumerate(each))
 
-    def _is_parameter(self, name: Any) -> bool:
-        if not isinstance(name, str):
-            raise ConfigError(f"the name of an attribute must be text, got {shown(name)}")
+    def _is_parameter(self, name: str) -> bool:
         env = self._prototype
         return not hasattr(env, name) and name in env.fmu.description.variables
 
@@ -374,9 +373,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> list[Any]:
         """Call a method of some environments."""
         self._open_pool("call")
-        if isinstance(name, str) and name in TOGETHER:
+        name = checked_name(name)
+        if name in TOGETHER:
             raise ConfigError(f"{name!r} cannot be called on single environments of many")
-        if isinstance(name, str) and name == "render":
+        if name == "render":
             pictures = self.render() or [None] * self.num_envs
             return [pictures[index] for index in indices]
         return self._engine.call(name, indices, args, kwargs)

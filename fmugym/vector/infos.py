@@ -82,7 +82,7 @@ def copy_rows(source: Any, target: Any, mask: MaskArray) -> None:
 
 def not_finite(values: Any) -> MaskArray | None:
     """Which rows of an array, or of a dict of arrays, hold NaN or infinity; None for no row."""
-    if isinstance(values, Mapping):
+    if type(values) is dict:
         found = [rows for rows in map(not_finite, values.values()) if rows is not None]
         return np.logical_or.reduce(found) if found else None
     if values.dtype.kind != "f":

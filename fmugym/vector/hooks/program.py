@@ -7,6 +7,7 @@ FMU's step; ``evaluate`` runs it with numpy, so that the two can be compared.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -107,26 +108,39 @@ class Program:
 def is_always_finite(program: Program, result: int) -> bool:
     """Whether a result can be neither infinite nor NaN, whatever the program loads.
 
-    What a program loads is finite: the pool does not step with inputs that are not, and an FMU
-    whose outputs are not has failed. Only arithmetic may overflow, or divide by zero.
+    The values that a program loads are finite: the pool does not step with other inputs, and an FMU
+    with other outputs has failed. So a bound of all magnitudes shows where arithmetic may overflow.
     """
-    finite: list[bool] = []
+    bounds: list[float] = []
     for number, *operands in program.code.tolist():
         operation = OPERATIONS[number]
         if operation == "constant":
-            finite.append(math.isfinite(program.constants[operands[0]]))
-        elif operation in _CHOICES:
-            used = operands[1:] if operation == "where" else operands[:2]
-            finite.append(all(finite[operand] for operand in used))
+            constant = abs(float(program.constants[operands[0]]))
+            bounds.append(constant if constant <= _LARGEST else math.inf)  # a NaN, too
+        elif operation in _BOUNDS:
+            a, b, c = (bounds[operand] if operand < len(bounds) else 0.0 for operand in operands)
+            bounds.append(_BOUNDS[operation](a, b, c))
         else:
-            finite.append(operation not in _MAY_OVERFLOW)
-    return finite[int(program.results[result])]
+            bounds.append(_LARGEST if operation in _LOADED else 1.0)
+    return bounds[int(program.results[result])] <= _LARGEST
 
 
-_CHOICES: Final = frozenset({"absolute", "maximum", "minimum", "negative", "where"})
-"""Operations whose result is finite if their operands are."""
+_LARGEST: Final = sys.float_info.max
+_LOADED: Final = frozenset({"output", "input", "action", "parameter", "step_count"})
 
-_MAY_OVERFLOW: Final = frozenset({"add", "subtract", "multiply", "divide", "square_root"})
+_BOUNDS: Final[Mapping[str, Callable[[float, float, float], float]]] = {
+    "add": lambda a, b, _: a + b,
+    "subtract": lambda a, b, _: a + b,
+    "multiply": lambda a, b, _: a * b,
+    "divide": lambda *_: math.inf,
+    "negative": lambda a, *_: a,
+    "absolute": lambda a, *_: a,
+    "square_root": lambda *_: math.inf,  # it is NaN for a negative number
+    "minimum": lambda a, b, _: max(a, b),
+    "maximum": lambda a, b, _: max(a, b),
+    "where": lambda _, b, c: max(b, c),
+}
+"""Bounds of the magnitudes of results; comparisons and logic give 0 or 1."""
 
 
 def evaluate(program: Program, batch: FMUEnv) -> list[FloatArray]:

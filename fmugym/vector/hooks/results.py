@@ -57,38 +57,47 @@ def rewards(value: Any, count: int) -> FloatArray:
 
 def write_inputs(value: Any, inputs: FloatArray) -> None:
     """Write the result of ``_get_inputs`` to the inputs of the FMUs, shape (k, N)."""
-    if type(value) is np.ndarray and value.shape == inputs.shape and value.dtype == _FLOAT:
+    length, count = inputs.shape
+    is_floats = type(value) is np.ndarray and value.dtype == _FLOAT
+    if is_floats and (value.shape == inputs.shape or (length == 1 and value.shape == (count,))):
         inputs[:] = value
         return
     given(value, "_get_inputs")
-    length, count = inputs.shape
     wanted = f"{length} numbers, or arrays of {count}"
-    with _expected("_get_inputs", value, wanted):
-        rows = value if isinstance(value, list | tuple) else _rows_of(value, length)
-        if len(rows) != length:
-            raise ConfigError(f"_get_inputs returned {len(rows)} values, expected {length}")
-        for row, part in zip(inputs, rows, strict=True):
-            row[:] = _numbers("_get_inputs", part, count, wanted)
+    is_list = issubclass(type(value), list | tuple)
+    rows = value if is_list else _rows_of(value, length, wanted)
+    if len(rows) != length:
+        raise ConfigError(f"_get_inputs returned {len(rows)} values, expected {length}")
+    for row, part in zip(inputs, rows, strict=True):
+        is_row = type(part) is np.ndarray and part.dtype == _FLOAT and part.shape == (count,)
+        row[:] = part if is_row else _numbers("_get_inputs", part, count, wanted)
 
 
-def _rows_of(value: Any, length: int) -> Any:
+def _rows_of(value: Any, length: int, wanted: str) -> Any:
     """The rows of an array; an array for a single input may be that row itself."""
-    array = value if isinstance(value, np.ndarray) else np.asarray(value)
+    array = value
+    if type(value) is not np.ndarray:
+        with _expected("_get_inputs", value, wanted):
+            array = np.asarray(value)
     return array if array.ndim >= (2 if length == 1 else 1) else [array]
 
 
 def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]:
     """Turn a number, or an array of N numbers, into an array of shape (N,); it may be a view."""
     given(value, hook)
-    with _expected(hook, value, wanted):
+    try:
         array = np.asarray(value)
         if array.dtype == object:  # decimals, fractions and the like
             array = np.array([number_of(hook, one) for one in array.flat]).reshape(array.shape)
-        if array.dtype.kind not in _NUMBERS:
-            raise _mismatch(hook, value, wanted)
         if array.ndim > 1 and array.size == count:
             array = array.reshape(count)
-        return np.broadcast_to(array, (count,))
+        if array.dtype.kind in _NUMBERS:
+            return np.broadcast_to(array, (count,))
+    except FMUGymError:
+        raise
+    except Exception:  # it makes no array, or its own methods fail
+        raise _mismatch(hook, value, wanted) from None
+    raise _mismatch(hook, value, wanted)
 
 
 @contextmanager
