@@ -205,4 +205,3 @@ class Pool(ABC):
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """Return what is known of the last step by name, each of shape (N,)."""
         return {}
-
