@@ -74,13 +74,14 @@ void snapshots_drop_all(Pool *pool) {
     }
 }
 
-/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the next
- * one inside finds it. */
+/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the
+ * next one inside finds it. */
 void pool_abandon(Pool *pool, Snapshot *snapshot) {
     atomic_set(&snapshot->abandoned, 1);
     atomic_set(&pool->abandoned, 1);
     if (mutex_try_lock(&pool->lock)) {
         begin_inside(pool);
+        pool->floats = floats_now();
         pool_leave(pool);
     }
 }
@@ -89,9 +90,10 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
     const size_t index = index_of(pool, me);
 
     if (me->phase != PHASE_STEPPING) {
-        return instance_refuse(me, me->phase == PHASE_INSTANTIATED
-                              ? "cannot save the FMU state before the first reset"
-                              : "cannot save the FMU state before a reset has mended the instance");
+        return instance_refuse(
+            me, me->phase == PHASE_INSTANTIATED
+                    ? "cannot save the FMU state before the first reset"
+                    : "cannot save the FMU state before a reset has mended the instance");
     }
     snapshot->generations[index] = me->generation;
     snapshot->steps[index] = me->steps;
