@@ -139,37 +139,35 @@ static Type stored_type(const Access *access, const Group *group) {
 }
 
 Status access_get(const Access *access, const Library *library, void *component, double *values,
-                  void *typed) {
+                  void *typed, const Floats *floats) {
     const Fmi *fmi = access->fmi;
     const Group *group = access->groups;
-    const Floats floats = floats_now();
     Status worst = STATUS_OK;
 
     if (access->direct) {
         worst = fmi->get(library, component, TYPE_FLOAT64, group->references, group->count, values);
-        floats_restore(&floats);
+        floats_restore_if_seen(floats);
         return worst;
     }
     for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
         const Status status =
             fmi->get(library, component, group->type, group->references, group->count, typed);
         worst = status > worst ? status : worst;
-        floats_restore(&floats);
+        floats_restore_if_seen(floats);
         load(group, stored_type(access, group), typed, values);
     }
     return worst;
 }
 
 Status access_set(const Access *access, const Library *library, void *component,
-                  const double *values, void *typed) {
+                  const double *values, void *typed, const Floats *floats) {
     const Fmi *fmi = access->fmi;
     const Group *group = access->groups;
-    const Floats floats = floats_now();
     Status worst = STATUS_OK;
 
     if (access->direct) {
         worst = fmi->set(library, component, TYPE_FLOAT64, group->references, group->count, values);
-        floats_restore(&floats);
+        floats_restore_if_seen(floats);
         return worst;
     }
     for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
@@ -177,7 +175,7 @@ Status access_set(const Access *access, const Library *library, void *component,
         const Status status =
             fmi->set(library, component, group->type, group->references, group->count, typed);
         worst = status > worst ? status : worst;
-        floats_restore(&floats);
+        floats_restore_if_seen(floats);
     }
     return worst;
 }

@@ -17,7 +17,7 @@ typedef struct {
     uint64_t id; /* unique in the process */
     size_t count;
     size_t number_of_groups;
-    bool direct; /* all values are doubles: the FMU uses the list's own memory */
+    bool direct;      /* all values are doubles: the FMU uses the list's own memory */
     uint32_t *memory; /* references and positions of all groups */
     Group groups[NUMBER_OF_TYPES];
 } Access;
@@ -29,13 +29,14 @@ bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const cha
 void access_close(Access *access);
 
 /* Both use typed as scratch memory, of access_scratch bytes, and return the worst status; after one
- * worse than a warning no other type is asked. */
+ * worse than a warning no other type is asked. After
+ * each call into the FMU the floating-point environment is restored. */
 static inline size_t access_scratch(const Access *access) {
     return access->count * sizeof(double);
 }
 Status access_get(const Access *access, const Library *library, void *component, double *values,
-                  void *typed);
+                  void *typed, const Floats *floats);
 Status access_set(const Access *access, const Library *library, void *component,
-                  const double *values, void *typed);
+                  const double *values, void *typed, const Floats *floats);
 
 #endif

@@ -7,7 +7,6 @@
 #include "failures.h"
 #include "instances.h"
 
-
 /* Other start variables than before: what was kept of them is of no use any more. */
 static bool make_room_for_starts(Pool *pool, const Access *start) {
     const size_t count = pool->settings.count;
@@ -63,8 +62,8 @@ static Status read_instance(Pool *pool, Instance *me, const Access *access, doub
     if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
         return instance_refuse(me, "the instance needs a reset before anything can be read");
     }
-    const Status status =
-        access_get(access, me->library, me->component, memory, memory + access->count);
+    const Status status = access_get(access, me->library, me->component, memory,
+                                     memory + access->count, &pool->floats);
     if (status > STATUS_WARNING) {
         return instance_fail(pool, me, "reading variables", status);
     }

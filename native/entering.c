@@ -38,6 +38,7 @@ static Entry enter_locked(Pool *pool) {
         return ENTRY_CLOSED;
     }
     begin_inside(pool);
+    pool->floats = floats_now();
     return ENTRY_ENTERED;
 }
 
@@ -58,6 +59,7 @@ Entry pool_enter(Pool *pool) {
 
 void pool_leave(Pool *pool) {
     pool_drop_abandoned(pool);
+    floats_restore(&pool->floats);
     end_inside();
     mutex_unlock(&pool->lock);
 }

@@ -52,7 +52,8 @@ Status instance_judge(Instance *me, Status status) {
     return status;
 }
 
-Status instance_note_not_finite(Instance *me, const char *what, const double *values, size_t count) {
+Status instance_note_not_finite(Instance *me, const char *what, const double *values,
+                                size_t count) {
     Failure *failure = failure_note(me, what, -1);
     if (failure != NULL) {
         failure->values = copy_values(values, count);

@@ -24,8 +24,7 @@ Status instance_fail(Pool *pool, Instance *me, const char *doing, Status status)
 /* A call was not even made. */
 Status instance_refuse(Instance *me, const char *reason);
 /* Values that are not finite are the reason. */
-Status instance_note_not_finite(Instance *me, const char *what, const double *values,
-                                size_t count);
+Status instance_note_not_finite(Instance *me, const char *what, const double *values, size_t count);
 
 void health_count_fault(const Pool *pool, const Instance *me, Status status);
 /* Adds the steps since the last time; steps count themselves. */

@@ -1,10 +1,10 @@
 /* The floating-point environment: rounding mode, treatment of denormal numbers, traps.
  *
  * An FMU that leaves another one behind would change the last bits of whatever its thread computes
- * next. So it is put back before the next instance has its turn. To read the control register takes as
- * long as a tenth of a small FMU's step, because the processor finishes all pending arithmetic first.
- * Between the instances of a run it is therefore enough to see that sums are rounded as before; what
- * no sum can tell (traps, the registers of the x87) is put back at the end of the run. */
+ * next. So it is restored before the next instance has its turn. Reading the control register takes a
+ * tenth of a small FMU's step, because the processor finishes all pending arithmetic first. After a
+ * step it is therefore enough to see that sums are rounded as before. What no sum can tell (traps, the
+ * control word of the x87) is restored at the end of each chunk of work. */
 
 #ifndef FMUGYM_FLOATS_H
 #define FMUGYM_FLOATS_H
@@ -25,10 +25,12 @@
 #if defined FMUGYM_FLOATS_X86
 
 typedef struct {
-    __m128i sums; /* what the processor makes of sums that every mode rounds in another way */
+    uint32_t sums[4]; /* what the processor makes of sums that every mode rounds in another way */
     uint32_t sse;
     uint16_t x87;
 } Floats;
+
+#define FLOATS_STICKY ((uint32_t)0x3f) /* exceptions seen, which are no modes */
 
 /* Sums that come out differently rounded upwards (the first) and downwards or towards zero (the
  * second), and where denormal numbers count as zero (the others). */
@@ -53,17 +55,20 @@ static inline uint16_t floats_x87(void) {
 }
 
 static inline Floats floats_now(void) {
-    const uint32_t sticky = 0x3f; /* exceptions seen, which are no modes */
-    return (Floats){floats_sums(), _mm_getcsr() & ~sticky, floats_x87()};
+    Floats now = {.sse = _mm_getcsr() & ~FLOATS_STICKY, .x87 = floats_x87()};
+
+    _mm_storeu_si128((__m128i *)now.sums, floats_sums());
+    return now;
 }
 
 static inline bool floats_seem_same(const Floats *before) {
-    const __m128i same = _mm_cmpeq_epi32(floats_sums(), before->sums);
+    const __m128i sums = _mm_loadu_si128((const __m128i *)before->sums);
+    const __m128i same = _mm_cmpeq_epi32(floats_sums(), sums);
     return _mm_movemask_epi8(same) == 0xffff;
 }
 
 static inline void floats_restore(const Floats *before) {
-    if ((_mm_getcsr() & ~(uint32_t)0x3f) != before->sse) {
+    if ((_mm_getcsr() & ~FLOATS_STICKY) != before->sse) {
         _mm_setcsr(before->sse);
     }
 #if defined __GNUC__
@@ -120,7 +125,6 @@ static inline void floats_restore(const Floats *before) {
 
 #endif
 
-/* Between the instances of a run. */
 static inline void floats_restore_if_seen(const Floats *before) {
     if (!floats_seem_same(before)) {
         floats_restore(before);

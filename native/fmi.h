@@ -101,8 +101,8 @@ typedef struct Fmi {
     /* no_return promises that no state from before this time will be restored. */
     Status (*do_step)(const Library *library, void *component, double time, double step,
                       bool no_return);
-    /* Does steps with inputs and outputs that are all FLOAT64; what exchange_by makes of the version.
-     * Returns whether all of them are OK. */
+    /* Does steps with inputs and outputs that are all FLOAT64; what exchange_by makes of the
+     * version. Returns whether all of them are OK. */
     bool (*exchange)(const Library *library, const Exchange *exchange);
     Status (*get)(const Library *library, void *component, Type type, const uint32_t *references,
                   size_t count, void *values);
@@ -140,8 +140,7 @@ static inline Outcome exchange_once(const Fmi *fmi, const Library *library, cons
                               e->number_of_inputs, inputs);
     if (outcome.status <= STATUS_WARNING) {
         outcome.stage = DOING_STEP;
-        outcome.status =
-            fmi->do_step(library, component, e->times[index], e->step, e->no_return);
+        outcome.status = fmi->do_step(library, component, e->times[index], e->step, e->no_return);
     }
     if (has_outputs(outcome)) {
         const Status got = fmi->get(library, component, TYPE_FLOAT64, e->output_references,
@@ -161,7 +160,6 @@ static inline bool exchange_by(const Fmi *fmi, const Library *library, const Exc
         floats_restore_if_seen(e.floats);
         good &= e.outcomes[i].status == STATUS_OK;
     }
-    floats_restore(e.floats);
     return good;
 }
 

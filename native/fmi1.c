@@ -65,9 +65,9 @@ static const Functions *functions_of(const Library *library) {
 
 static void *instantiate(const Library *library, const Identity *identity) {
     const Callbacks callbacks = {log_message_fmi1, calloc, free, NULL};
-    return functions_of(library)->instantiate(
-        identity->name, identity->token, identity->resources, "application/x-fmu-sharedlibrary",
-        0.0, 0, 0, callbacks, identity->logging);
+    return functions_of(library)->instantiate(identity->name, identity->token, identity->resources,
+                                              "application/x-fmu-sharedlibrary", 0.0, 0, 0,
+                                              callbacks, identity->logging);
 }
 
 static Status initialize(const Library *library, void *component, const Experiment *e,

@@ -13,22 +13,21 @@ typedef struct {
     Pool *pool;
     Instance *me;
     const Access *start;
-    Scratch scratch; /* holds the start values */
+    Scratch scratch;  /* holds the start values */
     uint32_t refused; /* the String that could not be set */
 } StartContext;
 
 static Status set_start_values(void *context) {
     StartContext *c = context;
     const Settings *s = &c->pool->settings;
-    const Floats floats = floats_now();
     Status status = access_set(c->start, c->me->library, c->me->component, c->scratch.values,
-                               c->scratch.typed);
+                               c->scratch.typed, &c->pool->floats);
 
     for (size_t i = 0; i < s->number_of_strings && status <= STATUS_WARNING; i++) {
         const StringValue *string = &s->strings[i];
-        status = s->fmi->set_string(c->me->library, c->me->component, string->reference,
-                                    string->text);
-        floats_restore(&floats);
+        status =
+            s->fmi->set_string(c->me->library, c->me->component, string->reference, string->text);
+        floats_restore_if_seen(&c->pool->floats);
         c->refused = status > STATUS_WARNING ? string->reference : c->refused;
     }
     return status;
@@ -65,7 +64,6 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     const Settings *s = &pool->settings;
     StartContext context = {pool, me, start, scratch, UINT32_MAX};
     const char *doing = "initialization";
-    const Floats floats = floats_now();
     Status status = instance_return_to_start(pool, me);
 
     if (status > STATUS_WARNING) {
@@ -73,7 +71,7 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     }
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
-    floats_restore(&floats);
+    floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         return fail_initialization(pool, me, &context, doing, status);
     }
@@ -81,8 +79,8 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     return warm_up(pool, me);
 }
 
-/* Initial states: kept once the same start values come a second time, after an episode with steps, and
- * restored from then on. */
+/* Initial states: kept once the same start values come a second time, after an episode with steps,
+ * and restored from then on. */
 
 static bool states_are_of_use(Pool *pool, const Instance *me) {
     return pool->settings.restores && !me->unsavable && !atomic_get(&pool->states_too_large);
@@ -90,9 +88,8 @@ static bool states_are_of_use(Pool *pool, const Instance *me) {
 
 static bool too_large(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
-    const Floats floats = floats_now();
     const size_t size = s->fmi->state_size(me->library, me->component, me->saved);
-    floats_restore(&floats);
+    floats_restore_if_seen(&pool->floats);
     return size > STATES_LIMIT / s->count;
 }
 
@@ -114,8 +111,7 @@ static bool starts_as_before(const Pool *pool, const Instance *me, const Access 
     return me->start_id == start->id && memcmp(start_values_of(pool, me), values, size) == 0;
 }
 
-static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
-                         Scratch scratch) {
+static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
     const Access *start = call->start;
 
     instance_free_state(pool, me, &me->saved);

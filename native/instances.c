@@ -13,23 +13,21 @@ bool instance_build(Pool *pool, Instance *me) {
     const Identity identity = {name_of(pool, index), s->token, s->resources,
                                log_environment(&pool->log, index), s->logging};
 
-    const Floats floats = floats_now();
-
     mutex_lock(&pool->making);
     me->component = s->fmi->instantiate(me->library, &identity);
     mutex_unlock(&pool->making);
-    floats_restore(&floats);
+    floats_restore_if_seen(&pool->floats);
     me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
     return me->component != NULL;
 }
 
 Status instance_free_state(const Pool *pool, Instance *me, void **state) {
-    const Floats floats = floats_now();
     Status status = STATUS_OK;
 
     if (*state != NULL && me->phase != PHASE_DEAD) {
-        status = instance_judge(me, pool->settings.fmi->free_state(me->library, me->component, state));
-        floats_restore(&floats);
+        status =
+            instance_judge(me, pool->settings.fmi->free_state(me->library, me->component, state));
+        floats_restore_if_seen(&pool->floats);
     }
     *state = NULL; /* after Fatal the standard forbids to free it: the memory is given up */
     return status;
@@ -50,7 +48,6 @@ static void free_states(Pool *pool, Instance *me) {
 
 void instance_discard(Pool *pool, Instance *me) {
     const Fmi *fmi = pool->settings.fmi;
-    const Floats floats = floats_now();
 
     free_states(pool, me);
     if (me->phase == PHASE_STEPPING || me->phase == PHASE_ENDED) {
@@ -61,7 +58,7 @@ void instance_discard(Pool *pool, Instance *me) {
         fmi->free_instance(me->library, me->component);
         mutex_unlock(&pool->making);
     }
-    floats_restore(&floats);
+    floats_restore_if_seen(&pool->floats);
     me->component = NULL;
     me->phase = PHASE_DEAD;
     me->generation++;
@@ -73,7 +70,6 @@ void instance_discard(Pool *pool, Instance *me) {
 /* A private library may be loaded anew: whatever Fatal left in its globals is gone then. */
 static void reload_private_library(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
-    const Floats floats = floats_now(); /* code runs when a library is loaded, too */
     char unused[256];
 
     if (s->private_libraries) {
@@ -83,7 +79,7 @@ static void reload_private_library(Pool *pool, Instance *me) {
             library_close(me->library);
         }
     }
-    floats_restore(&floats);
+    floats_restore(&pool->floats); /* code runs when a library is loaded, too */
 }
 
 static Status rebuild(Pool *pool, Instance *me) {
@@ -97,8 +93,10 @@ static Status rebuild(Pool *pool, Instance *me) {
     if (loaded && instance_build(pool, me)) {
         return STATUS_OK;
     }
-    Failure *failure = failure_note(me, loaded ? "the FMU refused to be instantiated anew"
-                                               : "the FMU's library cannot be loaded anew", -1);
+    Failure *failure = failure_note(me,
+                                    loaded ? "the FMU refused to be instantiated anew"
+                                           : "the FMU's library cannot be loaded anew",
+                                    -1);
     if (failure != NULL) {
         failure->said = log_said(&pool->log, index_of(pool, me));
     }
@@ -131,9 +129,8 @@ Status instance_return_to_start(Pool *pool, Instance *me) {
         return STATUS_OK;
     }
     if (me->phase != PHASE_DEAD) {
-        const Floats floats = floats_now();
         const Status status = pool->settings.fmi->reset(me->library, me->component);
-        floats_restore(&floats);
+        floats_restore_if_seen(&pool->floats);
         if (status <= STATUS_WARNING) {
             me->phase = PHASE_INSTANTIATED;
             return STATUS_OK;
@@ -144,21 +141,20 @@ Status instance_return_to_start(Pool *pool, Instance *me) {
 }
 
 Status instance_save(Pool *pool, Instance *me, void **state) {
-    const Floats floats = floats_now();
 
     *state = NULL;
     const Status status = pool->settings.fmi->get_state(me->library, me->component, state);
-    floats_restore(&floats);
-    return status > STATUS_WARNING ? instance_fail(pool, me, "saving the FMU state", status) : status;
+    floats_restore_if_seen(&pool->floats);
+    return status > STATUS_WARNING ? instance_fail(pool, me, "saving the FMU state", status)
+                                   : status;
 }
 
 Status instance_restore(Pool *pool, Instance *me, void *state) {
     if (me->phase == PHASE_DEAD) {
         return instance_refuse(me, "no restore after a fatal error");
     }
-    const Floats floats = floats_now();
     const Status status = pool->settings.fmi->set_state(me->library, me->component, state);
-    floats_restore(&floats);
+    floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         instance_fail(pool, me, "restoring the FMU state", status);
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;

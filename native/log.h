@@ -56,8 +56,8 @@ void log_give_back(Log *log, Message *first, size_t dropped);
 char *log_said(Log *log, size_t index);
 void log_forget(Log *log, size_t index);
 
-/* From now on the ends of all messages, a line each, are also written to this memory, as a text of less
- * than size bytes, before the FMU goes on: the process may not survive what it does next. */
+/* From now on the ends of all messages, a line each, are also written to this memory, as a text of
+ * less than size bytes, before the FMU goes on: the process may not survive what it does next. */
 void log_echo_to(char *memory, size_t size);
 
 /* Fork: the lock is held while it happens, so that the child finds no half-done change. */

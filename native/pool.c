@@ -67,7 +67,6 @@ static void prepare_instance(Pool *pool, size_t index) {
 
 static bool load_libraries(Pool *pool, char *error, size_t size) {
     const Settings *s = &pool->settings;
-    const Floats floats = floats_now();
     bool loaded = true;
 
     for (size_t i = 0; i < number_of_libraries(s) && loaded; i++) {
@@ -75,7 +74,7 @@ static bool load_libraries(Pool *pool, char *error, size_t size) {
         loaded = library_open(&pool->libraries[i], s->paths[i], error, size) &&
                  s->fmi->bind(&pool->libraries[i], error, size);
     }
-    floats_restore(&floats);
+    floats_restore(&pool->floats);
     return loaded;
 }
 
@@ -102,6 +101,7 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
                    settings->outputs->direct;
     pool->open = true;
+    pool->floats = floats_now();
     link_pool(pool);
     snprintf(error, size, "out of memory");
     if (!log_open(&pool->log, settings->count) || !allocate(pool)) {
@@ -116,7 +116,6 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
 /* As many as were made before memory ran out. */
 static void free_instances(Pool *pool) {
     const Settings *s = &pool->settings;
-    const Floats floats = floats_now();
 
     for (size_t i = 0; i < s->count && pool->instances != NULL; i++) {
         instance_discard(pool, &pool->instances[i]);
@@ -125,7 +124,7 @@ static void free_instances(Pool *pool) {
     for (size_t i = 0; i < number_of_libraries(s) && pool->libraries != NULL; i++) {
         library_close(&pool->libraries[i]);
     }
-    floats_restore(&floats);
+    floats_restore(&pool->floats);
 }
 
 void pool_close(Pool *pool) {

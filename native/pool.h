@@ -2,13 +2,14 @@
  *
  * The pool writes outputs and statuses into memory of its owner. Calls may come from any thread:
  * each begins with pool_enter or pool_try_enter and ends with pool_leave, so that the calls for one
- * pool take turns. Whoever holds the GIL must not wait for a pool, as the thread inside may need it;
- * that is what pool_try_enter is for. */
+ * pool take turns. Whoever holds the GIL must not wait for a pool, as the thread inside may need
+ * it; that is what pool_try_enter is for. */
 
 #ifndef FMUGYM_POOL_H
 #define FMUGYM_POOL_H
 
 #include "access.h"
+#include "floats.h"
 #include "fmi.h"
 #include "log.h"
 #include "platform.h"
@@ -77,10 +78,10 @@ typedef struct {
     const char *doing; /* what failed; with the status -1 a whole sentence */
     int status;
     bool in_warm_up;
-    double time;    /* of a step, NaN for other calls */
+    double time;               /* of a step, NaN for other calls */
     uint32_t string_reference; /* of the String that could not be set, or UINT32_MAX */
-    char *said;     /* what the FMU logged, or NULL */
-    double *values; /* the inputs or outputs if these are the reason, or NULL */
+    char *said;                /* what the FMU logged, or NULL */
+    double *values;            /* the inputs or outputs if these are the reason, or NULL */
     size_t number_of_values;
 } Failure;
 
@@ -129,7 +130,8 @@ typedef struct Pool {
     bool no_return;   /* whether no state will ever be restored */
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
-    Mutex making; /* held while an instance is made or freed: FMUs keep lists of theirs */
+    Floats floats; /* of the thread inside: the environment that FMUs shall find */
+    Mutex making;  /* held while an instance is made or freed: FMUs keep lists of theirs */
     bool open;
     Log log;
     Library *libraries;
@@ -172,8 +174,8 @@ typedef struct {
 /* To be called once per process. */
 void pool_prepare_process(void);
 
-/* Returns whether all could be loaded and instantiated; if not, error tells why, and the pool must be
- * closed. Only pool_open and pool_dispose need no pool_enter. */
+/* Returns whether all could be loaded and instantiated; if not, error tells why, and the pool must
+ * be closed. Only pool_open and pool_dispose need no pool_enter. */
 bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size);
 
 /* Frees what a closed pool still has. Nobody may use it any more. */
@@ -237,8 +239,8 @@ ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);
  * status worse than a warning now. */
 bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled);
 
-/* Frees a pool's snapshot, now or once the thread inside the pool leaves. Waits for nobody and may be
- * called from anywhere, so also inside. */
+/* Frees a pool's snapshot, now or once the thread inside the pool leaves. Waits for nobody and may
+ * be called from anywhere, so also inside. */
 void pool_abandon(Pool *pool, Snapshot *snapshot);
 
 #endif

@@ -13,8 +13,8 @@ enum {
     PROGRAM_RESULTS = 16  /* results, at most */
 };
 
-/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order, which is compared when that
- * is imported. */
+/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order, which is compared
+ * when that is imported. */
 typedef enum {
     LOAD_OUTPUT,
     LOAD_INPUT,
@@ -65,14 +65,14 @@ typedef struct {
 typedef struct {
     const double *outputs, *inputs, *parameters;
     const int64_t *actions, *step_counts;
-    size_t count;                                    /* length of a row */
+    size_t count; /* length of a row */
     size_t number_of_outputs, number_of_inputs, number_of_parameters;
 } Source;
 
 typedef double Registers[PROGRAM_LENGTH][PROGRAM_WIDTH];
 
-/* Once before the first run with these registers: constants stay in their place, and where there are
- * fewer instances than a register is wide, the rest is 0. */
+/* Once before the first run with these registers: constants stay in their place, and where there
+ * are fewer instances than a register is wide, the rest is 0. */
 void program_prepare(const Program *program, Registers registers);
 
 /* Whether every operand refers to something that there is. */

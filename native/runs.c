@@ -45,10 +45,8 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
     for (size_t i = begin; i < end; i++) {
         const size_t index = pool->chosen[i];
         Instance *me = &pool->instances[index];
-        const Status status =
-            task->operation == RESTORE
-                ? restore_instance(task, me, scratch)
-                : instance_reset(pool, me, call, scratch);
+        const Status status = task->operation == RESTORE ? restore_instance(task, me, scratch)
+                                                         : instance_reset(pool, me, call, scratch);
         troubled += note_status(task, index, status);
         if (call->observations != NULL) {
             write_observation(pool, index, call->observations);
@@ -171,8 +169,8 @@ static size_t do_one(Task *task, size_t index, Scratch scratch) {
     return troubled;
 }
 
-/* Those of a run that are stepped together, by one call of the FMI version, and the others; by their
- * places in the run. */
+/* Those of a run that are stepped together, by one call of the FMI version, and the others; by
+ * their places in the run. */
 typedef struct {
     size_t count, others;
     uint32_t places[RUN], other_places[RUN];
@@ -260,7 +258,7 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
         .components = line->components,
         .places = line->places,
         .times = line->times,
-        .floats = scratch.floats,
+        .floats = &pool->floats,
         .inputs = scratch.inputs,
         .outputs = scratch.outputs,
         .outcomes = line->outcomes,

@@ -18,8 +18,8 @@ typedef struct {
     bool listed;              /* whether the items are places in pool->chosen, or instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
-    Atomic ended;    /* episodes, when playing */
-    Atomic time;     /* ns, of all threads together, if measured */
+    Atomic ended;                         /* episodes, when playing */
+    Atomic time;                          /* ns, of all threads together, if measured */
 } Task;
 
 static inline bool is_in(Mask mask, size_t index) {
@@ -30,8 +30,8 @@ static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;
 }
 
-/* All three work on items from begin to end and return how many instances have a status worse than a
- * warning. Resets or restores instances that need not be neighbours: */
+/* All three work on items from begin to end and return how many instances have a status worse than
+ * a warning. Resets or restores instances that need not be neighbours: */
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);
 /* Steps or resets: */
 size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch);

@@ -7,7 +7,7 @@
 #include "threads.h"
 
 /* All in ns. */
-static const double QUICK = 10e3;         /* for which others may wait */
+static const double QUICK = 10e3; /* for which others may wait */
 static const double SMALLEST_CHUNK = 2e3;
 static const double LARGEST_CHUNK = 50e3;
 static const double WORTH_A_THREAD = 10e3; /* of work, for which waking another one pays */
@@ -63,9 +63,8 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     if (memory == NULL) {
         return task_give_up(task, begin, end);
     }
-    const Floats floats = floats_now();
     const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in,
-                             true, &floats};
+                             true};
     const size_t troubled = work_with(task, begin, end, scratch);
     if (memory != stack) {
         free(memory);
@@ -80,6 +79,7 @@ static void work(void *context, size_t begin, size_t end) {
 
     begin_inside(task->pool);
     const size_t troubled = work_with_memory(task, begin, end);
+    floats_restore(&task->pool->floats);
     end_inside();
     if (troubled > 0) {
         atomic_add(&task->troubled, troubled);

@@ -74,13 +74,14 @@ void snapshots_drop_all(Pool *pool) {
     }
 }
 
-/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the next
- * one inside finds it. */
+/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the
+ * next one inside finds it. */
 void pool_abandon(Pool *pool, Snapshot *snapshot) {
     atomic_set(&snapshot->abandoned, 1);
     atomic_set(&pool->abandoned, 1);
     if (mutex_try_lock(&pool->lock)) {
         begin_inside(pool);
+        pool->floats = floats_now();
         pool_leave(pool);
     }
 }

@@ -30,13 +30,12 @@ Status instance_fail_step(Pool *pool, Instance *me, double time, Status status) 
 static Status step_in_parts(Pool *pool, Instance *me, double time, int64_t parts) {
     const Settings *s = &pool->settings;
     const double size = pool->step_size / (double)parts;
-    const Floats floats = floats_now();
     Status status = STATUS_OK;
 
     for (int64_t i = 0; i < parts && status <= STATUS_WARNING; i++) {
         status = s->fmi->do_step(me->library, me->component, time + (double)i * size, size,
                                  pool->no_return);
-        floats_restore(&floats);
+        floats_restore_if_seen(&pool->floats);
     }
     return status;
 }
@@ -49,9 +48,8 @@ static Status retry(Pool *pool, Instance *me, double time, void *before) {
     Status status = STATUS_DISCARD;
 
     for (int64_t i = 1; i <= s->retries && status == STATUS_DISCARD; i++) {
-        const Floats floats = floats_now();
         const Status restored = s->fmi->set_state(me->library, me->component, before);
-        floats_restore(&floats);
+        floats_restore_if_seen(&pool->floats);
         if (restored > STATUS_WARNING) {
             return restored;
         }
@@ -64,10 +62,9 @@ static Status retry(Pool *pool, Instance *me, double time, void *before) {
 
 static Status step_with_retries(Pool *pool, Instance *me, double time) {
     void *before = NULL;
-    const Floats floats = floats_now();
     Status status = pool->settings.fmi->get_state(me->library, me->component, &before);
 
-    floats_restore(&floats);
+    floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         return status;
     }
@@ -118,8 +115,8 @@ void instance_copy_outputs(const Pool *pool, const Instance *me, double *values)
 Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
     const size_t count = s->outputs->count;
-    const Status got =
-        access_get(s->outputs, me->library, me->component, scratch.values, scratch.typed);
+    const Status got = access_get(s->outputs, me->library, me->component, scratch.values,
+                                  scratch.typed, &pool->floats);
 
     if (got > STATUS_WARNING) {
         return instance_fail(pool, me, "reading the outputs", got);
@@ -163,8 +160,8 @@ Status instance_step(Pool *pool, Instance *me, Scratch scratch) {
     if (s->retries > 0) {
         health_of(pool, me)[RETRIED] = 0;
     }
-    const Status set =
-        access_set(s->inputs, me->library, me->component, scratch.inputs, scratch.typed);
+    const Status set = access_set(s->inputs, me->library, me->component, scratch.inputs,
+                                  scratch.typed, &pool->floats);
     if (set > STATUS_WARNING) {
         return instance_fail_setting(pool, me, set);
     }
@@ -172,7 +169,7 @@ Status instance_step(Pool *pool, Instance *me, Scratch scratch) {
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         return status;
     }
-    const Status got =
-        access_get(s->outputs, me->library, me->component, scratch.outputs, scratch.typed);
+    const Status got = access_get(s->outputs, me->library, me->component, scratch.outputs,
+                                  scratch.typed, &pool->floats);
     return got > STATUS_WARNING ? instance_fail_reading(pool, me, got) : status;
 }

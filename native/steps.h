@@ -4,7 +4,6 @@
 #define FMUGYM_STEPS_H
 
 #include "failures.h"
-#include "floats.h"
 #include "pool.h"
 
 /* Scratch memory of one thread. */
@@ -13,8 +12,7 @@ typedef struct {
     void *typed;    /* and their typed form */
     double *inputs; /* of a run of instances, one after the other */
     double *outputs;
-    bool sound;     /* whether these inputs are all finite */
-    const Floats *floats; /* the environment that FMUs shall find */
+    bool sound; /* whether these inputs are all finite */
 } Scratch;
 
 /* The order of operations of PoolSpec.communication_point; a division by 1 changes nothing. */

@@ -1,13 +1,13 @@
 /* Helper threads that take chunks of jobs.
  *
- * The items of a job are divided into as many ranges as threads may work on it. Each thread begins with
- * a range that is its own from job to job, as what it touches is in its processor's cache then, and
- * goes on with what is left of the others'.
+ * The items of a job are divided into as many ranges as threads may work on it. Each thread begins
+ * with a range that is its own from job to job, as what it touches is in its processor's cache
+ * then, and goes on with what is left of the others'.
  *
- * A job sits in a slot, and slots are never freed, so a helper that was put to sleep by the operating
- * system between finding a job and taking a chunk of it does no harm when it wakes up much later: a
- * chunk is taken by replacing a range's ticket, (epoch, next item), and the epoch has gone on. So
- * the caller waits for chunks that were taken, never for threads. */
+ * A job sits in a slot, and slots are never freed, so a helper that was put to sleep by the
+ * operating system between finding a job and taking a chunk of it does no harm when it wakes up
+ * much later: a chunk is taken by replacing a range's ticket, (epoch, next item), and the epoch has
+ * gone on. So the caller waits for chunks that were taken, never for threads. */
 
 #include "threads.h"
 
@@ -25,11 +25,11 @@ enum {
     SLOTS = 64, /* jobs at the same time; with more, a caller works alone */
     MOST_RANGES = 16,
     MOST_HELPERS = 255,
-    WHOLE = 16, /* items whose 32-bit values fill a line of the cache */
-    FANOUT = 2, /* helpers that each thread wakes */
+    WHOLE = 16,           /* items whose 32-bit values fill a line of the cache */
+    FANOUT = 2,           /* helpers that each thread wakes */
     STACK_SIZE = 8 << 20, /* of the main thread on most systems: FMUs may count on it */
-    HELPER_SPIN = 20000, /* ns to look for more work before going to sleep */
-    CALLER_SPIN = 5000  /* ns to wait for the last chunks before going to sleep */
+    HELPER_SPIN = 20000,  /* ns to look for more work before going to sleep */
+    CALLER_SPIN = 5000    /* ns to wait for the last chunks before going to sleep */
 };
 
 /* Of a range: epoch << 32 | next item. Each is written by another thread, most of the time. */
@@ -115,9 +115,9 @@ static void finish(Slot *slot, size_t size, size_t count) {
     }
 }
 
-/* Takes chunks of a range until there are none, or only the first one. A helper works in the caller's floating-point
- * environment: the rounding mode and the treatment of denormals must not depend on the thread. epoch is
- * that of the job for which it has been set. */
+/* Takes chunks of a range until there are none, or only the first one. A helper works in the
+ * caller's floating-point environment: the rounding mode and the treatment of denormals must not
+ * depend on the thread. epoch is that of the job for which it has been set. */
 static void take_range(Slot *slot, size_t range, bool helper, bool one, uint64_t *epoch) {
     Atomic *place = &slot->tickets[range].value;
     uint64_t ticket = atomic_get(place), taken_here = 0;
@@ -260,8 +260,8 @@ static void *helper_entry(void *number) {
     return NULL;
 }
 
-/* Signals are for the threads that were there before, except those of a thread's own faults: if they
- * are blocked, the system ends the process without a word from any handler. */
+/* Signals are for the threads that were there before, except those of a thread's own faults: if
+ * they are blocked, the system ends the process without a word from any handler. */
 static void block_signals(sigset_t *before) {
     static const int faults[] = {SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGABRT, SIGTRAP, SIGSYS};
     sigset_t blocked;
@@ -282,8 +282,8 @@ static bool start_helper(size_t number) {
     pthread_attr_setstacksize(&attributes, STACK_SIZE);
     pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
     block_signals(&before);
-    const bool made = pthread_create(&thread, &attributes, helper_entry,
-                                     (void *)(uintptr_t)number) == 0;
+    const bool made =
+        pthread_create(&thread, &attributes, helper_entry, (void *)(uintptr_t)number) == 0;
     pthread_sigmask(SIG_SETMASK, &before, NULL);
     pthread_attr_destroy(&attributes);
     return made;
@@ -360,8 +360,8 @@ static void wait_for_chunks(Slot *slot, size_t count) {
     mutex_unlock(&slot->lock);
 }
 
-/* Helpers that look for work take part at once. Those that sleep are woken after the first chunk, by
- * which time there may be nothing left for them. */
+/* Helpers that look for work take part at once. Those that sleep are woken after the first chunk,
+ * by which time there may be nothing left for them. */
 void threads_run(const Job *job) {
     uint64_t epoch = UINT64_MAX;
     Slot *slot = job->helpers == 0 || job->count < 2 ? NULL : take_slot();

@@ -75,5 +75,4 @@ static PyType_Slot slots[] = {
     {0, NULL},
 };
 
-PyType_Spec access_spec = {"fmugym._native.Access", sizeof(PyAccess), 0, Py_TPFLAGS_DEFAULT,
-                           slots};
+PyType_Spec access_spec = {"fmugym._native.Access", sizeof(PyAccess), 0, Py_TPFLAGS_DEFAULT, slots};

@@ -6,13 +6,15 @@
 
 typedef struct {
     const char *name;
-    const char *formats; /* of the module struct; which of them has the size depends on the system */
+    const char
+        *formats; /* of the module struct; which of them has the size depends on the system */
     Py_ssize_t size;
 } ItemType;
 
 static const ItemType types[] = {
-    [ITEM_FLOAT64] = {"float64", "d", 8}, [ITEM_FLOAT32] = {"float32", "f", 4}, [ITEM_INT64] = {"int64", "lq", 8},
-    [ITEM_INT8] = {"int8", "b", 1},       [ITEM_BOOLEAN] = {"bool", "?", 1},
+    [ITEM_FLOAT64] = {"float64", "d", 8}, [ITEM_FLOAT32] = {"float32", "f", 4},
+    [ITEM_INT64] = {"int64", "lq", 8},    [ITEM_INT8] = {"int8", "b", 1},
+    [ITEM_BOOLEAN] = {"bool", "?", 1},
 };
 
 static bool has_type(const Py_buffer *buffer, const ItemType *type) {

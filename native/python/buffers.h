@@ -11,9 +11,9 @@
 typedef enum { ITEM_FLOAT64, ITEM_FLOAT32, ITEM_INT64, ITEM_INT8, ITEM_BOOLEAN } Item;
 
 typedef enum {
-    COPIED,     /* with any strides and at any address; values are copied out */
+    COPIED,   /* with any strides and at any address; values are copied out */
     IN_PLACE, /* C-contiguous and aligned, used in place */
-    WRITTEN     /* likewise, and written */
+    WRITTEN   /* likewise, and written */
 } Use;
 
 enum { ANY_LENGTH = -1 }; /* for a length of any number */

@@ -11,8 +11,8 @@ bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
     return given == expected;
 }
 
-/* A call, the arrays that it holds on to, and what comes of it. Arrays that are the pool's own need no
- * new buffer. */
+/* A call, the arrays that it holds on to, and what comes of it. Arrays that are the pool's own need
+ * no new buffer. */
 typedef struct {
     int operation;
     Call call;
@@ -124,8 +124,8 @@ PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
     PyCall c = {.operation = STEP};
 
-    if (has_arguments(nargs, 3) && view_inputs(self, args[0], &c) &&
-        view_mask(self, args[1], &c) && view_observations(self, args[2], &c)) {
+    if (has_arguments(nargs, 3) && view_inputs(self, args[0], &c) && view_mask(self, args[1], &c) &&
+        view_observations(self, args[2], &c)) {
         return finish(self, &c);
     }
     return give_up(&c);
@@ -226,9 +226,9 @@ PyObject *py_failure(PyObject *object, PyObject *argument) {
         Py_RETURN_NONE;
     }
     const Failure *f = &asking.failure;
-    PyObject *result = Py_BuildValue("sOidINN", f->doing, f->in_warm_up ? Py_True : Py_False,
-                                     f->status, f->time, (unsigned)f->string_reference,
-                                     decode(f->said), values_of(f));
+    PyObject *result =
+        Py_BuildValue("sOidINN", f->doing, f->in_warm_up ? Py_True : Py_False, f->status, f->time,
+                      (unsigned)f->string_reference, decode(f->said), values_of(f));
     free(f->said);
     free(f->values);
     return result;

@@ -196,8 +196,8 @@ static bool is_sound(const Play *play) {
 }
 
 static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
-    static char *names[] = {"start", "start_values", "inputs", "judgement",
-                            "actions", "draws",      "episodes", NULL};
+    static char *names[] = {"start",   "start_values", "inputs",   "judgement",
+                            "actions", "draws",        "episodes", NULL};
     PyObject *start, *values, *inputs, *judgement, *draws, *episodes;
     long long lowest, highest;
 
@@ -211,9 +211,8 @@ static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwarg
     playing->play.highest_action = highest;
     if (!take_starts(self, playing, start, values) ||
         !take_program(inputs, &playing->play.inputs) ||
-        !take_program(judgement, &playing->play.judgement) ||
-        !take_draws(self, playing, draws) || !take_episodes(self, playing, episodes) ||
-        !copy_rows(playing)) {
+        !take_program(judgement, &playing->play.judgement) || !take_draws(self, playing, draws) ||
+        !take_episodes(self, playing, episodes) || !copy_rows(playing)) {
         return false;
     }
     settle_play(self, playing);
@@ -229,9 +228,8 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
     if (playing == NULL) {
         return PyErr_NoMemory();
     }
-    PyObject *capsule = fill(self, playing, args, kwargs)
-                            ? PyCapsule_New(playing, PLAYING, playing_dealloc)
-                            : NULL;
+    PyObject *capsule =
+        fill(self, playing, args, kwargs) ? PyCapsule_New(playing, PLAYING, playing_dealloc) : NULL;
     if (capsule == NULL) {
         playing_free(playing);
         return NULL;
@@ -256,8 +254,7 @@ static Streams *streams_new(Py_ssize_t count) {
 static bool take_stream(Streams *streams, Py_ssize_t index) {
     PyObject *generator = PyTuple_GetItem(streams->generators, index);
     PyObject *capsule = PyObject_GetAttrString(generator, "capsule");
-    const Stream *stream =
-        capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, "BitGenerator");
+    const Stream *stream = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, "BitGenerator");
 
     if (capsule != NULL) {
         PyTuple_SetItem(streams->capsules, index, capsule);
@@ -288,8 +285,7 @@ PyObject *py_set_streams(PyObject *object, PyObject *generators) {
     PyPool *self = (PyPool *)object;
     const Py_ssize_t count = (Py_ssize_t)self->pool.settings.count;
     Streams *streams = streams_new(count);
-    PyObject *capsule =
-        streams == NULL ? NULL : PyCapsule_New(streams, STREAMS, streams_dealloc);
+    PyObject *capsule = streams == NULL ? NULL : PyCapsule_New(streams, STREAMS, streams_dealloc);
 
     if (capsule == NULL) {
         free(streams);
@@ -324,8 +320,7 @@ static bool take_arrays(PyPool *self, const Play *play, PyObject *const *args, P
            take_matrix(args[SEEN], &b[SEEN], WRITTEN, "observations", ITEM_FLOAT32, n,
                        (Py_ssize_t)s->num_observed) &&
            take_vector(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, n) &&
-           take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN,
-                       n) &&
+           take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
            take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
            take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
                        (Py_ssize_t)play->draws.draws, n);
@@ -398,8 +393,7 @@ static PyObject *play_with(PyPool *self, PyObject *playing_capsule, PyObject *st
 static bool is_ready(const PyPool *self) {
     const Playing *playing =
         self->playing == NULL ? NULL : PyCapsule_GetPointer(self->playing, PLAYING);
-    const bool ready =
-        playing != NULL && (self->streams != NULL || playing->play.draws.draws == 0);
+    const bool ready = playing != NULL && (self->streams != NULL || playing->play.draws.draws == 0);
 
     if (!ready) {
         PyErr_SetString(PyExc_ValueError, "play was not prepared, or has no streams");

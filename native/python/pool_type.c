@@ -12,9 +12,9 @@ PyObject *decode(const char *text) {
 
 /* Messages go to Python after a call, on the thread that made it. */
 
-/* An exception that is an error of the receiver's must not stop the pool; any other, as of Ctrl-C or
- * sys.exit, is for the caller. Signals are looked at before: what a handler of theirs raises would
- * else be taken for the receiver's. */
+/* An exception that is an error of the receiver's must not stop the pool; any other, as of Ctrl-C
+ * or sys.exit, is for the caller. Signals are looked at before: what a handler of theirs raises
+ * would else be taken for the receiver's. */
 static bool report(PyPool *self, const Message *message) {
     PyObject *result =
         PyObject_CallFunction(self->callback, "niNN", (Py_ssize_t)message->index, message->status,
@@ -61,8 +61,8 @@ bool report_messages(PyPool *self) {
 
 /* Entering */
 
-/* Getting the GIL back may take milliseconds where other Python threads are busy: work so short that
- * nobody notices is done without letting go of it. */
+/* Getting the GIL back may take milliseconds where other Python threads are busy: work so short
+ * that nobody notices is done without letting go of it. */
 static bool is_short(const PyPool *self, int length) {
     return length == ALWAYS_SHORT || (length >= 0 && pool_is_quick(&self->pool, length));
 }
@@ -83,8 +83,7 @@ bool perform(PyPool *self, int length, Work *work, void *context) {
         work(self, true, context);
         pool_leave(&self->pool);
     } else if (entry == ENTRY_ENTERED || entry == ENTRY_BUSY) {
-        Py_BEGIN_ALLOW_THREADS
-        entry = entry == ENTRY_BUSY ? pool_enter(&self->pool) : entry;
+        Py_BEGIN_ALLOW_THREADS entry = entry == ENTRY_BUSY ? pool_enter(&self->pool) : entry;
         if (entry == ENTRY_ENTERED) {
             work(self, false, context);
             pool_leave(&self->pool);
@@ -96,19 +95,17 @@ bool perform(PyPool *self, int length, Work *work, void *context) {
 
 /* Closing */
 
-/* Returns false with an exception if reporting the last messages was interrupted, or if an FMU closes
- * its own pool. */
+/* Returns false with an exception if reporting the last messages was interrupted, or if an FMU
+ * closes its own pool. */
 static bool close_pool(PyPool *self) {
     Entry entry;
 
-    Py_BEGIN_ALLOW_THREADS
-    entry = pool_enter(&self->pool);
+    Py_BEGIN_ALLOW_THREADS entry = pool_enter(&self->pool);
     if (entry == ENTRY_ENTERED) {
         pool_close(&self->pool);
         pool_leave(&self->pool);
     }
-    Py_END_ALLOW_THREADS
-    if (entry != ENTRY_ENTERED) {
+    Py_END_ALLOW_THREADS if (entry != ENTRY_ENTERED) {
         return entry == ENTRY_CLOSED || explain(entry);
     }
     const bool reported = report_messages(self);
@@ -172,8 +169,8 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
     va_list places;
 
     va_start(places, names);
-    const bool parsed = nothing != NULL && PyArg_VaParseTupleAndKeywords(nothing, group, format,
-                                                                         names, places);
+    const bool parsed =
+        nothing != NULL && PyArg_VaParseTupleAndKeywords(nothing, group, format, names, places);
     va_end(places);
     Py_XDECREF(nothing);
     return parsed;
@@ -184,8 +181,8 @@ static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
                             "private", "logging", "states", NULL};
     Settings *s = &self->pool.settings;
     return parse_group(group, "$iyyyO!ppp:library", names, &a->version, &s->model, &s->token,
-                       &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries,
-                       &a->logging, &a->can_save);
+                       &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
+                       &a->can_save);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -349,10 +346,8 @@ static bool open_pool(PyPool *self) {
     bool opened;
 
     self->opened = true;
-    Py_BEGIN_ALLOW_THREADS
-    opened = pool_open(&self->pool, &settings, error, sizeof error);
-    Py_END_ALLOW_THREADS
-    if (!report_messages(self)) {
+    Py_BEGIN_ALLOW_THREADS opened = pool_open(&self->pool, &settings, error, sizeof error);
+    Py_END_ALLOW_THREADS if (!report_messages(self)) {
         return false;
     }
     if (!opened) {

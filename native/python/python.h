@@ -16,19 +16,16 @@
 enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 
 typedef struct {
-    PyObject_HEAD
-    Access access;
+    PyObject_HEAD Access access;
 } PyAccess;
 
 typedef struct {
-    PyObject_HEAD
-    Snapshot *snapshot;
+    PyObject_HEAD Snapshot *snapshot;
     PyObject *pool; /* keeps the memory of the pool, not its instances */
 } PySnapshot;
 
 typedef struct {
-    PyObject_HEAD
-    Pool pool;
+    PyObject_HEAD Pool pool;
     bool opened;         /* whether the pool may need closing */
     PyObject *arguments; /* keeps alive what the settings point to */
     PyObject *callback;  /* borrowed from arguments, as are the arrays */
@@ -62,8 +59,8 @@ typedef void Work(PyPool *self, bool alone, void *context);
 
 enum { ALWAYS_SHORT = -1, NEVER_SHORT = -2 };
 
-/* Does some work; length is one of the operations of pool.h, for which the pool knows its length, or
- * one of the above. Returns false with an exception if the pool cannot be entered. */
+/* Does some work; length is one of the operations of pool.h, for which the pool knows its length,
+ * or one of the above. Returns false with an exception if the pool cannot be entered. */
 bool perform(PyPool *self, int length, Work *work, void *context);
 
 /* Hands over the messages of FMUs. Returns false if that was interrupted, with the exception. */

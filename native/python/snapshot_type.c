@@ -62,8 +62,8 @@ PyObject *py_save(PyObject *object, PyObject *unused) {
         snapshot_free(saving.snapshot);
         return NULL;
     }
-    PyObject *result = saving.failed >= 0 ? PyLong_FromSsize_t(saving.failed)
-                                          : wrap(self, saving.snapshot);
+    PyObject *result =
+        saving.failed >= 0 ? PyLong_FromSsize_t(saving.failed) : wrap(self, saving.snapshot);
     if (result != NULL && !report_messages(self)) {
         Py_DECREF(result);
         return NULL;
