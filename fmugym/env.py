@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping
+from math import floor, hypot, isfinite, nan
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Never
 
@@ -206,7 +206,7 @@ class FMUEnv(Pictured):
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
         self._output_count = len(interface.outputs)
         self._no_monitors = not interface.monitors
-        self._values = (math.nan,) * len(names)
+        self._values = (nan,) * len(names)
         self.out = NamedValues("output", names, lambda: self._values)
         self.state = self._values[: self._output_count]
         self.previous_state = self.state
@@ -447,12 +447,12 @@ class FMUEnv(Pictured):
         return is_misfit(action, self.action_space, error)
 
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and type(values) in _FLOATS and math.isfinite(values):
+        if self._takes_one_real and type(values) in _FLOATS and isfinite(values):
             self._input_row[0] = values
             self.inputs = (float(values),)
             return
         inputs = tuple(flat_inputs(values, self._interface.inputs, self._source).tolist())
-        if not all(map(math.isfinite, inputs)):
+        if not all(map(isfinite, inputs)):
             self._raise_for_inputs(inputs, "every input must be finite")
         self._input_row[:] = inputs
         self.inputs = inputs
@@ -489,11 +489,11 @@ class FMUEnv(Pictured):
             reward = as_reward(reward)
         if self._pool_observes:
             observation: Any = self._observation_row.copy()
-            is_finite = math.hypot(*self.state) <= FLOAT32_LIMIT or self._is_finite(observation)
+            is_finite = hypot(*self.state) <= FLOAT32_LIMIT or self._is_finite(observation)
         else:
             observation = self._get_observation()
             is_finite = self._is_finite(observation)
-        if not (is_finite and math.isfinite(reward)):
+        if not (is_finite and isfinite(reward)):
             return self._fault_of_hooks(reward, observation, before)
         info = self._info() if self._has_info else {}
         if stopped:
@@ -521,7 +521,7 @@ class FMUEnv(Pictured):
         self, reward: float, observation: Any, before: tuple[Any, dict[str, Any]]
     ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """End the episode because of a number that is not finite, in the state before the step."""
-        if math.isfinite(reward):
+        if isfinite(reward):
             reason = f"the observation is {shown(observation)} at t = {self.time:g} s"
         else:
             reason = f"_reward_policy returned {reward} at t = {self.time:g} s"
@@ -654,7 +654,7 @@ def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
     span = (config.stop_time - spec.start_time) / spec.time_step
     if span > limit:
         return limit
-    steps = math.floor(span + 1e-9) - spec.warm_up_steps
+    steps = floor(span + 1e-9) - spec.warm_up_steps
     if steps < 1:
         raise ConfigError(
             f"stop_time = {config.stop_time} s leaves no time for a step of {spec.time_step} s "

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import operator
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from math import hypot, isfinite, isnan
 from typing import Any, Final
 
 import numpy as np
@@ -53,10 +53,10 @@ def is_element(action: Any, elements: range) -> bool:
 
 def has_nan(action: Any) -> bool:
     """Whether a number of an action is NaN, whatever the hooks would make of it."""
-    if isinstance(action, float | np.floating):
-        return math.isnan(action)
     if isinstance(action, np.ndarray):
         return action.dtype.kind == "f" and _holds_nan(action)
+    if isinstance(action, float | np.floating):
+        return isnan(action)
     if not isinstance(action, list | tuple | Mapping):
         return False
     try:
@@ -83,8 +83,8 @@ def is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
 
 
 def _holds_nan(array: npt.NDArray[np.floating[Any]]) -> bool:
-    is_short = type(array) is np.ndarray and array.ndim == 1 and array.size <= _FEW
-    if is_short and math.isfinite(math.hypot(*array.tolist())):
+    is_short = type(array) is np.ndarray and array.ndim == 1 and len(array) <= _FEW
+    if is_short and isfinite(hypot(*array.tolist())):
         return False
     return bool(np.isnan(np.asarray(array)).any())
 

@@ -6,8 +6,8 @@ that are not finite are a fault of the episode, like a failure of the FMU.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
+from math import hypot, isfinite
 from typing import Any, Final
 
 import numpy as np
@@ -54,6 +54,8 @@ def as_flag(hook: str, value: Any) -> bool:
     Raises:
         ConfigError: If it is something else.
     """
+    if type(value) is np.bool_:
+        return bool(value)
     flag = _single(given(value, hook))
     if issubclass(type(flag), int | float | np.bool_ | np.number):
         number = number_of(f"what {hook} returned", flag)
@@ -68,6 +70,8 @@ def as_reward(value: Any) -> float:
     Raises:
         ConfigError: If it is no number.
     """
+    if type(value) is np.float64 or type(value) is np.float32:
+        return float(value)
     return number_of("what _reward_policy returned", _single(given(value, "_reward_policy")))
 
 
@@ -117,7 +121,7 @@ def _of_floats(space: spaces.Box) -> Finiteness:
                 observation = _numbers(observation, "fiub").astype(dtype)
         if observation.shape != shape:
             _refuse_shape(observation, shape)
-        if is_short and math.isfinite(math.hypot(*observation.tolist())):
+        if is_short and isfinite(hypot(*observation.tolist())):
             return True
         return bool(np.isfinite(observation).all())
 
