@@ -236,7 +236,6 @@ def _require_simple(env: FMUEnv) -> None:
         "environments have attributes of their own": env._per_env_attributes,
         "it has episode variables": env.config.episode_variables,
         "it has inputs that are not Real": not env._real_inputs,
-        "it has no inputs": not env._interface.inputs,
     }
     for obstacle, is_there in obstacles.items():
         if is_there:
