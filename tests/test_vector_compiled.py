@@ -264,7 +264,6 @@ class Unattended(Arithmetic):
         return -self.state[0]
 
 
-def test_an_environment_without_inputs():
-    require_pair_equal(Unattended, steps=20, hooks="auto")
-    with pytest.raises(ConfigError, match="cannot be compiled"):
-        FMUVectorEnv(Unattended, 2, hooks="compiled")
+@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+def test_an_environment_without_inputs(hooks):
+    require_pair_equal(Unattended, steps=20, hooks=hooks)
