@@ -199,7 +199,8 @@ def examine(
     Raises:
         FMULoadError: As ``meet``, with ``must_survive``.
     """
-    key = f"{_content_key(candidate.path)}-{_digest(repr((spec, starts)).encode())}"
+    asked = _digest(repr((spec, starts, candidate.preload)).encode())
+    key = f"{_content_key(candidate.path)}-{asked}"
     known = Verdict.from_text(recall(key))
     if known is not None and (known.neighbours is not None or not several):
         return known

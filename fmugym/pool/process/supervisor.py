@@ -11,6 +11,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any, Final
 
+from fmugym.errors import printable
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.last_words import describe_exit
 from fmugym.pool.process.launcher import Process, launch
@@ -151,7 +152,7 @@ class Supervisor:
         deaths = self._deaths
         self.begin_closing()
         self.close(deadline)
-        self._deaths, self.reason = deaths, f"{self._setup.path.name}: {reason}"
+        self._deaths, self.reason = deaths, printable(f"{self._setup.path.name}: {reason}")
 
     def note_success(self) -> None:
         """Remember that a reset has succeeded."""
@@ -288,7 +289,7 @@ class Supervisor:
         echo = self._echo.tobytes().partition(b"\0")[0].decode(errors="replace")
         lines = echo.splitlines()[-_TAIL:] or list(self._tail)
         said = f"; the FMU said: {' | '.join(lines)}" if lines else ""
-        return f"{self._setup.path.name}: {text}{said}"
+        return printable(f"{self._setup.path.name}: {text}{said}")
 
 
 def _is_debugged(pid: int) -> bool:
