@@ -87,23 +87,18 @@ static size_t end_of_range(const Slot *slot, size_t range) {
     return start_of_range(atomic_get(&slot->count), atomic_get(&slot->ranges), range + 1);
 }
 
-/* Large chunks first, smaller ones towards the end, so that all finish together. Large ones are
- * multiples of WHOLE, too. */
-static size_t chunk_size(const Slot *slot, size_t left) {
+/* Large chunks first, smaller ones towards the end, so that all finish together; the caller begins
+ * with a small one. Large ones are multiples of WHOLE, too. */
+static size_t chunk_size(const Slot *slot, size_t left, bool small) {
     const size_t smallest = (size_t)atomic_get(&slot->smallest);
     const size_t largest = (size_t)atomic_get(&slot->largest);
-    size_t size = left / 2;
+    size_t size = small ? smallest : left / 2;
 
     size = size > largest ? largest : size;
     size = size < smallest ? smallest : size;
     if (size >= WHOLE) {
         size = (size + WHOLE - 1) / WHOLE * WHOLE;
     }
-    return size < left ? size : left;
-}
-
-static size_t smallest_chunk(const Slot *slot, size_t left) {
-    const size_t size = (size_t)atomic_get(&slot->smallest);
     return size < left ? size : left;
 }
 
@@ -115,44 +110,52 @@ static void finish(Slot *slot, size_t size, size_t count) {
     }
 }
 
-/* Takes chunks of a range until there are none, or only the first one. A helper works in the
- * caller's floating-point environment: the rounding mode and the treatment of denormals must not
- * depend on the thread. epoch is that of the job for which it has been set. */
-static void take_range(Slot *slot, size_t range, bool helper, bool one, uint64_t *epoch) {
-    Atomic *place = &slot->tickets[range].value;
-    uint64_t ticket = atomic_get(place), taken_here = 0;
+/* A thread that works on a job. */
+typedef struct {
+    bool helper;
+    uint64_t epoch; /* of the job for which it has the caller's floating-point environment */
+} Worker;
 
-    while (!one || taken_here == 0) {
+static void do_chunk(Slot *slot, uint64_t ticket, size_t size, Worker *worker) {
+    const size_t count = (size_t)atomic_get(&slot->count), begin = next_item(ticket);
+
+    if (worker->helper && worker->epoch != ticket >> 32) {
+        worker->epoch = ticket >> 32;
+        floats_restore(&slot->floats); /* results must not depend on the thread */
+    }
+    slot->job.work(slot->job.context, begin, begin + size);
+    finish(slot, size, count);
+}
+
+/* Takes a chunk of a range. Returns whether there was one. */
+static bool take_chunk(Slot *slot, size_t range, bool small, Worker *worker) {
+    Atomic *place = &slot->tickets[range].value;
+    uint64_t ticket = atomic_get(place);
+
+    for (;;) {
         const size_t begin = next_item(ticket), end = end_of_range(slot, range);
         if (begin >= end) {
-            break;
+            return false;
         }
-        const size_t size = one ? smallest_chunk(slot, end - begin) : chunk_size(slot, end - begin);
-        if (!atomic_replace(place, &ticket, ticket + size)) {
-            continue;
+        const size_t size = chunk_size(slot, end - begin, small);
+        if (atomic_replace(place, &ticket, ticket + size)) {
+            do_chunk(slot, ticket, size, worker);
+            return true;
         }
-        if (helper && *epoch != ticket >> 32) {
-            *epoch = ticket >> 32;
-            floats_restore(&slot->floats);
-        }
-        const size_t count = (size_t)atomic_get(&slot->count);
-        slot->job.work(slot->job.context, begin, begin + size);
-        taken_here++;
-        finish(slot, size, count);
-        ticket = atomic_get(place);
-    }
-    if (taken_here > 0) {
-        atomic_add(&chunks, taken_here);
     }
 }
 
-static void take_chunks(Slot *slot, size_t home, bool helper) {
+/* Takes chunks until there are none: first of the own range, then of the others'. */
+static void take_chunks(Slot *slot, size_t home, Worker worker) {
     const size_t ranges = (size_t)atomic_get(&slot->ranges);
-    uint64_t epoch = UINT64_MAX;
+    uint64_t number = 0;
 
     for (size_t i = 0; i < ranges; i++) {
-        take_range(slot, (home + i) % ranges, helper, false, &epoch);
+        while (take_chunk(slot, (home + i) % ranges, false, &worker)) {
+            number++;
+        }
     }
+    atomic_add(&chunks, number);
 }
 
 /* Helpers */
@@ -200,7 +203,7 @@ static void wake_some(Slot *slot) {
 static void help(Slot *slot, size_t number) {
     if (atomic_add(&slot->helpers, 1) < atomic_get(&slot->limit)) {
         wake_some(slot);
-        take_chunks(slot, 1 + number, true);
+        take_chunks(slot, 1 + number, (Worker){.helper = true, .epoch = UINT64_MAX});
     }
     atomic_add(&slot->helpers, (uint64_t)-1);
 }
@@ -363,7 +366,7 @@ static void wait_for_chunks(Slot *slot, size_t count) {
 /* Helpers that look for work take part at once. Those that sleep are woken after the first chunk,
  * by which time there may be nothing left for them. */
 void threads_run(const Job *job) {
-    uint64_t epoch = UINT64_MAX;
+    Worker caller = {.helper = false};
     Slot *slot = job->helpers == 0 || job->count < 2 ? NULL : take_slot();
 
     if (slot == NULL) {
@@ -374,9 +377,9 @@ void threads_run(const Job *job) {
     atomic_add(&jobs, 1);
     start_helpers(job->helpers);
     open_slot(slot, job);
-    take_range(slot, 0, false, true, &epoch);
+    take_chunk(slot, 0, true, &caller);
     wake_some(slot);
-    take_chunks(slot, 0, false);
+    take_chunks(slot, 0, caller);
     atomic_and_bits(&opened, ~bit);
     wait_for_chunks(slot, job->count);
     atomic_and_bits(&taken, ~bit);
