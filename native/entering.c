@@ -1,36 +1,5 @@
-#include "entering.h"
-
+#include "inside.h"
 #include "snapshots.h"
-
-/* Which pools a thread is inside of: an FMU written in Python that calls its own pool gets an error
- * instead of waiting for itself. */
-
-enum { NESTED = 8 }; /* deeper ones are not noticed */
-
-static THREAD_LOCAL struct {
-    const Pool *pools[NESTED];
-    size_t depth;
-} inside;
-
-void begin_inside(const Pool *pool) {
-    if (inside.depth < NESTED) {
-        inside.pools[inside.depth] = pool;
-    }
-    inside.depth++;
-}
-
-void end_inside(void) {
-    inside.depth--;
-}
-
-static bool is_inside(const Pool *pool) {
-    for (size_t i = 0; i < inside.depth && i < NESTED; i++) {
-        if (inside.pools[i] == pool) {
-            return true;
-        }
-    }
-    return false;
-}
 
 static Entry enter_locked(Pool *pool) {
     if (!pool->open) {
@@ -62,4 +31,16 @@ void pool_leave(Pool *pool) {
     floats_restore(&pool->floats);
     end_inside();
     mutex_unlock(&pool->lock);
+}
+
+/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the
+ * next one inside finds it. */
+void pool_abandon(Pool *pool, Snapshot *snapshot) {
+    atomic_set(&snapshot->abandoned, 1);
+    atomic_set(&pool->abandoned, 1);
+    if (mutex_try_lock(&pool->lock)) {
+        begin_inside(pool);
+        pool->floats = floats_now();
+        pool_leave(pool);
+    }
 }

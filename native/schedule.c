@@ -3,7 +3,7 @@
 #include <math.h>
 #include <stdlib.h>
 
-#include "entering.h"
+#include "inside.h"
 #include "threads.h"
 
 /* All in ns. */

@@ -2,7 +2,6 @@
 
 #include <stdlib.h>
 
-#include "entering.h"
 #include "failures.h"
 #include "instances.h"
 #include "schedule.h"
@@ -71,18 +70,6 @@ void pool_drop_abandoned(Pool *pool) {
 void snapshots_drop_all(Pool *pool) {
     while (pool->snapshots != NULL) {
         drop_snapshot(pool, pool->snapshots);
-    }
-}
-
-/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the
- * next one inside finds it. */
-void pool_abandon(Pool *pool, Snapshot *snapshot) {
-    atomic_set(&snapshot->abandoned, 1);
-    atomic_set(&pool->abandoned, 1);
-    if (mutex_try_lock(&pool->lock)) {
-        begin_inside(pool);
-        pool->floats = floats_now();
-        pool_leave(pool);
     }
 }
 

@@ -1,0 +1,31 @@
+#include "inside.h"
+
+/* Which pools a thread is inside of: an FMU written in Python that calls its own pool gets an error
+ * instead of waiting for itself. */
+
+enum { NESTED = 8 }; /* deeper ones are not noticed */
+
+static THREAD_LOCAL struct {
+    const Pool *pools[NESTED];
+    size_t depth;
+} inside;
+
+void begin_inside(const Pool *pool) {
+    if (inside.depth < NESTED) {
+        inside.pools[inside.depth] = pool;
+    }
+    inside.depth++;
+}
+
+void end_inside(void) {
+    inside.depth--;
+}
+
+bool is_inside(const Pool *pool) {
+    for (size_t i = 0; i < inside.depth && i < NESTED; i++) {
+        if (inside.pools[i] == pool) {
+            return true;
+        }
+    }
+    return false;
+}
