@@ -1,14 +1,14 @@
-/* An FMU of FMI 2.0 whose steps take a given processor time and do nothing with it.
+/* An FMU of FMI 2.0 whose steps take a given processor time and do nothing.
  *
- * A step takes "mean" us, or, with "sigma" > 0, a time of a lognormal distribution with that mean:
- * with z standard normal from a hash of "seed" and the number of the step,
+ * A step takes "mean" us. With "sigma" > 0, its time has a lognormal distribution with this mean:
  *
  *     mean * exp(sigma * z - sigma^2 / 2)
  *
- * "busy" is the sum in us of the times that steps have taken. The clock is that of the wall, as a look
- * at the clocks of processor time costs up to a microsecond; but where more than LAPSE us have passed
- * since the last look, somebody else had the processor, and they do not count. The value references
- * are those of the enumeration. */
+ * where z is standard normal, from a hash of "seed" and the number of the step. "busy" is the sum in
+ * us of the times that steps have taken. It uses the wall clock, since reading a clock of processor
+ * time costs up to a microsecond. If more than LAPSE us have passed since the last reading, another
+ * process had the processor, and this time does not count. The value references are those of the
+ * enumeration. */
 
 #define _GNU_SOURCE
 #define LAPSE 100.0
@@ -34,12 +34,12 @@ static uint64_t mix(uint64_t x) {
     return x ^ (x >> 31);
 }
 
-/* In (0, 1). */
+/* Uniform in (0, 1). */
 static double uniform(uint64_t x) {
     return ((double)(mix(x) >> 11) + 0.5) / 9007199254740992.0;
 }
 
-/* By Box and Muller. */
+/* Standard normal, by Box and Muller. */
 static double normal(const Busy *me) {
     const uint64_t x = mix((uint64_t)(me->values[SEED] * 4294967296.0)) + 2 * me->steps;
     return sqrt(-2.0 * log(uniform(x))) * cos(6.283185307179586 * uniform(x + 1));

@@ -1,4 +1,4 @@
-"""An environment over an FMU that takes its time, compiled here from ``busy.c``."""
+"""An environment over an FMU with long steps, which is compiled here from ``busy.c``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import fmugym
 __all__ = ["BusyEnv", "build"]
 
 NAMES = ("u:input", "busy:output", "mean:parameter", "sigma:parameter", "seed:parameter")
-"""In the order of the value references."""
+"""Variables in the order of their value references."""
 
 
 def build(folder: Path) -> Path:
@@ -50,12 +50,12 @@ def _variable(index: int, name: str, causality: str) -> str:
 
 
 class BusyEnv(fmugym.FMI2CSEnv):
-    """Waits; the observation is for how many us it has waited in this episode.
+    """Waits. The observation is the time in us that it has waited in this episode.
 
     Args:
         path: The FMU.
-        mean: Time of a step in us.
-        sigma: Of the logarithm of that time, 0 for a constant one.
+        mean: Mean time of a step in us.
+        sigma: Standard deviation of the logarithm of this time; 0 for a constant time.
     """
 
     def __init__(self, path: Path, mean: float, sigma: float) -> None:

@@ -1,13 +1,13 @@
-/* The limit: a bare C loop over the functions of an FMI 2.0 cart-pole, nothing else.
+/* The limit: a bare C loop over the functions of an FMI 2.0 cart-pole, and nothing else.
  *
- * Each thread steps instances of its own without ever waiting for another: per instance an input is
- * set, a step done, four outputs got and written as float32, and instances whose pole has fallen
- * are reset and initialized with other start values. c_limit.py compiles it and passes
+ * Each thread steps its own instances and never waits for another. For each instance, it sets an
+ * input, does a step, gets four outputs and writes them as float32. If the pole has fallen, it resets
+ * the instance and initializes it with new start values. c_limit.py compiles the program and passes
  *
  *     library token instances threads seconds step input output*4 start*4 r:parameter=value...
  *
- * where inputs, outputs and parameters are value references. Prints steps per second, by the wall
- * clock and of processor time. */
+ * where inputs, outputs and parameters are value references. It prints steps per second, by the wall
+ * clock and by processor time. */
 
 #define _GNU_SOURCE
 
@@ -62,7 +62,7 @@ typedef struct {
     size_t count;
     uint64_t random;
     double steps_done, rate, cpu; /* steps, steps per second, processor time */
-    char padding[128]; /* the next part is of another thread: no cache line is shared */
+    char padding[128]; /* the next part belongs to another thread: they share no cache line */
 } Part;
 
 static void logger(void *environment, const char *name, int status, const char *category,

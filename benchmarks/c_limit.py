@@ -1,8 +1,8 @@
-"""The limit of all configurations: a C program that does nothing but step the cart-pole FMU.
+"""The upper limit for all configurations: a C program that only steps the cart-pole FMU.
 
     python benchmarks/c_limit.py --num-envs 1024 --threads 1
 
-A C compiler is needed: ``cc`` or ``gcc``, or else the package ``ziglang``.
+It needs a C compiler: ``cc``, ``gcc`` or ``clang``, or the package ``ziglang``.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ INTEGERS = {"pole_type": 2, "solver": 1}
 
 
 class Rates(NamedTuple):
-    """Steps per second of all threads together, resets included in the time.
+    """Steps per second of all threads together; the time includes resets.
 
     Attributes:
-        wall: By the wall clock.
-        cpu: Per second of processor time.
+        wall: Steps per second of wall-clock time.
+        cpu: Steps per second of processor time.
     """
 
     wall: float
@@ -52,10 +52,10 @@ class Rates(NamedTuple):
 
 
 def compile_c(source: Path, target: Path, *options: str) -> None:
-    """Compile a C program, or a library.
+    """Compile a C program or a library.
 
     Raises:
-        MissingError: Without a compiler, or if it refuses the program, as that of another system.
+        MissingError: If there is no compiler, or the program does not compile on this system.
     """
     command = [*_compiler(), "-O2", "-Wall", "-Wextra", "-o", str(target), str(source), *options]
     try:
@@ -75,7 +75,7 @@ def _compiler() -> list[str]:
 
 @functools.cache
 def build() -> tuple[Path, fmugym.FMU]:
-    """Compile the program once; the FMU is kept, as its folder goes with it.
+    """Compile the program once. The FMU is kept, because its folder lives as long as it does.
 
     Raises:
         MissingError: See ``compile_c``.
@@ -93,9 +93,9 @@ def measure(num_envs: int, threads: int = 1, seconds: float = 1.0) -> Rates:
     """Run the program.
 
     Args:
-        num_envs: Number of instances, of all threads together.
-        threads: Each steps its part of the instances, and none waits for another.
-        seconds: For how long.
+        num_envs: Number of instances of all threads together.
+        threads: Number of threads; each steps its share of the instances without waiting.
+        seconds: Length of the run.
     """
     program, fmu = build()
     names = ["f", "x", "x_dot", "phi", "phi_dot", "x_0", "x_dot_0", "phi_0", "phi_dot_0"]
@@ -109,7 +109,7 @@ def measure(num_envs: int, threads: int = 1, seconds: float = 1.0) -> Rates:
 
 
 def main() -> None:
-    """Print both rates."""
+    """Measure, and print both rates."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument("--threads", type=int, default=1)

@@ -1,4 +1,4 @@
-"""The cart-poles of all packages, each stepped with the same actions, made to be measured."""
+"""The cart-poles of all packages, ready to be measured with the same actions."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ __all__ = [
 
 FMUGYM, GYMNASIUM = "fmugym/CartPole-v0", "CartPole-v1"
 STEPS = 64
-"""Steps between two looks at the clock; as many different actions are taken, again and again."""
+"""Steps between two readings of the clock; this many different actions repeat."""
 
 PARAMETERS = {"m_pole": 0.1, "max_step": 1.0, "theta_0": math.pi / 2}
-"""What differs in Gymnasium's plant from the FMU's defaults, all but the solver."""
+"""Parameters of Gymnasium's plant that differ from the FMU's defaults, without the solver."""
 
 
 def actions(num_envs: int) -> npt.NDArray[np.int64]:
-    """The actions of ``STEPS`` steps: pushes to either side, at random."""
+    """Return random actions for ``STEPS`` steps."""
     return np.random.default_rng(0).integers(0, 2, (STEPS, num_envs))
 
 
 def require_native_pool() -> None:
-    """Leave out what would be measured on the Python pool by mistake.
+    """Refuse to measure on the Python pool by mistake.
 
     Raises:
-        MissingError: Without the C extension.
+        MissingError: If the C extension was not built.
     """
     if not has_native_pool():
         raise MissingError("not built")
@@ -58,7 +58,7 @@ def require_native_pool() -> None:
 
 
 def environment_run(env: gym.Env[Any, Any]) -> Run:
-    """Steps, with a reset where an episode ends."""
+    """Make a run of steps, with a reset after each episode."""
     chosen = actions(1)[:, 0].tolist() * 16
     env.reset(seed=0)
 
@@ -72,7 +72,7 @@ def environment_run(env: gym.Env[Any, Any]) -> Run:
 
 
 def fmpy_run(stack: ExitStack) -> Run:
-    """FMPy's wrappers as its documentation uses them: set, step, get; no reward, no episodes."""
+    """Make a run of FMPy's wrappers as documented: set, step, get; no reward, no episodes."""
     fmu, references = _fmpy_instance(stack)
     force, outputs = [references["f"]], [references[n] for n in ("x", "x_dot", "phi", "phi_dot")]
     forces = [20.0 * action - 10.0 for action in actions(1)[:, 0].tolist()] * 16
@@ -114,7 +114,7 @@ def _fmpy_start(fmu: FMU2Slave, references: dict[str, int]) -> None:
 
 
 def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """This package's vector environment, on the native pool where no other is asked for.
+    """Make a vector environment of this package, on the native pool unless told otherwise.
 
     Raises:
         MissingError: If there is no native pool.
@@ -125,9 +125,9 @@ def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, An
 
 
 def vector_run(env: Any) -> Run:
-    """Steps of a vector environment in the mode ``NEXT_STEP``.
+    """Make a run of steps of a vector environment in the mode ``NEXT_STEP``.
 
-    The step that only resets an environment is no transition and not counted; the clock stands
+    A step that only resets an environment is not a transition and does not count. The clocks stand
     still while counting.
     """
     workers = [process.pid for process in getattr(env, "processes", ())]
@@ -151,7 +151,7 @@ def vector_run(env: Any) -> Run:
 def _step_block(
     env: Any, chosen: list[npt.NDArray[np.integer[Any]]], watch: Stopwatch
 ) -> list[int]:
-    """Returns how many episodes each step has ended."""
+    """Step once per action; return how many episodes each step has ended."""
     step, flags = env.step, []
     watch.start()
     for action in chosen:
@@ -162,7 +162,7 @@ def _step_block(
 
 
 def envpool_run(stack: ExitStack, num_envs: int, threads: int) -> Run:
-    """EnvPool's cart-pole, which resets in the next step too.
+    """Make a run of EnvPool's cart-pole, which also resets in the next step.
 
     Raises:
         MissingError: If it is not installed.
@@ -180,7 +180,7 @@ def envpool_run(stack: ExitStack, num_envs: int, threads: int) -> Run:
 
 
 class _EnvPool:
-    """What ``vector_run`` asks for."""
+    """The attributes that ``vector_run`` needs."""
 
     def __init__(self, env: Any, num_envs: int) -> None:
         self.num_envs, self.reset, self.step = num_envs, env.reset, env.step
@@ -188,10 +188,10 @@ class _EnvPool:
 
 
 def c_limit_run(num_envs: int, threads: int) -> Run:
-    """The C program that does nothing but step the FMU.
+    """Make a run of the C program that only steps the FMU.
 
     Raises:
-        MissingError: Without a compiler, or with more threads than environments.
+        MissingError: If there is no compiler, or there are more threads than environments.
     """
     if threads > num_envs:
         raise MissingError("-")

@@ -1,4 +1,4 @@
-"""How much of the processors FMUs get whose steps take long, all the same or very different."""
+"""Measure the share of the processors that FMUs with long steps get."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ TITLE = (
 )
 SIZE = 64
 MEANS = (10.0, 100.0, 1000.0)
-"""In us."""
+"""Times of a step in us."""
 SIGMAS = {"constant": 0.0, "heavy-tailed": 1.5}
-"""With 1.5 the longest of 64 lognormal times is, in the median, 12 times their mean."""
+"""With 1.5, the median of the longest of 64 lognormal times is 12 times their mean."""
 
 
 def tables(effort: Effort) -> list[Table]:
@@ -66,7 +66,7 @@ def _runs(stack: ExitStack, folder: Path, effort: Effort) -> dict[str, Run]:
 
 
 def _run(stack: ExitStack, path: Path, mean: float, kind: str, threads: int) -> Run:
-    """Counts seconds in which FMUs were busy."""
+    """Count the seconds in which FMUs were busy."""
     env = fmugym.FMUVectorEnv(lambda: BusyEnv(path, mean, SIGMAS[kind]), SIZE, threads=threads)
     stack.callback(env.close)
     actions = np.zeros(SIZE, np.int64)

@@ -1,4 +1,4 @@
-"""What it costs to run FMUs in worker processes, and how soon a fault of theirs is dealt with."""
+"""Measure the cost of worker processes, and the time to handle their faults."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from busy import BusyEnv, build
 from measure import Effort, MissingError
 from tables import Table, duration, share
 
-from fmugym.env import request_pool
 from fmugym.envs import CartPoleEnv
+from fmugym.task.opening import request_pool
 
 __all__ = ["tables"]
 
 CALLS = 2000
-"""One after another, before the other configuration has its turn."""
+"""Calls in a row, before the turn of the other configuration."""
 SIZE = 64
 MEAN = 100.0
-"""Of a step of the heavy FMU, in us."""
+"""Time of a step of the heavy FMU in us."""
 TIMEOUT = 0.2
-"""In seconds, for the hang."""
+"""Time-out for the hang in seconds."""
 
 
 def tables(effort: Effort) -> list[Table]:
@@ -54,7 +54,7 @@ def _cost(stack: ExitStack, effort: Effort) -> Table:
 
 
 def _pools(stack: ExitStack, make_env: Callable[[], Any], count: int) -> list[Any]:
-    """One on a single thread here, and one in a single worker."""
+    """Make a pool on a single thread here, and one in a single worker."""
     pools = []
     for options in ({"isolation": "none"}, {"isolation": "process", "workers": 1}):
         with request_pool(count, threads=1, **options):
@@ -125,7 +125,7 @@ def _restart(env: Any) -> float:
 
 
 def _hang(stack: ExitStack) -> float:
-    """A worker that is stopped does not answer."""
+    """Stop a worker, so that it does not answer; return the time after its time-out."""
     with request_pool(1, isolation="process", call_timeout=TIMEOUT):
         env = CartPoleEnv(log_level=logging.CRITICAL)
     stack.callback(env.close)

@@ -1,4 +1,4 @@
-"""One thread and several on a machine whose processors all have something else to do."""
+"""Measure one thread and several on a machine whose processors are all busy with other work."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIZE = 1024
 HEADER = ["configuration", "steps/s", "steps/CPU-s", "of 1 thread"]
 MOST_SECONDS = 120
 BURN = f"import time\nend = time.time() + {MOST_SECONDS}\nwhile time.time() < end: pass"
-"""It ends by itself in case nobody is left to end it."""
+"""It ends by itself, in case nobody ends it."""
 
 
 def tables(effort: Effort) -> list[Table]:
@@ -58,7 +58,7 @@ def _run(stack: ExitStack, threads: int) -> Run:
 
 @contextmanager
 def all_processors_busy() -> Iterator[None]:
-    """Burn as many processors as there are."""
+    """Keep all processors busy."""
     burning = [subprocess.Popen([sys.executable, "-c", BURN]) for _ in range(processors())]
     try:
         yield

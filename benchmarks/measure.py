@@ -1,4 +1,4 @@
-"""Several configurations run by turns, and the medians and ratios of what they do."""
+"""Run several configurations by turns, and compute medians and ratios of their rates."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ __all__ = [
 
 
 class MissingError(Exception):
-    """What a configuration needs is not there; the text is what its row shows."""
+    """Something that a configuration needs is missing; its row shows the text."""
 
 
 class Effort(NamedTuple):
     """How long a section may take.
 
     Attributes:
-        rounds: How often each configuration has its turn.
-        seconds: How long a turn lasts.
-        quick: Whether only to show that everything works.
+        rounds: Number of turns of each configuration.
+        seconds: Length of a turn.
+        quick: Whether to check only that everything works.
     """
 
     rounds: int
@@ -44,10 +44,10 @@ class Effort(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What one turn did.
+    """The result of one turn.
 
     Attributes:
-        count: Steps, or whatever is counted.
+        count: Number of steps, or of whatever is counted.
         wall: Wall-clock time in seconds.
         cpu: Processor time of all threads and worker processes in seconds.
     """
@@ -58,14 +58,14 @@ class Sample(NamedTuple):
 
 
 Run = Callable[[float], Sample]
-"""Works for about as many seconds as it is told."""
+"""Works for about the given number of seconds."""
 
 
 class Stopwatch:
     """Adds up wall-clock and processor time between ``start`` and ``stop``.
 
     Args:
-        workers: Other processes whose time counts too.
+        workers: Other processes whose time counts, too.
 
     Attributes:
         wall: In seconds.
@@ -77,24 +77,24 @@ class Stopwatch:
         self.wall = self.cpu = 0.0
 
     def start(self) -> None:
-        """Begin a stretch."""
+        """Start the clocks."""
         self._cpu = cpu_seconds(self._workers)
         self._wall = time.perf_counter()
 
     def stop(self) -> None:
-        """End it."""
+        """Stop the clocks."""
         self.wall += time.perf_counter() - self._wall
         self.cpu += cpu_seconds(self._workers) - self._cpu
 
     def sample(self, count: float) -> Sample:
-        """What was done in the time so far."""
+        """Return the sample of the time so far."""
         return Sample(count, self.wall, self.cpu)
 
 
 def cpu_seconds(workers: Iterable[int]) -> float:
-    """Processor time of this process and others, NaN where the system does not tell of those.
+    """Processor time of this process and others; NaN if the system does not report it.
 
-    Linux has a clock for each process, numbered as in its ``clock_getcpuclockid``.
+    Linux has a clock for each process, with the number that ``clock_getcpuclockid`` computes.
     """
     try:
         others = sum(time.clock_gettime(~worker << 3 | 2) for worker in workers)
@@ -111,16 +111,16 @@ def processors() -> int:
 
 
 def thread_counts() -> dict[int, str]:
-    """One thread, and one for each processor; with the words for it."""
+    """One thread, and one per processor, each with its text."""
     count = processors()
     return {1: "1 thread"} | ({count: f"{count} threads"} if count > 1 else {})
 
 
 def make_runs(makers: Mapping[str, Callable[[], Run]]) -> tuple[dict[str, Run], dict[str, str]]:
-    """Make what can be made.
+    """Make the runs that can be made.
 
     Returns:
-        The runs, and, of the others, why there is none.
+        The runs, and for each other configuration the reason why there is none.
     """
     runs, missing = {}, {}
     for name, make in makers.items():
@@ -132,9 +132,9 @@ def make_runs(makers: Mapping[str, Callable[[], Run]]) -> tuple[dict[str, Run], 
 
 
 def by_turns(runs: Mapping[str, Run], effort: Effort) -> dict[str, list[Sample]]:
-    """Let each have its turn in every round, after one to get warm.
+    """Give each configuration a turn in every round, after a round to warm up.
 
-    Whoever comes first in a round comes last in the next, so that nobody always follows the same.
+    The first in a round is the last in the next, so that none always follows the same one.
     """
     samples: dict[str, list[Sample]] = {name: [] for name in runs}
     names = list(runs)
@@ -147,17 +147,17 @@ def by_turns(runs: Mapping[str, Run], effort: Effort) -> dict[str, list[Sample]]
 
 
 def wall_rate(samples: Sequence[Sample]) -> float:
-    """Median of what is done in a second."""
+    """Median rate per second of wall-clock time."""
     return statistics.median(sample.count / sample.wall for sample in samples)
 
 
 def cpu_rate(samples: Sequence[Sample]) -> float:
-    """Median of what is done in a second of processor time."""
+    """Median rate per second of processor time."""
     return statistics.median(sample.count / max(sample.cpu, 1e-9) for sample in samples)
 
 
 def ratio(samples: Sequence[Sample], base: Sequence[Sample]) -> float:
-    """Median over the rounds of how many times as fast as another one it is, by the wall clock."""
+    """Median over the rounds of the ratio of two rates, by the wall clock."""
     pairs = zip(samples, base, strict=True)
     return statistics.median(a.count * b.wall / (a.wall * b.count) for a, b in pairs)
 
@@ -168,9 +168,9 @@ def repeated(
     """Call a function until the time is over.
 
     Args:
-        block: What is measured.
-        count: How much it does.
-        prepare: Called before each, while the clock stands still.
+        block: The function to measure.
+        count: How much one call counts.
+        prepare: Called before each call, while the clocks stand still.
     """
 
     def run(seconds: float) -> Sample:

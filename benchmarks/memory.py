@@ -1,4 +1,4 @@
-"""Memory per instance, growth, and a great many instances; each in a process of its own."""
+"""Measure memory per instance, growth, and very many instances, each in its own process."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def in_child(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def resident() -> int:
-    """Bytes of this process that are in memory.
+    """Resident memory of this process in bytes.
 
     Raises:
-        MissingError: Where there is no /proc.
+        MissingError: If there is no /proc.
     """
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
@@ -69,7 +69,7 @@ def resident() -> int:
 
 
 def resident_with(num_envs: int) -> int:
-    """Memory with so many environments, after a few steps and two resets."""
+    """Memory of this many environments in bytes, after a few steps and two resets."""
     env = fmugym_vector(num_envs)
     for seed in (0, None):
         env.reset(seed=seed)
@@ -86,7 +86,7 @@ def _step(env: Any, count: int) -> None:
 
 
 def growth(steps: int, resets: int) -> tuple[int, int]:
-    """Memory after many steps, and after many resets, less that of before."""
+    """Growth of memory in bytes over many steps, and over many resets."""
     env = fmugym_vector(SIZE)
     env.reset(seed=0)
     _step(env, 200)
@@ -102,7 +102,7 @@ def growth(steps: int, resets: int) -> tuple[int, int]:
 
 
 def times_of(num_envs: int) -> tuple[float, float, float]:
-    """Seconds to make, to reset for the first time, and to step (median of 21)."""
+    """Seconds to make, to reset for the first time, and to step once (median of 21)."""
     begin = time.perf_counter()
     env = fmugym_vector(num_envs)
     made = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What it costs to start an episode."""
+"""Measure the cost of starting an episode."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from measure import Effort, Run, Sample, by_turns, cpu_rate, make_runs, ratio, r
 from tables import Table, duration, rate, times
 
 import fmugym
-from fmugym.pool import PoolSpec, make_pool
+from fmugym.pool import PoolSpec
+from fmugym.trial.opening import make_pool
 
 __all__ = ["tables"]
 
@@ -58,7 +59,7 @@ def _add(table: Table, name: str, own: list[Sample], base: list[Sample]) -> None
 
 
 def _pool(stack: ExitStack) -> Run:
-    """One thread; the instances do a step between two resets."""
+    """Reset with one thread; the instances do a step between two resets."""
     cart_poles.require_native_pool()
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     outputs = tuple(map(fmu.variable, ("x", "x_dot", "phi", "phi_dot")))

@@ -1,13 +1,13 @@
-"""Everything that is said of speed and memory, measured side by side in one run.
+"""Measure everything that the project says about speed and memory, side by side in one run.
 
     python benchmarks/run.py
     python benchmarks/run.py --quick --only single
     python benchmarks/run.py --json benchmarks.json
 
-In every section the configurations have their turns one after the other, many times over; the
-figures are medians over the rounds, and ratios are taken within a round: other work on the machine
-disturbs all alike. Leave the machine alone all the same. Packages that are not installed get a row
-that says so; a C compiler (``cc``, or the package ``ziglang``) is needed for some rows.
+In each section, the configurations take turns, in many rounds. The figures are medians over the
+rounds, and ratios are computed within a round, so that other work on the machine disturbs all
+configurations alike. Leave the machine alone nevertheless. A package that is not installed gets a
+row that says so. Some rows need a C compiler (``cc``, or the package ``ziglang``).
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
 FULL = Effort(rounds=11, seconds=0.08, quick=False)
 QUICK = Effort(rounds=1, seconds=0.01, quick=True)
 LOADED = Effort(rounds=21, seconds=0.2, quick=False)
-"""Longer, as the system hands out the processors in slices of some milliseconds."""
+"""Longer turns, because the system assigns processors in slices of some milliseconds."""
 
 
 def main() -> None:
-    """Print the tables."""
+    """Measure, and print the tables."""
     arguments = _parser().parse_args()
     logging.basicConfig(level=logging.WARNING)
     begin, results = time.perf_counter(), {}
@@ -64,9 +64,9 @@ def main() -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="only show that everything works")
+    parser.add_argument("--quick", action="store_true", help="only check that everything works")
     parser.add_argument("--only", action="append", choices=SECTIONS, help="may be repeated")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Steps per second of one environment, beside Gymnasium's own and FMPy's wrappers."""
+"""Measure the steps per second of one environment, of Gymnasium's own and of FMPy's wrappers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables as plain text that is also Markdown."""
+"""Tables in plain text that is valid Markdown."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ class Table:
     """A table.
 
     Attributes:
-        title: What stands above it.
+        title: The text above the table.
         header: The names of the columns.
         rows: The cells.
-        data: The same figures unrounded, for programs.
+        data: The same figures, not rounded, for programs.
     """
 
     title: str
@@ -39,14 +39,14 @@ def _line(cells: list[str], widths: list[int]) -> str:
 
 
 def _three_digits(value: float) -> str:
-    """At least three significant digits, and never an exponent."""
+    """Format with at least three significant digits and without an exponent."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
 
 
 def rate(value: float) -> str:
-    """A number per second: 1.23 M, 45.6 k."""
+    """Format a number per second: 1.23 M, 45.6 k."""
     for factor, unit in ((1e6, " M"), (1e3, " k")):
         if value >= factor:
             return _three_digits(value / factor) + unit
@@ -54,17 +54,17 @@ def rate(value: float) -> str:
 
 
 def times(value: float) -> str:
-    """A ratio: 1.23x."""
+    """Format a ratio: 1.23x."""
     return _three_digits(value) + "x"
 
 
 def share(value: float) -> str:
-    """A part of a whole: 45 %."""
+    """Format a part of a whole: 45 %."""
     return f"{100 * value:.0f} %"
 
 
 def duration(seconds: float) -> str:
-    """A time: 1.23 us, 45.6 ms."""
+    """Format a time: 1.23 us, 45.6 ms."""
     for factor, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "us")):
         if seconds >= factor:
             return f"{_three_digits(seconds / factor)} {unit}"

@@ -1,4 +1,4 @@
-"""Steps per second of vector environments of several sizes, beside those of other packages."""
+"""Measure the steps per second of vector environments, of this package and of others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["tables"]
 
 SIZES = (1, 8, 64, 1024, 4096)
 MOST = {"fmugym, Python pool": 64, "Gymnasium SyncVectorEnv": 64, "Gymnasium AsyncVectorEnv": 8}
-"""Where more environments would only take longer to tell the same."""
+"""The largest sizes; larger ones would take longer and show nothing new."""
 
 BASE, LIMIT = "Gymnasium make_vec (numpy)", "C limit, 1 thread"
 TITLES = (
@@ -36,7 +36,7 @@ TITLES = (
 
 
 def tables(effort: Effort) -> list[Table]:
-    """Measure all sizes; all columns are numbers of environments."""
+    """Measure all sizes, one per column."""
     sizes = SIZES[:2] if effort.quick else SIZES
     header = ["environments", *map(str, sizes)]
     walls, cpus = (Table(title, header) for title in TITLES)
@@ -50,7 +50,7 @@ def tables(effort: Effort) -> list[Table]:
 
 
 def _column(size: int, effort: Effort) -> dict[str, tuple[str, str, dict[str, Any]]]:
-    """The two cells of each configuration, and the figures in them."""
+    """Return the two cells of each configuration, and their figures."""
     with ExitStack() as stack:
         makers = dict(_makers(stack, size))
         runs, missing = make_runs({n: m for n, m in makers.items() if size <= MOST.get(n, size)})
@@ -106,7 +106,7 @@ def _cells(
 
 
 def _limit(name: str, samples: dict[str, list[Sample]]) -> str:
-    """The C program with as many threads, as far as there are environments for them."""
+    """Return the name of the C program with as many threads, if there are enough environments."""
     threads = name.rpartition(", ")[2] if name.endswith("threads") else "1 thread"
     own = f"C limit, {threads}"
     return own if own in samples else LIMIT

@@ -22,29 +22,29 @@ HALF_WIDTHS = np.array([2.4, 2.0, radians(12), 2.5])
 
 
 class Episode(NamedTuple):
-    """What one episode came to: its length in steps and the sum of its rewards."""
+    """The result of one episode: its length in steps and the sum of its rewards."""
 
     steps: int
     total_reward: float
 
 
 class Agent(Protocol):
-    """What the training program asks of an agent."""
+    """The methods that the training program calls."""
 
     def learn(self, env: Env) -> Iterator[Episode]:
-        """Play and learn without end, giving one training episode after the other."""
+        """Play and learn forever, and yield each training episode."""
 
     def policy(self) -> Policy:
-        """Return what was learnt, free of exploration: observation in, action out."""
+        """Return the learnt policy, without exploration: observation in, action out."""
 
 
 def play(env: Env, policy: Policy, seed: int | None = None) -> Episode:
     """Play one episode to its end.
 
     Args:
-        env: The environment, reset here.
-        policy: Gives the action for an observation.
-        seed: Seed of the episode's start; None continues the environment's own random stream.
+        env: The environment; this function resets it.
+        policy: Returns the action for an observation.
+        seed: Seed of the start; None continues the environment's own random numbers.
 
     Returns:
         The episode's length and sum of rewards.
@@ -60,10 +60,10 @@ def play(env: Env, policy: Policy, seed: int | None = None) -> Episode:
 
 
 def middle(space: Box) -> NDArray[np.float64]:
-    """Return the middle of a box, 0 along unbounded axes: where the pole stands upright.
+    """Return the middle of a box, where the pole stands upright; 0 along unbounded axes.
 
     Args:
-        space: The observation space; pi/2 is upright in one cart-pole and 0 in another.
+        space: The observation space. Upright is pi/2 in one cart-pole and 0 in another.
 
     Returns:
         The middle [m, m/s, rad, rad/s], of the box's shape.
@@ -75,10 +75,10 @@ def middle(space: Box) -> NDArray[np.float64]:
 
 
 class RandomPolicy:
-    """Push left or right by the toss of a coin.
+    """Push left or right at random.
 
     Args:
-        seed: Seed of the coin.
+        seed: Seed of the random numbers.
     """
 
     def __init__(self, seed: int) -> None:
@@ -92,19 +92,20 @@ class RandomPolicy:
 class QLearning:
     """Tabular Q-learning on a grid of cells over the observations.
 
-    For every cell and action one value is learnt (C. J. C. H. Watkins and P. Dayan, "Q-learning",
-    Machine Learning 8, 1992). All values start at what balancing for ever is worth at a reward of
-    1 a step, `1 / (1 - DISCOUNT)`, or up to 1 more. Disappointment then drives the greedy choice
-    to whatever is untried, so that no random actions are needed (optimistic initial values:
-    R. S. Sutton and A. G. Barto, "Reinforcement Learning: An Introduction", 2nd edition, 2018,
-    section 2.6).
+    The agent learns one value for each cell and action (C. J. C. H. Watkins and P. Dayan,
+    "Q-learning", Machine Learning 8, 1992). All values start at or slightly above
+    `1 / (1 - DISCOUNT)`, the value of balancing forever with a reward of 1 per step. A tried action
+    loses value, so the greedy choice moves on to untried ones, and no random actions are needed
+    (optimistic initial values: R. S. Sutton and A. G. Barto, "Reinforcement Learning: An
+    Introduction", 2nd edition, 2018, section 2.6).
 
     Args:
         space: The observation space, of shape (4,).
-        seed: Seed of the first values, which say what is tried first.
+        seed: Seed of the first values, which decide what is tried first.
 
     Attributes:
-        values: The table, one `[left, right]` per cell. Lists: numpy is slower at single numbers.
+        values: The table, one `[left, right]` per cell: lists, as numpy is slower for single
+            numbers.
     """
 
     BINS = (3, 3, 6, 6)  # finer for the pole than for the cart
@@ -135,18 +136,18 @@ class QLearning:
         return number
 
     def best_action(self, cell: int) -> int:
-        """Return the action of the greater value in a cell, 0 if they are equal."""
+        """Return the action with the larger value in a cell, or 0 if both are equal."""
         left, right = self.values[cell]
         return int(right > left)
 
     def update(self, cell: int, action: int, reward: float, next_cell: int | None) -> None:
-        """Move one value towards the reward and the discounted best value that follows.
+        """Move one value towards the reward plus the discounted best value of the next cell.
 
         Args:
             cell: The cell in which the action was taken.
             action: The action taken.
             reward: The reward received.
-            next_cell: The cell that followed; None if the episode terminated.
+            next_cell: The next cell; None if the episode terminated.
         """
         future = 0.0 if next_cell is None else max(self.values[next_cell])
         error = reward + self.DISCOUNT * future - self.values[cell][action]
@@ -167,10 +168,10 @@ class QLearning:
 
 
 class LinearPolicy:
-    """Push right where a weighted sum of the scaled observation is positive.
+    """Push right if a weighted sum of the scaled observation is positive.
 
     Args:
-        weights: One weight per observation, of shape (4,); their common factor has no effect.
+        weights: One weight per observation, of shape (4,). A common factor has no effect.
         centre: The observation of the balanced cart-pole [m, m/s, rad, rad/s], of shape (4,).
     """
 
@@ -186,11 +187,12 @@ class LinearPolicy:
 class RandomSearch:
     """Augmented random search for the weights of a linear policy.
 
-    An iteration plays one episode with the weights shifted along each of several random
-    directions and one with the weights shifted against it, and then moves them by the directions
-    weighted with the differences in return, in units of the returns' standard deviation
-    (H. Mania, A. Guy and B. Recht, "Simple random search of static linear policies is competitive
-    for reinforcement learning", NeurIPS 2018, algorithm 1, version V1 with all directions used).
+    Each iteration draws several random directions. For each direction, it plays one episode with
+    the weights shifted along it and one with the weights shifted against it. Then it moves the
+    weights along each direction by the difference of the two returns, in units of the standard
+    deviation of all returns (H. Mania, A. Guy and B. Recht, "Simple random search of static linear
+    policies is competitive for reinforcement learning", NeurIPS 2018, algorithm 1, version V1 with
+    all directions used).
 
     Args:
         space: The observation space, of shape (4,).
@@ -202,7 +204,7 @@ class RandomSearch:
 
     DIRECTIONS = 8
     NOISE = 0.1
-    STEP_SIZE = 0.1  # equal to the noise: of the two only the ratio has an effect on the actions
+    STEP_SIZE = 0.1  # equal to the noise: only the ratio of the two affects the actions
 
     def __init__(self, space: Box, seed: int) -> None:
         self._centre = middle(space)
@@ -223,15 +225,15 @@ class RandomSearch:
             self.update(directions, returns)
 
     def policy(self) -> Policy:
-        """Return the linear policy of the present weights."""
+        """Return the linear policy with the current weights."""
         return LinearPolicy(self.weights, self._centre)
 
     def update(self, directions: NDArray[np.float64], returns: NDArray[np.float64]) -> None:
-        """Move the weights towards the directions that paid.
+        """Move the weights towards the directions with higher returns.
 
         Args:
             directions: The directions tried, of shape (n, 4).
-            returns: The returns with the weights shifted along and against them, of shape (n, 2).
+            returns: The returns along and against each direction, of shape (n, 2).
         """
         spread = returns.std()
         if spread > 0:

@@ -3,11 +3,16 @@
     pip install -e ".[examples,identification]"
     python examples/identify_pendulum.py
 
-The cell is simulated: a pendulum with viscous and Coulomb friction, whose log at 50 Hz has the
-encoder's steps and a noisy velocity. Printed is what each fit finds, with the half width of its
-interval of 95 % confidence: without a Coulomb term p1 comes out far too large, with it the rest of
-the error is that of central differences at 50 Hz, which no interval knows of, and the simulation
-is free of it. Written is a plot of a swing that no fit has seen, measured and simulated.
+The cell is simulated: a pendulum with viscous and Coulomb friction. Its log at 50 Hz has the
+resolution of an encoder and a noisy velocity. The program prints the parameters that each fit
+finds, with the half width of the 95 % confidence interval:
+
+- Least squares without a Coulomb term makes p1 far too large.
+- Least squares with a Coulomb term leaves the error of central differences at 50 Hz. The interval
+  does not include this error.
+- The fit by simulation has neither error.
+
+It writes a plot of a swing that no fit has seen, measured and simulated.
 """
 
 import argparse
@@ -26,7 +31,7 @@ from fmugym.identification import (
     plot_comparison,
 )
 
-CELL = {"m": 0.06, "l": 0.1, "b": 4e-4, "c": 2e-3}  # the truth: kg, m, N m s/rad, N m
+CELL = {"m": 0.06, "l": 0.1, "b": 4e-4, "c": 2e-3}  # the true values: kg, m, N m s/rad, N m
 SAMPLING = 0.02  # s
 ENCODER_STEP = 4.794e-5  # rad
 VELOCITY_NOISE = 0.04  # rad/s
@@ -36,7 +41,7 @@ UNITS = {"p1": "1/s", "p2": "1/s^2", "p3": "rad/s^2", "l": "m", "b": "N m s/rad"
 
 
 class Cell(fmugym.FMUEnv):
-    """The cell, hanging free."""
+    """The cell, swinging freely."""
 
     def __init__(self, angle: float) -> None:
         config = {
@@ -52,7 +57,7 @@ class Cell(fmugym.FMUEnv):
 
 
 def log_swing(angle: float, seconds: float, rng: np.random.Generator) -> Trajectory:
-    """Let the cell swing from an angle [rad], and log it."""
+    """Let the cell swing from an angle [rad] and return the log."""
     cell = Cell(angle)
     cell.reset()
     states = [cell.state]
@@ -82,7 +87,7 @@ def simulation_fit(swings: list[Trajectory]) -> FitResult:
         {"l": (0.05, 0.2), "b": (1e-3, 0.0, 0.01), "c": (1e-3, 0.0, 0.01)},
         swings,
         initial_states={"q_0": "q", "q_dot_0": "q_dot"},
-        fixed={"m": CELL["m"]},  # a free swing says nothing of the mass
+        fixed={"m": CELL["m"]},  # a free swing does not reveal the mass
         scales={"q": ENCODER_STEP, "q_dot": VELOCITY_NOISE},
     )
 
@@ -90,7 +95,7 @@ def simulation_fit(swings: list[Trajectory]) -> FitResult:
 def print_rows(
     title: str, values: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Print what one fit has found."""
+    """Print the parameters that one fit has found."""
     print(f"\n{title}")
     for name, (low, high) in intervals.items():
         half = (high - low) / 2
@@ -99,10 +104,10 @@ def print_rows(
 
 
 def main() -> None:
-    """Log swings, fit, print, plot."""
+    """Log swings, fit them, print the results and plot a comparison."""
     parser = argparse.ArgumentParser(description="Identify a simulated pendulum cell.")
     parser.add_argument("--swings", type=int, default=4, help="number of swings (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of each (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of angles and noise (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("identified_pendulum.png"))
     options = parser.parse_args()

@@ -1,9 +1,9 @@
 """Learn on one cell of the simulated lab, episode after episode under one lease.
 
-A torque of 0.03 N m cannot lift the pendulum, so it has to be swung up. The policy pushes along
-with the motion, with a gain that is to be found; a change that swung no higher is taken back. The
-cell stays reserved while the program thinks between two episodes. In real time that takes 45 s;
-`--fast` moves the lab's time by hand.
+A torque of 0.03 N m cannot lift the pendulum, so it has to swing up. The policy pushes along with
+the motion, and the program looks for the best gain: it keeps a change only if the pendulum swings
+higher. The cell stays reserved between two episodes. This takes 45 s in real time; with `--fast`,
+the program advances the lab's clock itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TORQUE = 0.03  # N m
 def run_episode(client: Client, token: str, gain: float, clock: Any) -> float:
     """Push for an episode with a torque of `gain` N m s/rad; return the mean height in rods."""
     heights = []
-    client.set_torque(TORQUE, token)  # to begin with
+    client.set_torque(TORQUE, token)  # the first push
     start = clock.time()
     for tick in range(1, round(EPISODE_TIME / PERIOD) - 1):
         clock.sleep(max(0.0, start + tick * PERIOD - clock.time()))
@@ -41,12 +41,12 @@ def learn(user_token: str, seed: int, clock: Any = time) -> tuple[list[float], s
     """Search for the best gain.
 
     Args:
-        user_token: Of a user who may reserve gyms.
-        seed: Of the changes tried.
-        clock: What gives the time and sleeps: `time`, or the lab's clock.
+        user_token: Token of a user who may reserve gyms.
+        seed: Seed of the changes to try.
+        clock: Gives the time and sleeps: `time`, or the lab's clock.
 
     Returns:
-        The mean height in each episode, in rods, and the address of the last one's video.
+        The mean height of each episode, in rods, and the address of the last video.
     """
     client, rng = Client(), np.random.default_rng(seed)
     gym_token = client.start_gym(user_token, 120, [CellType.SINGLE])
@@ -57,7 +57,7 @@ def learn(user_token: str, seed: int, clock: Any = time) -> tuple[list[float], s
         token, _ = client.start_episode(gym_token, "SimplePendulum", EPISODE_TIME, record=last)
         try:
             heights.append(run_episode(client, token, candidate, clock))
-        except RuntimeError as error:  # over the top once too often: the lab ends the episode
+        except RuntimeError as error:  # it went over the top, and the lab ended the episode
             print(str(error).partition(";")[0])
             heights.append(0.0)
         video = client.stop_episode(token)
@@ -69,12 +69,12 @@ def learn(user_token: str, seed: int, clock: Any = time) -> tuple[list[float], s
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Learn, and print what came of it."""
+    """Learn, and print the result."""
     parser = argparse.ArgumentParser(description="Learn to swing the lab's pendulum up.")
     parser.add_argument("--preset", choices=("hardware", "ideal"), default="hardware")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fast", action="store_true", help="do not wait for real time")
-    parser.add_argument("--videos", help="folder for a video of the last episode")
+    parser.add_argument("--videos", help="folder for the video of the last episode")
     options = parser.parse_args(arguments)
     clock = ManualClock() if options.fast else None
     folder = options.videos

@@ -1,10 +1,10 @@
 """Measure the length of a pendulum in the simulated lab, with four cells at a time.
 
-Each of four threads lets its cell fall freely, again and again from another random angle. All the
-swings together give the parameters of q'' = -p1 q' - p2 sin(q) by least squares, and p2 = g / l the
-length. In real time that takes 18 s; `--fast` moves the lab's time by hand and needs about one.
+Each of four threads lets its cell fall from several random angles. Least squares over all swings
+gives the parameters of q'' = -p1 q' - p2 sin(q), and p2 = g / l gives the length. This takes 18 s
+in real time. With `--fast`, the program advances the lab's clock itself and takes about 1 s.
 
-For the real lab change the import of `Client` and `CellType`, leave out `Lab` and give your token.
+For the real lab, change the import of `Client` and `CellType`, leave out `Lab`, and use your token.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ Swing = tuple[list[float], list[float]]
 
 
 def record_swing(gym_token: str, angle: float, clock: Any) -> Swing:
-    """Let a cell fall from an angle in rad; return angles in rad and velocities in rad/s."""
+    """Let a cell fall from an angle [rad]; return the angles [rad] and velocities [rad/s]."""
     client = Client()
     positions, velocities = [], []
     token, _ = client.start_episode(
         gym_token, "SimplePendulum", SWING_TIME, initial_position=[angle]
     )
-    client.set_impedance_controller_params([0.0], [0.0], token)  # torque control, and no torque
+    client.set_impedance_controller_params([0.0], [0.0], token)  # torque control without torque
     start = clock.time()
     for tick in range(1, round(SWING_TIME / PERIOD)):
         positions.append(client.get_position(token))
@@ -48,12 +48,12 @@ def record_swing(gym_token: str, angle: float, clock: Any) -> Swing:
 
 
 def collect(user_token: str, angles: Sequence[float], clock: Any = time) -> list[Swing]:
-    """Reserve the cells and swing from all the angles, in as many threads as there are cells.
+    """Reserve the cells and record a swing from each angle, with one thread per cell.
 
     Args:
-        user_token: Of a user who may reserve gyms.
-        angles: The start angles, in rad.
-        clock: What gives the time and sleeps: `time`, or the lab's clock.
+        user_token: Token of a user who may reserve gyms.
+        angles: The start angles [rad].
+        clock: Gives the time and sleeps: `time`, or the lab's clock.
     """
     client, swings = Client(), []
     make_thread = getattr(clock, "thread", None) or (
@@ -74,7 +74,7 @@ def collect(user_token: str, angles: Sequence[float], clock: Any = time) -> list
 
 
 def fit(swings: Sequence[Swing], with_coulomb: bool = False) -> NDArray[np.float64]:
-    """Return p1 in 1/s and p2 in 1/s^2 and, if asked for, the Coulomb friction in 1/s^2."""
+    """Return p1 [1/s], p2 [1/s^2] and, if requested, the Coulomb friction [1/s^2]."""
     q, v = np.array(swings).transpose(1, 0, 2)  # each of shape (swings, samples)
     acceleration = (v[:, 2:] - v[:, :-2]) / (2 * PERIOD)
     q, v = q[:, 1:-1], v[:, 1:-1]
@@ -84,7 +84,7 @@ def fit(swings: Sequence[Swing], with_coulomb: bool = False) -> NDArray[np.float
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the experiment and print what it found."""
+    """Run the experiment and print the results."""
     parser = argparse.ArgumentParser(description="Measure the length of the lab's pendulum.")
     parser.add_argument("--preset", choices=("hardware", "ideal"), default="hardware")
     parser.add_argument("--seed", type=int, default=0)

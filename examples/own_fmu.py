@@ -1,8 +1,8 @@
-"""An environment for an FMU of your own, from the FMU to the first episode.
+"""An environment for your own FMU: a file to copy.
 
-Here it is the bundled pendulum, taken as a foreign FMU: 60 g that hang from a rod of 10 cm are
-to be brought to rest by a torque too weak to hold them sideways. For another FMU change the path,
-the names and the hooks; `fmugym info your.fmu` lists the names.
+The FMU is the bundled pendulum, 60 g on a rod of 10 cm. The task is to bring it to rest with a
+torque that is too weak to hold it sideways. For your FMU, change the path, the names and the
+hooks; `fmugym info your.fmu` lists the names.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class BrakeEnv(FMI2CSEnv):
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
             "model_parameters": {
-                "m": Uniform(0.05, 0.07),  # kg, another one in each episode
-                "q_0": Uniform(-1.0, 1.0),  # rad, where the episode starts
+                "m": Uniform(0.05, 0.07),  # kg, drawn for each episode
+                "q_0": Uniform(-1.0, 1.0),  # rad, the start angle
                 "b": 1e-5,  # N m s/rad, hardly any friction
             },
             "bounds": {
-                "tau": (-largest_torque, largest_torque),  # N m: the action space
-                "q": (-4.0, 4.0),  # rad: with the next line, the observation space
+                "tau": (-largest_torque, largest_torque),  # N m, limits of the action space
+                "q": (-4.0, 4.0),  # rad, limits of the observation space
                 "q_dot": (-50.0, 50.0),  # rad/s
             },
             "time_step": 0.02,  # s
@@ -50,7 +50,7 @@ class BrakeEnv(FMI2CSEnv):
         return self._is_at_rest() | (abs(self.state[0]) > 3.0)
 
     def _reward_policy(self) -> Any:
-        """What is left of the swing costs, and being at rest pays."""
+        """Swinging costs, and being at rest pays."""
         q, q_dot = self.state
         return 10.0 * self._is_at_rest() - q**2 - 0.01 * q_dot**2
 
@@ -59,7 +59,7 @@ fmugym.register("own/Brake-v0", BrakeEnv)
 
 
 def main() -> None:
-    """Check the environment and run one episode with a torque against the motion."""
+    """Check the environment, then run one episode with a torque against the motion."""
     env = gymnasium.make("own/Brake-v0", largest_torque=0.01)
     check_fmu_env(env)
     observation, info = env.reset(seed=1)

@@ -1,16 +1,17 @@
-"""From simulation to the lab: swing a pendulum up with a policy that only knows the FMU.
+"""From simulation to the lab: swing a pendulum up with a policy computed from the FMU alone.
 
     pip install -e ".[examples,identification]"
     python examples/pendulum_sim_to_lab.py
 
-The policy pumps energy into the pendulum with 0.03 N m, too little to lift it, and balances it near
-the top by a linear-quadratic regulator (LQR). Both are computed from the FMU's directional
-derivatives. The policy is tried on FMUs with random masses, lengths and friction, and then runs on
-cells of the simulated lab, whose friction, noise and delays it has not seen, in real time: 11 s for
-each seed. `--fast` moves the lab's time by hand. Written is a plot of both trajectories.
+The policy pumps energy into the pendulum with 0.03 N m, which is too little to lift it directly.
+Near the top, a linear-quadratic regulator (LQR) balances it. Both parts are computed from the FMU's
+directional derivatives. The program first tries the policy on FMUs with random masses, lengths and
+friction. Then it runs the policy on cells of the simulated lab, which have friction, noise and
+delays that the policy has not seen. Each seed takes 11 s in real time; with `--fast`, the program
+advances the lab's clock itself. It writes a plot of the trajectories on both sides.
 
-The environment is the same on both sides, but for its `backend`. For a cell of the real lab make it
-with `backend=cloudpendulumclient.client.Client(), user_token="..."`.
+Only the `backend` of the environment differs between the two sides. For a cell of the real lab, use
+`backend=cloudpendulumclient.client.Client(), user_token="..."`.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from fmugym.lab import CellType, Lab, ManualClock
 ENV = "fmugym/CloudPendulum-v0"
 PERIOD = 0.02  # s, from one sample to the next
 STEPS = 500
-TORQUE_LIMIT = 0.15  # N m, of an action of 1
+TORQUE_LIMIT = 0.15  # N m, for an action of 1
 SWING_TORQUE = 0.03  # N m; the weight of the horizontal pendulum is 0.059 N m
-ENERGY_GAIN = 4.0  # N m/J: full swing torque but for the last 7.5 mJ of 118
+ENERGY_GAIN = 4.0  # N m/J: full swing torque except for the last 7.5 of 118 mJ
 CATCH = 0.7  # rad from upright, where balancing begins
-AT_REST = 0.3  # rad/s; slower than that the velocity's sign says nothing
+AT_REST = 0.3  # rad/s; below this, the sign of the velocity means nothing
 UPRIGHT = 10.0  # degrees, the largest angle that counts as upright
-LAST = round(3.0 / PERIOD)  # samples that count
+LAST = round(3.0 / PERIOD)  # samples at the end that are judged
 
 RANDOMIZED = {
     "m": fmugym.Uniform(0.048, 0.072),  # kg, +- 20 %
@@ -51,14 +52,15 @@ Array = NDArray[np.float64]
 
 
 def delayed_lqr(model: fmugym.LinearModel) -> Array:
-    """Return the gains of angle, velocity and the torque that is still to come.
+    """Return the gains for the angle, the velocity and the pending torque.
 
-    What is computed from a sample acts one period later, so the torque on its way is a third state.
+    A torque takes effect one period after the sample from which it was computed. The pending torque
+    is therefore a third state.
     """
     continuous = np.zeros((3, 3))
     continuous[:2] = np.hstack([model.A, model.B])
-    a = expm(continuous * PERIOD)  # x and the torque over a period, with the torque held
-    a[2] = 0.0  # after which the new torque takes its place
+    a = expm(continuous * PERIOD)  # the state after a period with a constant torque
+    a[2] = 0.0  # then the new torque replaces the pending one
     b = np.array([[0.0], [0.0], [1.0]])
     q, r = np.diag([1.0, 0.01, 0.0]), 100.0  # 1 rad is as bad as 10 rad/s and 0.1 N m
     p = solve_discrete_are(a, b, q, [[r]])
@@ -66,20 +68,20 @@ def delayed_lqr(model: fmugym.LinearModel) -> Array:
 
 
 class Policy:
-    """Energy shaping far from the top, LQR near it; one for each episode.
+    """Energy shaping far from the top, LQR near it. Make a new policy for each episode.
 
     Args:
-        model: The upright pendulum, whose states are the angle from upright and its velocity.
+        model: The pendulum linearized upright; its states are the angle and the velocity.
     """
 
     def __init__(self, model: fmugym.LinearModel) -> None:
         self.gravity = model.A[1, 0]  # 1/s^2, g / l
         self.inertia = 1 / model.B[1, 0]  # kg m^2
         self.gains = delayed_lqr(model)
-        self.torque = np.zeros(())  # N m, on its way
+        self.torque = np.zeros(())  # N m, pending
 
     def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action for an observation (cos q, sin q, velocity), or actions for rows of them."""
+        """Return the action for an observation (cos q, sin q, velocity), or for rows of them."""
         cosine, sine, velocity = np.asarray(observation, float).T
         angle = np.arctan2(-sine, -cosine)
         near = np.abs(angle) < CATCH
@@ -89,14 +91,14 @@ class Policy:
         return (self.torque[..., np.newaxis] / TORQUE_LIMIT).astype(np.float32)
 
     def balance(self, angle: Array, velocity: Array) -> Array:
-        """Linear feedback of the angle from upright."""
+        """Return the torque of the linear feedback."""
         of_angle, of_velocity, of_torque = self.gains
         return -(of_angle * angle + of_velocity * velocity + of_torque * self.torque)
 
     def swing(self, cosine: Array, sine: Array, velocity: Array) -> Array:
-        """Push along with the motion, in proportion to the energy that is missing."""
+        """Return a torque along the motion, proportional to the missing energy."""
         missing = self.inertia * (self.gravity * (1 + cosine) - velocity**2 / 2)  # J
-        motion = np.where(np.abs(velocity) > AT_REST, velocity, -sine)  # at rest: what comes next
+        motion = np.where(np.abs(velocity) > AT_REST, velocity, -sine)  # at rest: where it falls
         return ENERGY_GAIN * missing * np.copysign(1.0, motion)
 
 
@@ -122,14 +124,14 @@ def play_on_lab(
     plant: Mapping[str, float] | None = None,
     **options: Any,
 ) -> Array:
-    """Play an episode on a cell of a lab of its own.
+    """Play an episode on a cell of a new lab.
 
     Args:
-        model: For the policy.
-        seed: Of the lab's friction, noise and delays, and of the start.
-        fast: Whether the lab's time is moved by hand.
+        model: Model for the policy.
+        seed: Seed of the lab's friction, noise and delays, and of the start.
+        fast: Whether to advance the lab's clock instead of waiting.
         plant: Parameters of the cell's FMU.
-        options: Options of the lab that are not to be those of the preset `hardware`.
+        options: Options of the lab that replace those of the preset `hardware`.
     """
     clock, parameters = ManualClock() if fast else None, {CellType.SINGLE: plant or {}}
     with Lab("hardware", clock=clock, seed=seed, parameters=parameters, **options) as lab:
@@ -137,14 +139,14 @@ def play_on_lab(
 
 
 def worst_angles(q: Array) -> Array:
-    """The largest angles from upright in the last 3 s, in degrees; 180 if the episode broke off."""
+    """Return the largest angles from upright in the last 3 s [degrees]; 180 for a short episode."""
     if len(q) < STEPS:
         return np.full(q.shape[1:], 180.0)
     return np.degrees(np.pi - np.abs(q[-LAST:])).max(axis=0)
 
 
 def plot(randomized: Array, simulated: Array, measured: Array) -> Figure:
-    """Draw the trajectories, turned so that all of them end at +180 degrees."""
+    """Draw the trajectories, mirrored where needed so that all end at +180 degrees."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True)
     many = {"color": "0.75", "linewidth": 0.5}
@@ -163,7 +165,7 @@ def plot(randomized: Array, simulated: Array, measured: Array) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Design, try on FMUs, run on the lab, plot."""
+    """Compute the policy, try it on FMUs, run it in the lab, and plot."""
     parser = argparse.ArgumentParser(description="Swing up a pendulum of the lab.")
     parser.add_argument("--seeds", type=int, default=10, metavar="N", help="number of labs")
     parser.add_argument("--envs", type=int, default=256, metavar="N", help="number of random FMUs")

@@ -1,9 +1,9 @@
 """Swing the pendulum up by its energy and catch it near the top.
 
-The torque of 2 N m cannot lift the rod at once. As long as it is away from the top the torque
-drives the energy towards that of the upright rod at rest (K. J. Astrom and K. Furuta, "Swinging
-up a pendulum by energy control", Automatica 36, 2000); near the top, where the torque suffices,
-a linear feedback takes over. Run it with `--render` to watch.
+The torque of 2 N m cannot lift the rod directly. Away from the top, the torque drives the energy
+towards that of the upright rod at rest (K. J. Astrom and K. Furuta, "Swinging up a pendulum by
+energy control", Automatica 36, 2000). Near the top, the torque is strong enough and a linear
+feedback takes over. Run the program with `--render` to watch.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ INERTIA = MASS * LENGTH**2 / 3  # kg m^2, about the end
 WEIGHT_MOMENT = MASS * GRAVITY * LENGTH / 2  # N m, of the horizontal rod
 UNSTABLE_RATE = math.sqrt(WEIGHT_MOMENT / INERTIA)  # 1/s, at which the upright rod falls
 
-CATCH = 0.9 * LARGEST_TORQUE / WEIGHT_MOMENT  # rad; from 1.0 on no torque stops the fall
+CATCH = 0.9 * LARGEST_TORQUE / WEIGHT_MOMENT  # rad; with a factor of 1, no torque stops the fall
 CATCH_GAIN = 2.0 * WEIGHT_MOMENT  # N m/rad; one WEIGHT_MOMENT would only balance the weight
-ENERGY_GAIN = 5.0  # N m/J: full torque but for the last 0.4 J
+ENERGY_GAIN = 5.0  # N m/J: full torque except for the last 0.4 J
 UPRIGHT = 0.05  # rad, largest angle that counts as upright
 
 
 def torque(observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """The action for an observation (cos theta, sin theta, theta_dot).
+    """Return the action for an observation (cos theta, sin theta, theta_dot).
 
-    Near the top the rod falls along theta + theta_dot / UNSTABLE_RATE, which is fed back; the
-    other mode of the linearized rod dies out of itself.
+    Near the top, the rod falls along theta + theta_dot / UNSTABLE_RATE. The feedback uses this sum
+    only, because the other mode of the linearized rod decays by itself.
     """
     cosine, sine, velocity = map(float, observation)
     angle = math.atan2(sine, cosine)
@@ -51,7 +51,7 @@ def torque(observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Episode:
-    """The return, the number of steps, and how many of the last steps were all upright."""
+    """The return, the number of steps, and the number of steps at the end that were all upright."""
 
     total_reward: float
     steps: int
@@ -72,7 +72,7 @@ def run_episode(env: gymnasium.Env[Any, Any], seed: int) -> Episode:
 
 
 def main() -> None:
-    """Run the episodes and print what became of them."""
+    """Run the episodes and print their results."""
     parser = argparse.ArgumentParser(description="Swing the pendulum up and hold it upright.")
     parser.add_argument("--seeds", type=int, default=10, metavar="N", help="number of episodes")
     parser.add_argument("--render", action="store_true", help="show a window")

@@ -1,12 +1,13 @@
-"""Train agents on the cart-pole FMU with numpy alone, and see what became of them.
+"""Train agents on the cart-pole FMU with numpy alone, and evaluate them.
 
     pip install -e ".[examples]"
     python examples/train_cart_pole.py
 
-Two methods, each from several seeds: tabular Q-learning and augmented random search (agents.py).
-Printed is a table of the held-out episodes before and after training; written are the learning
-curves and an animation of the best agent. An episode is judged by its length, the number of steps
-the pole was balanced, whatever the rewards: at most 500, and a mean of 475 counts as solved.
+There are two methods, tabular Q-learning and augmented random search (agents.py). Each is trained
+from several seeds. The program prints a table of held-out episodes before and after training, and
+writes the learning curves and an animation of the best agent. Its measure is the length of an
+episode: the number of steps for which the pole was balanced, at most 500. A mean of 475 counts as
+solved.
 """
 
 import argparse
@@ -48,8 +49,8 @@ COLOURS = {"q-learning": "#d55e00", "random-search": "#0072b2"}
 
 EPISODE_LIMIT = 500
 SOLVED = 475
-HELD_OUT_SEED = 1_000_000  # seeds from here on are never trained on
-FRAME_STEPS = 2  # an animation's frames show every other step
+HELD_OUT_SEED = 1_000_000  # no training uses seeds from here on
+FRAME_STEPS = 2  # the animation shows every second step
 
 FULL = {"seeds": 10, "steps": 100_000, "episodes": 100}
 QUICK = {"seeds": 2, "steps": 6_000, "episodes": 10}
@@ -62,8 +63,8 @@ HEADERS = (
     "Training\nsteps",
     "Time\nper run",
 )
-SET_HELP = "an argument of the environment; may be given several times"
-EPILOG = """examples, the second as a study of plant and task:
+SET_HELP = "an argument of the environment; may be repeated"
+EPILOG = """examples (the second one changes the plant and the task):
   python examples/train_cart_pole.py --method random-search --seeds 30
   python examples/train_cart_pole.py --env fmugym/ModelicaCartPole-v0 \\
       --set force=15 --set m_pole=2 --set time_step=0.02 --set negative_reward=-50
@@ -72,7 +73,7 @@ EPILOG = """examples, the second as a study of plant and task:
 
 @dataclass(frozen=True)
 class Task:
-    """One run to do.
+    """One run that is to be done.
 
     Attributes:
         method: A key of `AGENTS`.
@@ -91,7 +92,7 @@ class Task:
     env_options: dict[str, Any] = field(default_factory=dict)
 
     def make_env(self, render_mode: str | None = None) -> Env:
-        """Return the environment, limited to 500 steps an episode."""
+        """Return the environment, limited to 500 steps per episode."""
         return gym.make(
             self.env_id,
             max_episode_steps=EPISODE_LIMIT,
@@ -103,12 +104,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Run:
-    """One run done.
+    """The result of one run.
 
     Attributes:
-        task: What was to be done.
+        task: The task.
         agent: The trained agent.
-        lengths: Length of every training episode [steps].
+        lengths: Length of each training episode [steps].
         seconds: Duration of the training [s].
         before: Mean length of the held-out episodes under a random policy [steps].
         after: Mean length of the same episodes under the trained agent [steps].
@@ -128,7 +129,7 @@ _steps_done: "Synchronized[int]"
 
 
 def start_worker(steps_done: "Synchronized[int]") -> None:
-    """Keep the counter of steps shared with the main process, and leave Ctrl-C to that process."""
+    """Keep the step counter that is shared with the main process, and leave Ctrl-C to it."""
     global _steps_done
     _steps_done = steps_done
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -148,10 +149,10 @@ def train_and_evaluate(task: Task) -> Run:
 
 
 def train(agent: Agent, env: Env, task: Task) -> NDArray[np.int64]:
-    """Train an agent until its steps are used up.
+    """Train an agent until it has used up its steps.
 
     Returns:
-        The length of every training episode [steps].
+        The length of each training episode [steps].
     """
     env.reset(seed=task.seed)
     lengths, left = [], task.steps
@@ -175,17 +176,17 @@ def evaluate(env: Env, policy: Policy, episodes: int) -> float:
 
 
 def run_all(tasks: list[Task], workers: int, console: Console) -> list[Run]:
-    """Train and evaluate in parallel under a progress bar.
+    """Train and evaluate in parallel, with a progress bar.
 
     Args:
-        tasks: The runs to do.
+        tasks: The tasks.
         workers: Number of processes.
-        console: Where the progress bar is drawn, if it is a terminal.
+        console: The console for the progress bar, which appears only on a terminal.
 
     Returns:
-        The runs, in the tasks' order.
+        The runs, in the order of the tasks.
     """
-    context = multiprocessing.get_context("spawn")  # a fork would share the FMU's library
+    context = multiprocessing.get_context("spawn")  # a fork would share the library of the FMU
     steps_done = context.Value("q", 0)
     with ProcessPoolExecutor(workers, context, start_worker, (steps_done,)) as executor:
         try:
@@ -201,7 +202,7 @@ def run_all(tasks: list[Task], workers: int, console: Console) -> list[Run]:
 
 @contextmanager
 def ignored_interrupt() -> Iterator[None]:
-    """Ignore Ctrl-C for a moment: processes started meanwhile ignore it from their first line."""
+    """Ignore Ctrl-C for a moment, so that processes started meanwhile ignore it from the start."""
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
@@ -212,7 +213,7 @@ def ignored_interrupt() -> Iterator[None]:
 def watch(
     futures: list[Future[Run]], steps_done: "Synchronized[int]", steps: int, console: Console
 ) -> None:
-    """Show the progress until all runs are done, or raise what the first to fail raised."""
+    """Show the progress until all runs are done; if a run fails, raise its error."""
     columns = (
         TextColumn("Training"),
         BarColumn(),
@@ -234,7 +235,7 @@ def watch(
 
 
 def by_method(runs: list[Run]) -> dict[str, list[Run]]:
-    """Return the runs of each method, in the order of `AGENTS`, without the methods not run."""
+    """Return the runs of each method that was run, in the order of `AGENTS`."""
     groups = {name: [run for run in runs if run.task.method == name] for name in AGENTS}
     return {name: group for name, group in groups.items() if group}
 
@@ -252,7 +253,7 @@ def summary(runs: list[Run]) -> Table:
 
 
 def summary_cells(runs: list[Run]) -> list[str]:
-    """Return the numbers of a method: mean and standard deviation are taken over its seeds."""
+    """Return the numbers of a method: mean and standard deviation over its seeds."""
     after = np.array([run.after for run in runs])
     return [
         f"{np.mean([run.before for run in runs]):.1f}",
@@ -265,12 +266,12 @@ def summary_cells(runs: list[Run]) -> list[str]:
 
 
 def learning_curve(run: Run, grid: NDArray[np.float64], window: float) -> NDArray[np.float64]:
-    """Return the mean length of the latest training episodes, along the training.
+    """Return the running mean of the length of the training episodes.
 
     Args:
         run: The run.
-        grid: Where the curve is wanted, in environment steps, of shape (n,).
-        window: The episodes that ended within so many steps before count.
+        grid: The points of the curve, in environment steps, of shape (n,).
+        window: The mean is over the episodes that ended within so many steps before a point.
 
     Returns:
         The mean lengths [steps], of shape (n,).
@@ -297,7 +298,7 @@ def draw_results(runs: list[Run], path: Path) -> None:
 
 
 def draw_learning_curves(axes: Axes, runs: list[Run]) -> None:
-    """Draw over the seeds each method's median, its middle half, and its worst and best."""
+    """Draw the median, the middle half and the range over the seeds, for each method."""
     steps = runs[0].task.steps
     window = max(steps / 20, 2 * EPISODE_LIMIT)
     grid = np.linspace(EPISODE_LIMIT, steps, 200)
@@ -317,7 +318,7 @@ def draw_learning_curves(axes: Axes, runs: list[Run]) -> None:
 
 
 def draw_held_out(axes: Axes, runs: list[Run]) -> None:
-    """Draw the held-out result of every seed as a dot and each method's mean as a bar."""
+    """Draw the held-out result of each seed as a dot, and the mean of each method as a line."""
     groups = by_method(runs)
     for place, (name, group) in enumerate(groups.items()):
         after = [run.after for run in group]
@@ -330,7 +331,7 @@ def draw_held_out(axes: Axes, runs: list[Run]) -> None:
 
 
 def draw_levels(axes: Axes, runs: list[Run]) -> None:
-    """Draw the levels of the solved task and of the random policy, and tidy the frame."""
+    """Draw the levels of the solved task and of the random policy, and style the frame."""
     for level in (SOLVED, random_level(runs)):
         axes.axhline(level, color="0.35", linewidth=1, linestyle=(0, (4, 3)), zorder=1)
     axes.set_ylim(0, EPISODE_LIMIT * 1.04)
@@ -339,7 +340,7 @@ def draw_levels(axes: Axes, runs: list[Run]) -> None:
 
 
 def label_levels(axes: Axes, runs: list[Run]) -> None:
-    """Say right of the axes what the levels are."""
+    """Label the levels to the right of the axes."""
     random = random_level(runs)
     for level, text in ((SOLVED, f"{SOLVED}: solved"), (random, f"{random:.0f}: random policy")):
         axes.annotate(
@@ -381,11 +382,11 @@ def animate(run: Run, path: Path) -> int:
 
 
 def write_gif(frames: list[Image.Image], seconds: float, path: Path) -> None:
-    """Write an endless animation, all frames in the colours of the middle one.
+    """Write an endless animation; all frames use the colours of the middle one.
 
     Args:
         frames: The pictures.
-        seconds: How long each is shown [s].
+        seconds: Time for which each picture is shown [s].
         path: The file.
     """
     palette = frames[len(frames) // 2].quantize(64)
@@ -398,7 +399,7 @@ def write_gif(frames: list[Image.Image], seconds: float, path: Path) -> None:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options, complete and checked, or end the program with a message."""
+    """Return the complete and checked options, or end the program with a message."""
     parser = make_parser()
     options = parser.parse_args(arguments)
     for name, value in (QUICK if options.quick else FULL).items():
@@ -426,7 +427,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--first-seed", type=at_least(0), default=0, help="seed of the first run (0)")
     add("--steps", type=at_least(1000), help=f"environment steps of a run ({FULL['steps']})")
     add("--episodes", type=at_least(1), help=f"held-out episodes ({FULL['episodes']})")
-    add("--quick", action="store_true", help="try everything in a few seconds")
+    add("--quick", action="store_true", help="run everything briefly, in a few seconds")
     add("--output", type=Path, default=Path("results"), help="folder of the pictures (results)")
     add("--workers", type=at_least(1), default=os.cpu_count() or 1, help="processes (one per core)")
     add("--env", default=ENV_ID, help=f"a cart-pole's id ({ENV_ID})")
@@ -435,7 +436,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def at_least(lowest: int) -> Callable[[str], int]:
-    """Return a function that reads a whole number, refusing what is lower."""
+    """Return a function that reads a whole number and refuses lower ones."""
 
     def whole_number(text: str) -> int:
         if int(text) < lowest:
@@ -446,7 +447,7 @@ def at_least(lowest: int) -> Callable[[str], int]:
 
 
 def assignment(text: str) -> tuple[str, Any]:
-    """Return the name and the value of `NAME=VALUE`; what is no Python literal is a string."""
+    """Return name and value of `NAME=VALUE`; a value that is no Python literal is a string."""
     name, equals, value = text.partition("=")
     if not (name.isidentifier() and equals):
         raise argparse.ArgumentTypeError(f"must be NAME=VALUE, is {text}")
@@ -457,7 +458,7 @@ def assignment(text: str) -> tuple[str, Any]:
 
 
 def make_tasks(options: argparse.Namespace) -> list[Task]:
-    """Return the runs asked for."""
+    """Return the tasks that the options ask for."""
     methods = list(AGENTS) if options.method == "both" else [options.method]
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     return [
@@ -468,18 +469,18 @@ def make_tasks(options: argparse.Namespace) -> list[Task]:
 
 
 def check_env(task: Task) -> None:
-    """Raise an error unless the environment can be made and looks like a cart-pole."""
+    """Raise an error if the environment cannot be made or does not look like a cart-pole."""
     env = task.make_env()
     if env.observation_space.shape != (4,) or env.action_space != gym.spaces.Discrete(2):
         raise ValueError(
-            f"{task.env_id} is no cart-pole: expected 4 observations and 2 actions, "
+            f"{task.env_id} is not a cart-pole: expected 4 observations and 2 actions, "
             f"got {env.observation_space} and {env.action_space}"
         )
     env.close()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train, evaluate, and show the results.
+    """Train and evaluate the agents, and show the results.
 
     Returns:
         The exit status.
@@ -500,7 +501,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def write_pictures(runs: list[Run], folder: Path, console: Console) -> None:
-    """Draw the results and the best agent into a folder, and say where."""
+    """Draw the results and the best agent, and print the paths of the files."""
     folder.mkdir(parents=True, exist_ok=True)
     curves, animation = folder / "learning_curves.png", folder / "trained_agent.gif"
     draw_results(runs, curves)

@@ -3,13 +3,15 @@
     pip install -e ".[examples,sb3]"
     python examples/train_sb3.py
 
-PPO learns to balance the cart-pole, SAC to swing up the pendulum; each from several seeds, once on
-the FMU and once on Gymnasium's own environment, with the same settings. Every trained policy is
-then scored on both sides, on the same held-out episodes. Printed are the scores, the durations and
-whether both sides had the same episodes throughout; the learning curves are drawn into a picture.
-From the same seed and actions both sides give the same observations, so a policy should score the
-same on both. Trainings are the same as long as every reward is: one that is rounded otherwise in
-its last bit is enough for two trainings to part. All takes some ten minutes on two cores.
+PPO learns to balance the cart-pole, and SAC to swing up the pendulum. Each is trained from several
+seeds, on the FMU and on Gymnasium's own environment, with the same settings. The program scores
+each trained policy on both sides, on the same held-out episodes. It prints the scores, the
+durations, and whether the training episodes were the same on both sides, and it draws the learning
+curves. This takes about ten minutes on two cores.
+
+Both sides give the same observations for the same seed and actions, so a policy should score the
+same on both. Two trainings stay equal as long as all rewards are equal; a single reward that
+differs in its last bit makes them diverge.
 """
 
 import argparse
@@ -41,7 +43,7 @@ from fmugym.sb3 import make_sb3_env
 SIDES = ("fmu", "gymnasium")
 SIDE_TITLES = {"fmu": "FMU", "gymnasium": "Gymnasium"}
 COLOURS = {"fmu": "#0072b2", "gymnasium": "#e69f00"}
-HELD_OUT_SEED = 1_000_000  # seeds from here on are never trained on
+HELD_OUT_SEED = 1_000_000  # no training uses seeds from here on
 
 FULL = {"seeds": 5, "episodes": 100}
 QUICK = {"seeds": 2, "episodes": 20}
@@ -57,23 +59,23 @@ HEADERS = (
 
 
 def falling(value: float) -> Callable[[float], float]:
-    """Return a schedule from the value down to 0 over the training."""
+    """Return a schedule that falls from the value to 0 during the training."""
     return lambda remaining: value * remaining
 
 
 @dataclass(frozen=True)
 class Study:
-    """An algorithm and a task that both sides have.
+    """An algorithm and a task that exists on both sides.
 
     Attributes:
-        title: What it is.
+        title: The title of tables and figures.
         ids: The environment's id on each side.
         algorithm: SB3's class.
         settings: The algorithm's arguments.
-        num_envs: Environments stepped together.
+        num_envs: Number of environments that step together.
         steps: Environment steps of a training.
-        quick_steps: The same for a quick try.
-        label: What an episode is judged by.
+        quick_steps: The same with `--quick`.
+        label: The label of the measure of an episode.
     """
 
     title: str
@@ -125,7 +127,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class Task:
-    """One training to do.
+    """One training that is to be done.
 
     Attributes:
         study: A key of `STUDIES`.
@@ -144,14 +146,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Run:
-    """One training done.
+    """The result of one training.
 
     Attributes:
-        task: What was to be done.
-        ends: After how many environment steps each training episode ended, of shape (k,).
+        task: The task.
+        ends: The environment step at which each training episode ended, of shape (k,).
         returns: The returns of those episodes, of shape (k,).
         seconds: Duration of the training [s].
-        env_seconds: How much of that the environments took [s].
+        env_seconds: The part of it that the environments took [s].
         scores: The returns of the held-out episodes on each side, of shape (episodes,).
     """
 
@@ -167,7 +169,7 @@ class Run:
 
 
 class Stopwatch(VecEnvWrapper):
-    """Measures how long the environments take."""
+    """Measure the time that the environments take."""
 
     seconds = 0.0
 
@@ -188,7 +190,7 @@ class Stopwatch(VecEnvWrapper):
 
 
 class Episodes(BaseCallback):
-    """Notes when the training episodes ended, and their returns."""
+    """Record the ends and the returns of the training episodes."""
 
     def _on_training_start(self) -> None:
         self.ended: list[tuple[int, float]] = []
@@ -201,7 +203,7 @@ class Episodes(BaseCallback):
 
 
 def make_envs(study: Study, side: str, count: int) -> VecEnv:
-    """Return a number of environments of one side."""
+    """Return several environments of one side."""
     env_id = study.ids[side]
     if side == "fmu":
         return make_sb3_env(env_id, count)
@@ -225,7 +227,7 @@ def train_and_evaluate(task: Task) -> Run:
 
 
 def evaluate(model: BaseAlgorithm, study: Study, side: str, episodes: int) -> NDArray[np.float64]:
-    """Play held-out episodes, all at once, each in an environment of its own.
+    """Play all held-out episodes at once, each in its own environment.
 
     Returns:
         The returns of the episodes, of shape (episodes,).
@@ -253,12 +255,12 @@ def chosen(runs: list[Run], study: str, side: str) -> list[Run]:
 
 
 def studies_of(runs: list[Run]) -> list[str]:
-    """Return the keys of the studies that were run."""
+    """Return the keys of the studies that were done."""
     return [name for name in STUDIES if chosen(runs, name, "fmu")]
 
 
 def summary(runs: list[Run], study: str) -> Table:
-    """Return the table of a study's scores and durations: means over the seeds."""
+    """Return the table of a study: scores and durations, as means over the seeds."""
     episodes = runs[0].task.episodes
     table = Table(title=f"{STUDIES[study].title}: {episodes} held-out episodes")
     table.add_column("Trained on")
@@ -283,27 +285,27 @@ def summary_cells(runs: list[Run]) -> list[str]:
 
 
 def equal_trainings(runs: list[Run], study: str) -> str:
-    """Say from how many seeds both sides had the same episodes throughout the training."""
+    """Return a sentence: for how many seeds all training episodes were the same on both sides."""
     pairs = list(zip(*(chosen(runs, study, side) for side in SIDES), strict=True))
     same = sum(
         np.array_equal(a.ends, b.ends) and np.array_equal(a.returns, b.returns) for a, b in pairs
     )
     return (
-        f"{STUDIES[study].title}: from {same} of {len(pairs)} seeds every training episode was "
+        f"{STUDIES[study].title}: with {same} of {len(pairs)} seeds, all training episodes were "
         "the same on both sides."
     )
 
 
 def learning_curve(run: Run, grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean return of the latest training episodes, along the training.
+    """Return the running mean of the returns of the training episodes.
 
     Args:
         run: The run.
-        grid: Where the curve is wanted, in environment steps, of shape (n,).
+        grid: The points of the curve, in environment steps, of shape (n,).
 
     Returns:
-        The mean over the episodes of the last twentieth of the training (or else over the last
-        one), of shape (n,).
+        The means of shape (n,). Each is over the episodes that ended within the twentieth of the
+        training before a point, or over the last episode if there were none.
     """
     last = np.searchsorted(run.ends, grid, side="right")
     first = np.searchsorted(run.ends, grid - run.task.steps / 20, side="right")
@@ -329,7 +331,7 @@ def draw_results(runs: list[Run], path: Path) -> None:
 
 
 def draw_learning_curves(axes: Axes, runs: list[Run], study: str) -> None:
-    """Draw over the seeds each side's median, and its worst and best."""
+    """Draw the median and the range over the seeds, for each side."""
     groups = {side: chosen(runs, study, side) for side in SIDES}
     steps = groups["fmu"][0].task.steps
     start = max(run.ends[0] for group in groups.values() for run in group)
@@ -351,7 +353,7 @@ def draw_learning_curves(axes: Axes, runs: list[Run], study: str) -> None:
 
 
 def draw_durations(axes: Axes, runs: list[Run], study: str) -> None:
-    """Draw how long a training took on each side, and how much of it in the environment."""
+    """Draw the duration of a training on each side, and the part that the environments took."""
     for place, side in enumerate(SIDES):
         group = chosen(runs, study, side)
         env = float(np.mean([run.env_seconds for run in group]))
@@ -370,7 +372,7 @@ def draw_durations(axes: Axes, runs: list[Run], study: str) -> None:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options, complete."""
+    """Return the complete options."""
     options = make_parser().parse_args(arguments)
     for name, value in (QUICK if options.quick else FULL).items():
         if getattr(options, name) is None:
@@ -386,14 +388,14 @@ def make_parser() -> argparse.ArgumentParser:
     add("--seeds", type=at_least(1), help=f"trainings on each side ({FULL['seeds']})")
     add("--steps", type=at_least(1000), help="environment steps of a training (by study)")
     add("--episodes", type=at_least(1), help=f"held-out episodes ({FULL['episodes']})")
-    add("--quick", action="store_true", help="try everything in a minute")
+    add("--quick", action="store_true", help="run everything briefly, in a minute")
     add("--output", type=Path, default=Path("results"), help="folder of the picture (results)")
     add("--workers", type=at_least(1), default=os.cpu_count() or 1, help="processes (one per core)")
     return parser
 
 
 def at_least(lowest: int) -> Callable[[str], int]:
-    """Return a function that reads a whole number, refusing what is lower."""
+    """Return a function that reads a whole number and refuses lower ones."""
 
     def whole_number(text: str) -> int:
         if int(text) < lowest:
@@ -404,7 +406,7 @@ def at_least(lowest: int) -> Callable[[str], int]:
 
 
 def make_tasks(options: argparse.Namespace) -> list[Task]:
-    """Return the trainings asked for; the two sides alternate, so that both find the same load."""
+    """Return the tasks; the two sides alternate, so that both meet the same load."""
     names = list(STUDIES) if options.study == "both" else [options.study]
     return [
         Task(name, side, seed, options.steps or default_steps(name, options), options.episodes)
@@ -418,7 +420,7 @@ def default_steps(study: str, options: argparse.Namespace) -> int:
 
 
 def run_all(tasks: list[Task], workers: int, console: Console) -> list[Run]:
-    """Do the trainings in parallel, telling of each that is done."""
+    """Train in parallel, and print a line for each training that is done."""
     runs = []
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context) as executor:

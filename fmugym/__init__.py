@@ -4,17 +4,17 @@ Importing this package registers its environments, so that ``gymnasium.make("fmu
 """
 
 from fmugym import envs
-from fmugym.adapters import Status
-from fmugym.archive import FMU
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.archive.fmu import FMU
+from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.config import EnvConfig
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
 from fmugym.errors import ConfigError, ContractError, FMUGymError, FMULoadError, SimulationError
-from fmugym.linearization import LinearModel, linearize
+from fmugym.fmi.status import Status
 from fmugym.pool import Backend, Paced
 from fmugym.registration import register
-from fmugym.safe_zip import ArchiveLimits
+from fmugym.tools.linearization import LinearModel, linearize
 from fmugym.vector import FMUVectorEnv
 
 __all__ = [

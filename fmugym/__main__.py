@@ -1,8 +1,8 @@
-"""``python -m fmugym``: the command line of ``fmugym.cli``."""
+"""``python -m fmugym``: the command line of ``fmugym.tools.cli``."""
 
 import sys
 
-from fmugym.cli import main
+from fmugym.tools.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

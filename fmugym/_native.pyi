@@ -71,6 +71,9 @@ class Experiment(TypedDict):
     substeps: int
     warm_up_steps: int
     retries: int
+    restores: bool
+    rebuilds: bool
+    reloads: bool
 
 class Variables(TypedDict):
     """What is set and read in each step, and the Strings that are set before initialization."""

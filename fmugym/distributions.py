@@ -1,22 +1,35 @@
 """Distributions from which an environment draws values at each reset.
 
-Wherever a config takes a number for a start value, a parameter or an episode variable it also
-takes a distribution, and the environment draws from it with its own seeded generator.
+Wherever a config takes a number for a start value, a parameter or an episode variable, it also
+takes a distribution. The environment then draws from it with its own seeded generator.
+
+A distribution may be written as a dict: ``{"distribution": "uniform", "low": 0, "high": 1}`` is
+``Uniform(0, 1)``. JSON and YAML files can hold this form, and Gymnasium's ``EnvSpec.to_json``
+writes it. All numbers become Python floats, whatever type they were given in.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from numbers import Real
-from typing import Any, Protocol
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Final, Protocol
 
 import numpy as np
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_mapping, check_number, check_option, has_method, number_of
+from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Choice", "Distribution", "LogUniform", "Normal", "Uniform", "draw", "is_distribution"]
+__all__ = [
+    "Choice",
+    "Distribution",
+    "LogUniform",
+    "Normal",
+    "Uniform",
+    "as_distribution",
+    "draw",
+    "is_distribution",
+]
 
 
 class Distribution(Protocol):
@@ -27,17 +40,29 @@ class Distribution(Protocol):
         ...
 
 
+def _kind(name: str) -> Any:
+    """A constant field, which tells the kind of a distribution that was turned into a dict."""
+    return field(default=name, init=False, repr=False, compare=False)
+
+
 @dataclass(frozen=True)
 class Uniform:
-    """The uniform distribution over ``[low, high)``, drawn as ``rng.uniform(low, high)``."""
+    """The uniform distribution over ``[low, high)``, drawn as ``rng.uniform(low, high)``.
+
+    Raises:
+        ConfigError: If ``low`` is greater than ``high``, or the interval is no finite one.
+    """
 
     low: float
     high: float
+    distribution: str = _kind("uniform")
 
     def __post_init__(self) -> None:
-        _require_finite(self, self.low, self.high)
+        _take_finite(self, "low", "high")
         if self.low > self.high:
             raise ConfigError(f"{self}: low must not be greater than high")
+        if not math.isfinite(self.high - self.low):
+            raise ConfigError(f"{self}: the width must be finite")
 
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value."""
@@ -46,13 +71,18 @@ class Uniform:
 
 @dataclass(frozen=True)
 class LogUniform:
-    """The distribution whose logarithm is uniform; ``0 < low <= high``."""
+    """The distribution whose logarithm is uniform; ``0 < low <= high``.
+
+    Raises:
+        ConfigError: If the bounds are no such numbers.
+    """
 
     low: float
     high: float
+    distribution: str = _kind("log_uniform")
 
     def __post_init__(self) -> None:
-        _require_finite(self, self.low, self.high)
+        _take_finite(self, "low", "high")
         if not 0 < self.low <= self.high:
             raise ConfigError(f"{self}: the bounds must satisfy 0 < low <= high")
 
@@ -63,17 +93,25 @@ class LogUniform:
 
 @dataclass(frozen=True)
 class Normal:
-    """The normal distribution, redrawn until the value lies in ``[low, high]``."""
+    """The normal distribution, redrawn until the value is finite and lies in ``[low, high]``.
+
+    Raises:
+        ConfigError: If the numbers do not make a distribution, or fewer than one draw in a hundred
+            would lie within the limits.
+    """
 
     mean: float
     std: float
     low: float = -math.inf
     high: float = math.inf
+    distribution: str = _kind("normal")
 
     def __post_init__(self) -> None:
-        _require_finite(self, self.mean, self.std)
+        _take_finite(self, "mean", "std")
+        _take(self, "low", "high")
         if self.std < 0:
             raise ConfigError(f"{self}: std must not be negative")
+        object.__setattr__(self, "std", abs(self.std))  # numpy refuses -0.0
         if not self.low <= self.mean <= self.high:
             raise ConfigError(f"{self}: mean must lie between low and high")
         if self._probability_within() < 0.01:
@@ -87,39 +125,95 @@ class Normal:
         return (high - low) / 2
 
     def sample(self, rng: np.random.Generator) -> float:
-        """Draw one value; at least every hundredth draw lies within the bounds."""
+        """Draw one value; at least one draw in a hundred lies within the limits."""
         while True:
             value = float(rng.normal(self.mean, self.std))
-            if self.low <= value <= self.high:
+            if self.low <= value <= self.high and math.isfinite(value):
                 return value
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of the given numbers, with equal or the given probabilities."""
+    """One of the given values, with equal or the given probabilities.
 
-    values: Sequence[float]
+    The values are numbers; for a parameter that is an Enumeration they may be names of its items.
+
+    Raises:
+        ConfigError: If there is no value, or the probabilities do not fit.
+    """
+
+    values: Sequence[Any]
     probabilities: Sequence[float] | None = None
+    distribution: str = _kind("choice")
 
     def __post_init__(self) -> None:
-        if not hasattr(self.values, "__len__") or len(self.values) == 0:
-            raise ConfigError(f"{self}: expected a list of at least one value")
-        weights = self.probabilities
-        if weights is None:
-            return
+        values = _items(self.values)
+        if not values:
+            raise ConfigError(f"Choice: expected a list of at least one value, {_got(self.values)}")
+        values = [value if isinstance(value, str) else _finite(self, value) for value in values]
+        object.__setattr__(self, "values", tuple(values))
+        if self.probabilities is not None:
+            object.__setattr__(self, "probabilities", self._checked_probabilities())
+
+    def _checked_probabilities(self) -> tuple[float, ...]:
+        weights = [number_of("Choice: a probability", one) for one in _items(self.probabilities)]
         fits = len(weights) == len(self.values) and min(weights) >= 0
         if not (fits and abs(sum(weights) - 1) <= 1e-9):
-            raise ConfigError(f"{self}: expected one probability per value, adding up to 1")
+            raise ConfigError(
+                "Choice: expected one probability per value, adding up to 1, "
+                f"{_got(self.probabilities)}"
+            )
+        return tuple(weights)
 
-    def sample(self, rng: np.random.Generator) -> float:
+    def sample(self, rng: np.random.Generator) -> Any:
         """Draw one value."""
         index = rng.choice(len(self.values), p=self.probabilities)
         return self.values[int(index)]
 
 
+_KINDS: Final[Mapping[str, type[Any]]] = {
+    "uniform": Uniform,
+    "log_uniform": LogUniform,
+    "normal": Normal,
+    "choice": Choice,
+}
+_OURS: Final = tuple(_KINDS.values())
+
+
+def as_distribution(what: str, value: Any) -> Any:
+    """Turn a dict with the key ``"distribution"`` into the distribution that it describes.
+
+    Args:
+        what: The name of the value, for the error.
+        value: Such a dict, or anything else, which is returned as it is.
+
+    Raises:
+        ConfigError: If there is no such distribution, or the other keys do not fit it.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    arguments = check_mapping(what, value)
+    if "distribution" not in arguments:
+        raise ConfigError(
+            f"{what} must be a number or a distribution; a dict needs the key 'distribution', "
+            f"{_got(value)}"
+        )
+    kind = _KINDS[check_option("distribution", arguments.pop("distribution"), _KINDS)]
+    known = [one.name for one in fields(kind) if one.init]
+    for name in arguments:
+        if name not in known:
+            raise unknown_name(f"key of the distribution {kind.__name__}", name, known)
+    try:
+        return kind(**arguments)
+    except TypeError:
+        raise ConfigError(f"{what}: {kind.__name__} needs more than {sorted(arguments)}") from None
+
+
 def is_distribution(value: object) -> bool:
     """Whether a value of a config is to be drawn anew at each reset."""
-    return not isinstance(value, type) and (hasattr(value, "sample") or hasattr(value, "rvs"))
+    if isinstance(value, type):
+        return False
+    return isinstance(value, _OURS) or has_method(value, "sample") or has_method(value, "rvs")
 
 
 def draw(value: Any, rng: np.random.Generator) -> Any:
@@ -130,15 +224,52 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
         rng: The generator of the environment.
 
     Returns:
-        The constant, or one number.
+        The constant, or one number. From a ``Choice`` it may be the name of an item.
+
+    Raises:
+        ConfigError: If a distribution of the caller's own fails, or draws no finite number.
     """
-    if hasattr(value, "sample"):
+    if isinstance(value, _OURS):
         return value.sample(rng)
-    if hasattr(value, "rvs"):
-        return float(value.rvs(random_state=rng))
-    return value
+    if not is_distribution(value):
+        return value
+    try:
+        drawn = value.sample(rng) if has_method(value, "sample") else value.rvs(random_state=rng)
+    except Exception as error:
+        raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
+    return drawn if isinstance(drawn, str) else check_number(f"what {shown(value)} draws", drawn)
 
 
-def _require_finite(distribution: object, *numbers: float) -> None:
-    if not all(isinstance(number, Real) and math.isfinite(number) for number in numbers):
-        raise ConfigError(f"{distribution}: every number must be one, and finite")
+def _items(values: Any) -> list[Any]:
+    """The elements of what should be a list; none if it is no list."""
+    if isinstance(values, str | bytes) or not isinstance(values, Iterable):
+        return []
+    try:
+        return list(values)
+    except Exception:  # an iterable of the caller's that fails
+        return []
+
+
+def _take_finite(distribution: Any, *names: str) -> None:
+    """Turn fields into finite floats."""
+    _take(distribution, *names)
+    for name in names:
+        _finite(distribution, getattr(distribution, name), name)
+
+
+def _take(distribution: Any, *names: str) -> None:
+    for name in names:
+        value = number_of(f"{_name(distribution)}: {name}", getattr(distribution, name))
+        object.__setattr__(distribution, name, value)
+
+
+def _finite(distribution: Any, value: Any, name: str = "a value") -> float:
+    return check_number(f"{_name(distribution)}: {name}", value)
+
+
+def _name(distribution: Any) -> str:
+    return type(distribution).__name__
+
+
+def _got(value: Any) -> str:
+    return f"got {shown(value)}"

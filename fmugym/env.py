@@ -1,99 +1,111 @@
-"""The environment: hooks, spaces and episodes around a pool of one FMU instance."""
+"""The environment: episodes around a pool of one FMU instance."""
 
 from __future__ import annotations
 
-import inspect
 import logging
 import math
-import operator
 import os
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Final, Never
 
-import gymnasium
 import numpy as np
-import numpy.typing as npt
+from gymnasium import logger as gymnasium_logger
 from gymnasium import spaces
 
-from fmugym import spaces as fmu_spaces
-from fmugym.adapters import Status
-from fmugym.archive import FMU
-from fmugym.config import EnvConfig, checked, output_variable, start_variable
-from fmugym.episode import Episode, EpisodePlan
-from fmugym.errors import ConfigError, SimulationError, unknown_name
-from fmugym.pool import Pool, PoolSpec, make_pool
+from fmugym.checks import check_mapping, check_seed
+from fmugym.config import EnvConfig
+from fmugym.distributions import as_distribution
+from fmugym.errors import (
+    ConfigError,
+    FMUGymError,
+    SimulationError,
+    shown,
+    unknown_argument,
+    unknown_name,
+)
+from fmugym.fmi.status import Status
+from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.health import fault_rates
-from fmugym.values import EpisodeVariables, NamedValues
-
-if TYPE_CHECKING:
-    from fmugym.rendering import Renderer, Scene
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.actions import (
+    elements_of,
+    flat_inputs,
+    has_nan,
+    is_element,
+    is_misfit,
+    no_action,
+)
+from fmugym.task.episode import Episode, EpisodePlan
+from fmugym.task.interface import checked, output_variable, resolve, start_variable
+from fmugym.task.opening import open_fmu, open_pool
+from fmugym.task.pictures import Pictured
+from fmugym.task.results import (
+    FLOAT32_LIMIT,
+    as_flag,
+    as_info,
+    as_reward,
+    finiteness_of,
+)
+from fmugym.task.values import EpisodeVariables, NamedValues
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
-
-_WARNING = int(Status.WARNING)
-_TERMINATED = int(Status.TERMINATED)
-
-_pool_request: ContextVar[tuple[int, dict[str, Any]]] = ContextVar("request", default=(1, {}))
-
-
-@contextmanager
-def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
-    """Let environments that are made in this context have a pool of this size.
-
-    Args:
-        num_instances: Number of FMU instances; a vector environment's prototype has all of them.
-        options: Passed to ``fmugym.pool.make_pool``.
-    """
-    token = _pool_request.set((num_instances, options))
-    try:
-        yield
-    finally:
-        _pool_request.reset(token)
+_WARNING: Final = int(Status.WARNING)
+_TERMINATED: Final = int(Status.TERMINATED)
+_ARGUMENTS: Final = ("fmu_path", "config", "log_level", "render_mode", "backend", "isolation")
+_FASTEST_FPS: Final = 1_000_000
+_FLOATS: Final = frozenset({float, np.float64})
 
 
-class FMUEnv(gymnasium.Env[Any, Any], ABC):
+class FMUEnv(Pictured):
     """A co-simulation FMU as a Gymnasium environment.
 
-    A subclass for an FMU of its own derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv``
-    and supplies ``_is_done``; every other hook has a default. Hooks are called once a step in the
-    order in which they stand below. All but ``_get_inputs`` and ``_update`` are free of side
-    effects, and none draws random numbers: what is random is a distribution in the config.
+    A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv`` and supplies
+    ``_is_done``; every other hook of ``fmugym.task.hooks.Hooks`` has a default. A step calls the
+    hooks once each, in the order in which they stand there. All but ``_get_inputs`` and ``_update``
+    must be free of side effects. None may draw random numbers; random values are distributions in
+    the config.
+
+    A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
+    an observation that is not finite is a fault of the episode, like a failure of the FMU.
+
+    An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
+    already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
+    the episode as it was; it becomes a ``ConfigError`` if it comes from an action that is not in
+    the action space.
 
     Args:
         fmu_path: The FMU; a relative path is relative to the file of the class.
         config: See ``EnvConfig``.
         log_level: Level of this class's logger, which gets the FMU's messages.
-        render_mode: One of the class's ``metadata["render_modes"]``, or None.
+        render_mode: One of the class's ``metadata["render_modes"]``, or None. For another mode of
+            Gymnasium there is a warning, and no pictures.
         backend: What stands in for the FMU, which then only describes the variables: an object
             with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
-            it. Or the name of a way to step the FMU, see ``fmugym.pool.make_pool``.
-        isolation: Where the FMU runs, if not where the config says.
+            it. Or the name of a way to step the FMU, see ``fmugym.trial.opening.make_pool``.
+        isolation: Where the FMU runs; by default where the config says.
 
     Attributes:
-        fmu: The FMU; ``fmu.description`` is what it says of itself.
+        fmu: The FMU; ``fmu.description`` is its model description.
         config: The checked config.
         state: The outputs in the order of the config, floats.
-        out: The outputs and the monitored variables by name.
+        out: The outputs and the monitored variables by name, a read-only mapping.
         action: The action of this step as it was given; zeros after a reset.
-        inputs: What was written to the FMU's inputs in this step, floats.
+        inputs: The FMU's inputs in this step, floats.
         previous_state: ``state`` before this step.
         previous_action: The action of the step before; zeros in the first.
         step_count: Steps since the reset.
-        done: What ``_is_done`` said in this step.
+        done: What ``_is_done`` returned in this step.
         after_end: Whether this step began after the end of the episode.
         parameters: The parameters of this episode by name.
         variables: The episode variables by name; ``_update`` may write them.
         logger: The logger of the class.
 
     Raises:
-        ConfigError: If the config does not fit the FMU.
+        ConfigError: If an argument does not fit, or the config does not fit the FMU.
+        ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
         FMULoadError: If the FMU cannot be used on this machine.
     """
 
@@ -108,28 +120,17 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters",)
     """The keys that ``reset`` takes in its options."""
 
-    state: Any
-    previous_state: Any
-    inputs: Any
-    action: Any
-    previous_action: Any
-    step_count: Any
-    done: Any
-    after_end: Any
     _values: Any
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
-    render_size: ClassVar[tuple[int, int]] = (600, 400)
-    """Width and height of the pictures in pixels."""
 
     _per_env_attributes: Mapping[str, Any] = MappingProxyType({})
     """In a vector environment: attributes that hold one value for each environment."""
 
     _has_info: bool
     _pool: Pool | None = None
-    _renderer: Renderer[Any] | None = None
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUEnv:
-        """Keep the arguments: an environment pickles as its class and them."""
+        """Keep the arguments, because an environment pickles as its class and arguments."""
         env = super().__new__(cls)
         env._constructor_arguments = args, kwargs
         return env
@@ -143,51 +144,37 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
+        **unknown: Never,
     ) -> None:
+        for name in unknown:
+            raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
-        self.logger.setLevel(log_level)
+        _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
         self.render_mode = self._checked_render_mode(render_mode)
-        self.fmu = self._open_fmu(fmu_path)
+        self.fmu = open_fmu(type(self), fmu_path, self.config)
         self._require_fmi_version()
-        self._interface = self.config.resolve(self.fmu.description)
+        self._interface = resolve(self.config, self.fmu.description)
         self._spec = self._interface.pool_spec()
         self._warn_of_peculiarities()
         self._prepare_values()
+        self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
-        self._pool = self._make_pool(backend, isolation)
+        self._pool = open_pool(
+            self.fmu, self._spec, self.config, self._plan, self.logger, backend, isolation
+        )
         self._step_pool = self._pool.step_own
         self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
         self._observation_row = self._pool.observations[0]
-        self._halt = getattr(self._pool, "halt", _nothing)
-        self._pool_tells = bool(pool_info(self._pool))
+        self._halt = self._pool.halt
+        self._pool_tells = bool(self._pool.info())
         self._has_info = self._has_info or self._pool_tells
 
-    def _checked_render_mode(self, mode: str | None) -> str | None:
-        if mode is not None and mode not in self.metadata["render_modes"]:
-            raise unknown_name("render mode", mode, self.metadata["render_modes"])
-        return mode
-
-    def _open_fmu(self, path: str | os.PathLike[str]) -> FMU:
-        cls, config = type(self), self.config
-        return FMU(
-            _find_file(cls, path),
-            limits=config.archive_limits,
-            preload=[_find_file(cls, p) if os.path.dirname(p) else p for p in config.preload],
-            probe_timeout=config.probe_timeout,
-        )
-
-    def _make_pool(self, backend: Any, isolation: str | None) -> Pool:
-        num_instances, requested = _pool_request.get()
-        options: dict[str, Any] = {
-            "isolation": self.config.isolation if isolation is None else isolation,
-            "call_timeout": self.config.call_timeout,
-            **requested,
-        }
-        if backend is not None:
-            options["backend"] = backend
-        return make_pool(self.fmu, self._spec, num_instances, self.logger, **options)
+    @property
+    def reset_method(self) -> str:
+        """How episodes begin; see ``EnvConfig``."""
+        return str(self._open_pool("reset_method").reset_method)
 
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
@@ -212,9 +199,11 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
 
     def _prepare_values(self) -> None:
-        interface, config = self._interface, self.config
+        """Set what hooks may read to what it is before the first reset."""
+        interface = self._interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / interface.time_step))}
+        fps = min(1 / interface.time_step, _FASTEST_FPS)
+        self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
         self._output_count = len(interface.outputs)
         self._no_monitors = not interface.monitors
         self._values = (math.nan,) * len(names)
@@ -226,17 +215,17 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.action = None
         self.previous_action = None
         self.parameters: Mapping[str, Any] = MappingProxyType({})
-        self.variables = EpisodeVariables(config.episode_variables)
-        self._plan = self._plan_episode({})
-        self._step_limit = _step_limit(config, self._spec)
+        self.variables = EpisodeVariables(self.config.episode_variables)
         self.step_count = 0
         self.done = False
         self.after_end = False
+
+    def _prepare_episodes(self) -> None:
+        self._plan = self._plan_episode({})
+        self._step_limit = _step_limit(self.config, self._spec)
         self._ended = True
         self._in_hooks = False
         self._was_reset = False
-        self._last_reward: float | None = None
-        self._return = 0.0
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -244,127 +233,35 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         for name, space in (("action", self.action_space), ("observation", self.observation_space)):
             if not isinstance(space, spaces.Space):
                 raise ConfigError(
-                    f"{type(self).__name__}._get_{name}_space returned {space!r}, "
+                    f"{type(self).__name__}._get_{name}_space returned {shown(space)}, "
                     "expected a gymnasium.spaces.Space"
                 )
-        self._no_action = _no_action(self.action_space)
-        self._elements = _elements(self.action_space) if type(self).step is FMUEnv.step else None
+        self._no_action = no_action(self.action_space)
+        # A subclass with its own step may take other actions.
+        is_own = type(self).step is not FMUEnv.step
+        self._elements = None if is_own else elements_of(self.action_space)
 
     def _prepare_hooks(self) -> None:
-        """Settle what depends on the hooks that the class has of its own."""
+        """Find out which hooks the class overrides, and prepare the defaults of the others."""
         interface, cls = self._interface, type(self)
         derived = cls._get_action_space is FMUEnv._get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
         self._action_values = values
         default = cls._get_observation is FMUEnv._get_observation
         space = self.observation_space
-        # Then the pool makes the observation in the same pass.
+        make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
+        self._observe = make(interface, space)
+        self._is_finite = finiteness_of(space)
+        # The pool writes this observation in the pass that steps the FMU.
         self._pool_observes = (
             default and isinstance(space, spaces.Box) and space.dtype == np.float32
         )
-        if default:
-            self._observe = fmu_spaces.default_observation(interface, self.observation_space)
         self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
         self._has_update = cls._update is not FMUEnv._update
         self._has_truncation = cls._is_truncated is not FMUEnv._is_truncated
         self._has_info = cls._get_info is not FMUEnv._get_info
         self._real_inputs = all(v.kind == "real" for v in interface.inputs)
         self._takes_one_real = [v.kind for v in interface.inputs] == ["real"]
-
-    # Hooks, in the order of a step.
-
-    def _get_inputs(self) -> Any:
-        """Turn ``self.action`` into the values of the inputs, in the order of the config.
-
-        Returns:
-            One number for each input. By default the action's own elements; for a ``Discrete``
-            made from an Enumeration or Integer, the value that the element stands for.
-        """
-        values = self._action_values
-        if values is None:
-            return self.action
-        if isinstance(values, range):  # of an Integer; it may be a wide one
-            return values[0] + self.action
-        return np.array(values)[self.action]
-
-    def _update(self) -> None:
-        """Advance what the task itself integrates or filters; called once after each FMU step."""
-
-    @abstractmethod
-    def _is_done(self) -> bool:
-        """Whether the task has ended, by success or by failure: ``terminated``."""
-
-    def _is_truncated(self) -> bool:
-        """Whether the episode is to be cut short for a reason outside of the task."""
-        return False
-
-    def _reward_policy(self) -> Any:
-        """The reward of this step.
-
-        Returns:
-            By default ``negative_reward`` where the task has ended and ``positive_reward``
-            otherwise; for a goal task ``_goal_reward`` of this observation.
-        """
-        positive, negative = self.config.positive_reward, self.config.negative_reward
-        if self._is_goal_task:
-            return self._reward_for_goals(self._get_observation())
-        if isinstance(self.done, bool):
-            return negative if self.done else positive
-        return np.where(self.done, negative, positive)
-
-    def _reward_for_goals(self, observation: Mapping[str, Any]) -> Any:
-        """Goals have environments first, as whoever calls ``compute_reward`` has them."""
-        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-        if not isinstance(self.done, bool):
-            achieved, desired = np.moveaxis(achieved, -1, 0), np.moveaxis(desired, -1, 0)
-        return self._goal_reward(achieved, desired)
-
-    def _get_observation(self) -> Any:
-        """The observation, a new array (or dict of new arrays).
-
-        Returns:
-            By default the outputs in the type of the observation space.
-        """
-        return self._observe(self.state)
-
-    def _get_info(self) -> dict[str, Any]:
-        """What else is worth knowing of this step, a new dict."""
-        return {}
-
-    def _get_action_space(self) -> spaces.Space[Any]:
-        """The action space; by default from the inputs' types, min and max."""
-        return fmu_spaces.action_space(self._interface)
-
-    def _get_observation_space(self) -> spaces.Space[Any]:
-        """The observation space; by default from the outputs' types, min and max."""
-        return fmu_spaces.observation_space(self._interface)
-
-    def _goal_reward(self, achieved_goal: Any, desired_goal: Any) -> Any:
-        """The reward for having reached one goal when another was wanted, element-wise.
-
-        Override it for a goal task, whose observations are dicts with ``achieved_goal`` and
-        ``desired_goal``: the default reward and ``compute_reward`` are then made from it.
-        """
-        raise SimulationError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
-
-    def _get_scene(self) -> Scene[Any]:
-        """What ``render`` draws; see ``fmugym.rendering``. Called once."""
-        raise SimulationError(f"{type(self).__name__} has render modes, but no _get_scene")
-
-    def _get_frame(self) -> Any:
-        """What the scene needs to know of this moment; by default ``out``."""
-        return self.out
-
-    def _describe_action(self) -> str:
-        """The action as text for the picture."""
-        return ", ".join(f"{value:+.3g}" for value in self.inputs)
-
-    def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The parameters that the options of ``reset`` override for one episode, by name."""
-        overrides = options.get("model_parameters", {})
-        if not isinstance(overrides, Mapping):
-            raise ConfigError(f"option 'model_parameters' must be a dict, got {overrides!r}")
-        return overrides
 
     # Gymnasium's interface.
 
@@ -373,11 +270,11 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
     ) -> tuple[Any, dict[str, Any]]:
         """Start a new episode with the FMU instance at hand.
 
-        What is random is drawn from this environment's own generator: the parameters in the order
-        of the config, then those only in the options, then the episode variables.
+        Random values are drawn from this environment's own generator: first the parameters in the
+        order of the config, then those that only the options have, then the episode variables.
 
         Args:
-            seed: Seeds the generator; None goes on with it.
+            seed: Seeds the generator, an integer of at least 0; None goes on with the generator.
             options: ``{"model_parameters": {name: value or distribution}}`` overrides parameters
                 for this episode; an environment may take more, see its ``reset_options``.
 
@@ -386,14 +283,15 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             under ``"drawn"``.
 
         Raises:
-            ConfigError: If an option is unknown or does not fit.
-            SimulationError: If the FMU cannot be initialized, or the environment is closed.
+            ConfigError: If the seed or an option does not fit. The episode then goes on.
+            SimulationError: If the FMU cannot be initialized, the first observation is not finite,
+                or the environment is closed.
         """
         pool = self._open_pool("reset")
+        seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
-        plan = self._plan_of_reset(options)
         episode = plan.draw(self.np_random)
-        self._ended = True  # should the FMU fail in what follows
+        self._ended = True  # there is no episode if the FMU fails
         try:
             pool.reset(plan.model_variables, episode.start_values)
             if pool.statuses.item(0) > Status.WARNING:
@@ -401,6 +299,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             self._begin_episode(episode)
             observation, info = self._observation_and_info()
         except BaseException:
+            self._ended = True
             self._halt()
             raise
         info["drawn"] = episode.drawn
@@ -409,19 +308,24 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         return observation, info
 
     def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
-        if not options:
+        if options is None:
             return self._plan
-        if not isinstance(options, Mapping):
-            raise ConfigError(f"the options of reset must be a dict, got {options!r}")
+        options = check_mapping("the options of reset", options)
         for name in options:
             if name not in self.reset_options:
                 raise unknown_name("reset option", name, self.reset_options)
-        return self._plan_episode(self._get_episode_parameters(options))
+        if not options:
+            return self._plan
+        parameters = self._get_episode_parameters(options)
+        return self._plan_episode(
+            check_mapping("what _get_episode_parameters returned", parameters)
+        )
 
     def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
-        """Prepare the draws of episodes whose parameters are the config's and these instead."""
+        """Prepare the draws of episodes in which these parameters replace the config's."""
         parameters = dict(self._interface.parameters)
         for name, value in overrides.items():
+            value = as_distribution(repr(name), value)
             variable = start_variable(self.fmu.description, name, value)
             if not variable.numeric:
                 raise ConfigError(f"{name!r} is a String: it can be set in the config only")
@@ -446,14 +350,16 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._was_reset, self._ended = True, False
 
     def _set_values(self) -> None:
-        """Take the pool's outputs over: hooks get floats, which are faster than numpy's."""
+        """Give hooks the pool's outputs as Python floats, which are faster than numpy's."""
         self._values = values = tuple(self._output_row.tolist())
         self.state = values if self._no_monitors else values[: self._output_count]
 
     def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
         self._in_hooks = True
         try:
-            observation = _given(self._get_observation(), "_get_observation")
+            observation = self._get_observation()
+            if not self._is_finite(observation):
+                raise SimulationError(f"the first observation is not finite: {shown(observation)}")
             return observation, self._info()
         finally:
             self._in_hooks = False
@@ -462,17 +368,19 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
 
         Args:
-            action: An element of the action space, or whatever ``_get_inputs`` takes.
+            action: An element of the action space, or what ``_get_inputs`` can make use of; no
+                number in it may be NaN.
 
         Returns:
-            Observation, reward, terminated, truncated, info. After a fault of the FMU the
-            observation is the last good one and the info has ``"fault"``, the reason, and
-            ``"fault_rate"``, the part of the episodes until now that ended so.
+            Observation, reward, terminated, truncated, info. After a fault the observation is the
+            last good one. The info then has ``"fault"``, the reason, and ``"fault_rate"``, the part
+            of the episodes until now that ended by a fault.
 
         Raises:
-            ConfigError: If the action does not fit the inputs, or is not finite.
+            ConfigError: If the action does not fit the inputs or is not finite, or a hook returns
+                something unusable.
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
-                and, with ``on_fault="raise"``, if the FMU fails.
+                and, with ``on_fault="raise"``, after a fault.
         """
         pool = self._pool
         if pool is None or self._ended:
@@ -480,10 +388,14 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self._in_hooks = True
         try:
             self._take_action(action)
-            troubled = self._step_pool()
-            self.step_count += 1
-            result = self._evaluate(pool, pool.statuses.item(0) if troubled else 0)
-        except BaseException:  # whatever is real must not go on without its controller
+            try:
+                troubled = self._step_pool()
+                self.step_count += 1
+                result = self._evaluate(pool, pool.statuses.item(0) if troubled else 0)
+            except BaseException:  # the FMU has moved, so that the step cannot be tried again
+                self._ended = True
+                raise
+        except BaseException:  # a real system must not go on without its controller
             self._halt()
             raise
         finally:
@@ -492,11 +404,6 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
             self._note_for_picture(result[1])
         return result
 
-    def _note_for_picture(self, reward: float) -> None:
-        self._last_reward, self._return = reward, self._return + reward
-        if self.render_mode == "human":
-            self.render()
-
     def _checked_before_step(self) -> Pool:
         pool = self._open_pool("step")
         if not self._was_reset:
@@ -504,7 +411,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         if not self.steps_after_end:
             raise SimulationError("step was called after the end of the episode; call reset first")
         if not self.after_end:
-            gymnasium.logger.warn("step was called after the end of the episode; call reset first")
+            gymnasium_logger.warn("step was called after the end of the episode; call reset first")
         return pool
 
     def _open_pool(self, method: str) -> Pool:
@@ -514,83 +421,94 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
 
     def _take_action(self, action: Any) -> None:
         elements = self._elements
-        if elements is not None and not _is_element(action, elements):
-            raise ConfigError(f"action {action!r} is not in {self.action_space}")
+        if elements is not None:
+            if not is_element(action, elements):
+                raise ConfigError(f"action {shown(action)} is not in {self.action_space}")
+        elif has_nan(action):
+            raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
         before = self.action, self.previous_action, self.previous_state
         self.previous_action, self.action, self.previous_state = self.action, action, self.state
         try:
             self._write_inputs(self._get_inputs())
-        except BaseException:  # the FMU was not touched: a better action may follow
+        except BaseException as error:  # the FMU was not touched: a better action may follow
             self.action, self.previous_action, self.previous_state = before
+            if self._blames_action(action, error):
+                raise ConfigError(
+                    f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
+                ) from error
             raise
 
+    def _blames_action(self, action: Any, error: BaseException) -> bool:
+        """Whether ``_get_inputs`` failed because of an action outside of the action space."""
+        if isinstance(error, FMUGymError) or not isinstance(error, Exception):
+            return False
+        if type(self).step is not FMUEnv.step:  # then its actions may be others
+            return False
+        return is_misfit(action, self.action_space, error)
+
     def _write_inputs(self, values: Any) -> None:
-        if self._takes_one_real and isinstance(values, float) and math.isfinite(values):
+        if self._takes_one_real and type(values) in _FLOATS and math.isfinite(values):
             self._input_row[0] = values
             self.inputs = (float(values),)
             return
-        inputs = tuple(self._flat_inputs(values).tolist())
+        inputs = tuple(flat_inputs(values, self._interface.inputs, self._source).tolist())
         if not all(map(math.isfinite, inputs)):
             self._raise_for_inputs(inputs, "every input must be finite")
         self._input_row[:] = inputs
         self.inputs = inputs
 
-    def _flat_inputs(self, values: Any) -> npt.NDArray[np.float64]:
-        if values is None:
-            raise ConfigError("_get_inputs returned None, expected a number for each input")
-        try:
-            raw = np.asarray(values)
-            flat = raw.astype(np.float64, casting="unsafe" if raw.dtype == object else "same_kind")
-        except (TypeError, ValueError, OverflowError):
-            raise ConfigError(f"action {self.action!r} does not make numbers") from None
-        flat = flat.ravel()
-        variables = self._interface.inputs
-        if flat.size != len(variables):
-            names = ", ".join(variable.name for variable in variables)
-            raise ConfigError(
-                f"action {self.action!r} makes {flat.size} values, "
-                f"expected {len(variables)}, one for each input ({names})"
-            )
-        return flat if self._real_inputs else fmu_spaces.to_input_types(variables, flat)
+    def _source(self, values: Any) -> str:
+        """Say for an error where inputs come from."""
+        if values is self.action:
+            return f"action {shown(values)}"
+        return f"what _get_inputs returned for action {shown(self.action)}, {shown(values)},"
 
     def _raise_for_inputs(self, inputs: tuple[float, ...], why: str) -> None:
         pairs = zip(self.config.model_input_names, inputs, strict=True)
         listing = ", ".join(f"{name} = {value}" for name, value in pairs)
-        raise ConfigError(f"action {self.action!r} makes {listing}; {why}")
+        raise ConfigError(f"action {shown(self.action)} makes {listing}; {why}")
 
     def _evaluate(self, pool: Pool, status: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         stopped = status == _TERMINATED
         if status > _WARNING and not stopped:
             return self._fault(pool.failure(0))
         self.after_end = self._ended
+        before = self._values, self.variables.copy() if self._has_update else {}
         self._set_values()
         if self._has_update:
             self._update()
         done = self._is_done()
-        self.done = terminated = stopped or bool(done)
+        if done is not True and done is not False:
+            done = as_flag("_is_done", done)
+        self.done = terminated = stopped or done
         truncated = self.step_count >= self._step_limit
         if self._has_truncation:
-            truncated = bool(_given(self._is_truncated(), "_is_truncated")) or truncated
+            truncated = as_flag("_is_truncated", self._is_truncated()) or truncated
         reward = self._reward_policy()
+        if type(reward) is not float:
+            reward = as_reward(reward)
         if self._pool_observes:
             observation: Any = self._observation_row.copy()
+            is_finite = math.hypot(*self.state) <= FLOAT32_LIMIT or self._is_finite(observation)
         else:
-            observation = _given(self._get_observation(), "_get_observation")
+            observation = self._get_observation()
+            is_finite = self._is_finite(observation)
+        if not (is_finite and math.isfinite(reward)):
+            return self._fault_of_hooks(reward, observation, before)
         info = self._info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
         if terminated or truncated:
             self._ended = True
-        if done is None or reward is None:
-            _given(done, "_is_done")
-            _given(reward, "_reward_policy")
-        return observation, float(reward), terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
-        """What the hook tells, and the pool."""
-        info: dict[str, Any] = _given(self._get_info(), "_get_info")
+        """Return the info of the hook and of the pool."""
+        info = as_info(self._get_info())
         if self._pool_tells:
-            info = info | {name: value.item(0) for name, value in pool_info(self._pool).items()}
+            info = info | {
+                name: value.item(0) for name, value in self._open_pool("info").info().items()
+            }
         return info
 
     @property
@@ -598,6 +516,21 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         """The FMU's time in seconds."""
         steps = self._spec.warm_up_steps + self.step_count
         return self._spec.communication_point(steps * self._spec.substeps)
+
+    def _fault_of_hooks(
+        self, reward: float, observation: Any, before: tuple[Any, dict[str, Any]]
+    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """End the episode because of a number that is not finite, in the state before the step."""
+        if math.isfinite(reward):
+            reason = f"the observation is {shown(observation)} at t = {self.time:g} s"
+        else:
+            reason = f"_reward_policy returned {reward} at t = {self.time:g} s"
+        self._values, variables = before
+        self.state = self.previous_state
+        self.variables.update(variables)
+        self._open_pool("step").note_fault(0)
+        self._halt()
+        return self._fault(reason)
 
     def _fault(self, reason: str) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self._ended = True
@@ -607,21 +540,23 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         self.logger.warning("%s", reason)
         self.done = policy == "terminate"
         info = self._info() | {"fault": reason, "fault_rate": self._fault_rate()}
-        reward = float(self.config.fault_reward)
-        return self._get_observation(), reward, self.done, not self.done, info
+        observation = self._get_observation()
+        if not self._is_finite(observation):
+            raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
+        return observation, self.config.fault_reward, self.done, not self.done, info
 
     def _fault_rate(self) -> float:
         return float(fault_rates(self._open_pool("health").health())[0])
 
     @property
     def health(self) -> dict[str, int]:
-        """What was counted of the FMU since the environment was made, by name.
+        """Counts of what happened since the environment was made, by name.
 
         ``resets``; ``steps`` (communication steps); faults by kind: ``discards``, ``errors``,
         ``fatals``, ``not_finite``, ``deaths`` (of its worker process); ``retries`` of discarded
         steps; ``replacements`` of the instance, and of these ``recyclings`` because of leaks; and
-        ``memory_growth``, the bytes that resets have taken from this process (in worker processes:
-        that the worker has grown by).
+        ``memory_growth``, the bytes that resets have taken from this process, or by which its
+        worker process has grown.
 
         Raises:
             SimulationError: If the environment is closed.
@@ -629,35 +564,12 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
         counts = self._open_pool("health").health()
         return {name: int(values[0]) for name, values in counts.items()}
 
-    def render(self) -> Any:
-        """Draw the present state.
-
-        Returns:
-            In the mode ``rgb_array`` an array of shape (height, width, 3) and type uint8, in the
-            mode ``human`` None: the picture is in a window.
-        """
-        if self.render_mode is None:
-            gymnasium.logger.warn("render was called, but no render_mode was given at construction")
-            return None
-        if not self._was_reset:
-            raise SimulationError("render was called before the first reset")
-        from fmugym.rendering import Overlay, Renderer  # pygame takes a while to import
-
-        if self._renderer is None:
-            fps = 1 / self._interface.time_step
-            title = type(self).__name__
-            scene = self._get_scene()
-            self._renderer = Renderer(scene, self.render_size, fps, self.render_mode, title)
-        action = self._describe_action() if self.step_count else ""
-        overlay = Overlay(self.time, action, self._last_reward, self._return)
-        return self._renderer.render(self._get_frame(), overlay)
-
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
         """The goal reward in the form that hindsight replay calls; see ``_goal_reward``.
 
         Raises:
-            AttributeError: If this is no goal task: that is how Stable-Baselines3 tells.
+            AttributeError: If this is no goal task, as Stable-Baselines3 expects it.
         """
         if not self._is_goal_task:
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
@@ -678,7 +590,7 @@ class FMUEnv(gymnasium.Env[Any, Any], ABC):
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The environment's generator; not for hooks, whose results must not depend on it."""
+        """The environment's generator; hooks must not use it."""
         if self._in_hooks:
             raise SimulationError(
                 "a hook drew random numbers; give a distribution in the config under "
@@ -723,19 +635,11 @@ class FMI3CSEnv(FMUEnv):
     fmi_version = 3
 
 
-def _nothing() -> None:
-    """What is to be halted where all is simulated."""
-
-
-def pool_info(pool: Any) -> dict[str, npt.NDArray[Any]]:
-    """What a pool tells of each step, each of shape (N,); paced ones do, and those that retry."""
-    return pool.info() if hasattr(pool, "info") else {}
-
-
-def _given(value: Any, hook: str) -> Any:
-    if value is None:
-        raise ConfigError(f"{hook} returned None; is its return statement missing?")
-    return value
+def _set_level(logger: logging.Logger, level: Any) -> None:
+    try:
+        logger.setLevel(level)
+    except Exception:  # a TypeError or ValueError; or the object's own method fails
+        raise ConfigError(f"log_level must be a level of logging, got {shown(level)}") from None
 
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:
@@ -748,6 +652,8 @@ def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
     if config.stop_time is None:
         return limit
     span = (config.stop_time - spec.start_time) / spec.time_step
+    if span > limit:
+        return limit
     steps = math.floor(span + 1e-9) - spec.warm_up_steps
     if steps < 1:
         raise ConfigError(
@@ -755,46 +661,3 @@ def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
             f"after start_time = {spec.start_time} s and the warm-up"
         )
     return min(limit, steps)
-
-
-def _no_action(space: spaces.Space[Any]) -> Any:
-    """What hooks read where there was no action yet; None for spaces that have no zero."""
-    if isinstance(space, spaces.Discrete):
-        return space.dtype.type(space.start)
-    if isinstance(space, spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete):
-        return np.zeros(space.shape, space.dtype)
-    return None
-
-
-def _elements(space: spaces.Space[Any]) -> range | None:
-    """The elements of a ``Discrete``; a subclass that overrides ``step`` may take other actions."""
-    if isinstance(space, spaces.Discrete):
-        return range(int(space.start), int(space.start + space.n))
-    return None
-
-
-def _is_element(action: Any, elements: range) -> bool:
-    if type(action) is int:
-        return action in elements
-    try:
-        return operator.index(action) in elements
-    except TypeError:
-        return False
-
-
-def _find_file(cls: type, file: str | os.PathLike[str]) -> Path:
-    """Find a relative path beside the file of the class, or of a class that it derives from."""
-    path = Path(file).expanduser()
-    if path.is_absolute():
-        return path
-    folders = [Path(inspect.getfile(c)).parent for c in cls.__mro__ if _has_file(c)]
-    candidates = [folder / path for folder in folders] or [Path.cwd() / path]
-    return next((c for c in candidates if c.exists()), candidates[0])
-
-
-def _has_file(cls: type) -> bool:
-    """Classes of a notebook or the interactive interpreter have none."""
-    try:
-        return Path(inspect.getfile(cls)).is_file() and cls.__module__ != __name__
-    except (TypeError, OSError):
-        return False

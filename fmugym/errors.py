@@ -1,37 +1,77 @@
-"""The errors that fmugym raises for mistakes and faults it can name.
+"""The errors of fmugym.
 
 ::
 
     FMUGymError
     ├── ConfigError       a name, number or type that the user gave does not fit the FMU
+    │   └── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
     ├── FMULoadError      an archive, a model description or a library cannot be used
-    ├── SimulationError   an FMI call failed, or a call came out of its order
+    ├── SimulationError   an FMI call failed, or a method was called out of order
     └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
-Every error takes one argument, its text, and so survives pickling between processes.
+Every error takes one argument, its text, and so survives pickling between processes. The text is
+shown with ``printable``: it may quote an FMU.
 """
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Final
 
 __all__ = [
+    "ArgumentError",
     "ConfigError",
     "ContractError",
     "FMUGymError",
     "FMULoadError",
     "SimulationError",
+    "printable",
+    "shown",
+    "unknown_argument",
     "unknown_name",
 ]
+
+_LONGEST: Final = 120
+"""Characters of a value that an error shows, at most."""
+
+
+def printable(text: object) -> str:
+    r"""Escape what a terminal may obey or a log may take for a line of its own.
+
+    Names, descriptions and messages of an FMU are foreign texts. Every exit uses this function:
+    errors, logs, infos and the command line.
+
+    Args:
+        text: A text, or an object that is turned into one.
+
+    Returns:
+        The text on one line. Letters of all languages stay. Control characters, line breaks,
+        marks that reverse the direction of writing and the like become ``\x1b``, ``\n`` and
+        so on.
+    """
+    line = str(text)
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 class FMUGymError(Exception):
     """Base class of all errors of this package."""
 
+    def __str__(self) -> str:
+        return printable(super().__str__())
+
 
 class ConfigError(FMUGymError):
-    """A configuration, an option or an action does not fit the FMU or the environment."""
+    """A config, an option or an action does not fit the FMU or the environment."""
+
+
+class ArgumentError(ConfigError, TypeError):
+    """A constructor does not have this argument.
+
+    It is a ``TypeError`` for callers that try arguments, as Stable-Baselines3 does.
+    """
 
 
 class FMULoadError(FMUGymError):
@@ -39,11 +79,30 @@ class FMULoadError(FMUGymError):
 
 
 class SimulationError(FMUGymError):
-    """An FMI function failed, or a method was called at a time when it has no meaning."""
+    """An FMI function failed, or a method was called out of order."""
 
 
 class ContractError(FMUGymError):
-    """An environment does not keep what every environment of this package promises."""
+    """An environment breaks the contract of all environments of this package."""
+
+
+def shown(value: object) -> str:
+    """Return the text that stands for a value in an error.
+
+    Args:
+        value: Any object, even one whose ``repr`` fails.
+
+    Returns:
+        One printable line of at most 120 characters.
+    """
+    try:
+        text = repr(value)
+    except Exception:  # an error is being reported already
+        text = f"<{type(value).__name__} without a repr>"
+    if "\n" in text:  # an array
+        text = " ".join(text.split())
+    text = printable(text)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
@@ -51,15 +110,39 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
 
     Args:
         kind: What the name should have named, for example ``"config key"``.
-        name: The name as it was given.
-        known: All the names that would have been right.
+        name: The name that was given.
+        known: All valid names.
 
     Returns:
-        The error, with the nearest known name or, where none is near, some of the known names.
+        The error. It suggests the nearest known name, or lists known names if none is near.
     """
     names = list(known)
-    near = difflib.get_close_matches(str(name), names, n=1)
-    if near:
-        return ConfigError(f"unknown {kind} {name!r}; did you mean {near[0]!r}?")
-    listing = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
-    return ConfigError(f"unknown {kind} {name!r}; known are: {listing or 'none'}")
+    near = _nearest(name, names)
+    if near is not None:
+        return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near!r}?")
+    return ConfigError(f"unknown {kind} {shown(name)}; known are: {_listing(names)}")
+
+
+def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentError:
+    """Make the error for a keyword argument that a constructor does not have.
+
+    Args:
+        owner: The class.
+        name: The argument as it was given.
+        known: All arguments that the class has.
+    """
+    names = list(known)
+    near = _nearest(name, names)
+    hint = f"known are: {_listing(names)}" if near is None else f"did you mean {near!r}?"
+    return ArgumentError(f"{owner} got an unexpected keyword argument {shown(name)}; {hint}")
+
+
+def _nearest(name: object, known: list[str]) -> str | None:
+    text = name if isinstance(name, str) else shown(name)
+    near = difflib.get_close_matches(text[:_LONGEST], known, n=1)
+    return near[0] if near else None
+
+
+def _listing(names: list[str]) -> str:
+    """The first of the names, as text."""
+    return ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "") or "none"

@@ -17,12 +17,11 @@ import numpy.typing as npt
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
+from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
-from fmugym.vector.batch import BatchEngine
-from fmugym.vector.env import attribute
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -40,15 +39,6 @@ StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]
 _NOTHING_ENDED: dict[str, Any] = {"TimeLimit.truncated": False}
 """The info of a step after which the episode goes on."""
 
-_TOGETHER = frozenset({"close", "reset", "step"})
-"""Methods that one environment cannot do alone."""
-
-_KEPT_FOR_ALL = frozenset(
-    {"action", "after_end", "config", "done", "fmu", "inputs", "out", "parameters"}
-    | {"previous_action", "previous_state", "state", "step_count", "variables"}
-)
-"""Attributes of one environment that are views of those of all."""
-
 
 def make_sb3_env(
     env: str | Callable[..., FMUEnv],
@@ -58,25 +48,29 @@ def make_sb3_env(
     monitor: bool = True,
     **kwargs: Any,
 ) -> VecEnv:
-    """Make N environments for Stable-Baselines3, the counterpart of its ``make_vec_env``.
+    """Make N environments for Stable-Baselines3, as its own ``make_vec_env`` does.
 
     Args:
         env: A registered id, or a class; ids bring their ``max_episode_steps``.
         num_envs: N.
         seed: Environment i is seeded with ``seed + i`` at the first reset.
-        monitor: Whether to put a ``VecMonitor`` around them, which the training's log of returns
-            and lengths comes from.
+        monitor: Whether to wrap them in a ``VecMonitor``, which writes returns and lengths to the
+            log of the training.
         kwargs: Arguments of ``FMUVectorEnv`` (``max_episode_steps``, ``hooks``, ``threads``, ...)
             and of the environment.
 
     Raises:
-        ConfigError: If the environment is none of fmugym's, or an argument does not fit.
+        ConfigError: If the environment is unknown or not one of fmugym, or an argument does not
+            fit.
     """
+    seed = check_seed(seed)
     kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
     if isinstance(env, str):
         vector_env = _registered(env, num_envs, kwargs)
-    else:
+    elif callable(env):
         vector_env = vectorized(env)(num_envs, **kwargs)
+    else:
+        raise ConfigError(f"env must be a registered id or a class, got {shown(env)}")
     venv = FMUVecEnv(vector_env)
     if seed is not None:
         venv.seed(seed)
@@ -86,26 +80,29 @@ def make_sb3_env(
 
 def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
     module, _, name = env_id.rpartition(":")
-    if module:
-        import_module(module)
-    creator: Any = gymnasium.spec(name).entry_point
+    try:
+        if module:
+            import_module(module)
+        creator: Any = gymnasium.spec(name).entry_point
+    except (ImportError, ValueError, gymnasium.error.Error) as error:
+        raise ConfigError(f"there is no environment {env_id!r}: {error}") from None
     creator = load_env_creator(creator) if isinstance(creator, str) else creator
     if isinstance(creator, type) and not issubclass(creator, FMUEnv):
-        raise ConfigError(f"{name} is no environment of fmugym; use SB3's own make_vec_env for it")
+        raise ConfigError(f"{name} is not an environment of fmugym; use SB3's make_vec_env for it")
     return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)
 
 
 class FMUVecEnv(VecEnv):
     """N environments in the form that Stable-Baselines3 trains on.
 
-    It gives what SB3's ``DummyVecEnv`` over the N single environments gives, step by step, at the
-    speed of ``FMUVectorEnv``. The arrays and dicts it hands out are new ones.
+    It returns, step by step, what SB3's ``DummyVecEnv`` with N single environments returns, at the
+    speed of ``FMUVectorEnv``. All arrays and dicts that it returns are new.
 
     Args:
-        env: The environments, made with ``autoreset_mode="same_step"``.
+        env: The vector environment, made with ``autoreset_mode="same_step"``.
 
     Attributes:
-        vector_env: The environments, as given.
+        vector_env: The vector environment, as given.
 
     Raises:
         ConfigError: If ``env`` is something else, or has another autoreset mode.
@@ -114,7 +111,7 @@ class FMUVecEnv(VecEnv):
     def __init__(self, env: FMUVectorEnv) -> None:
         if not isinstance(env, FMUVectorEnv):
             raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
-        mode = env.metadata["autoreset_mode"]
+        mode = env.autoreset_mode
         if mode is not AutoresetMode.SAME_STEP:
             raise ConfigError(
                 f"the autoreset mode is {mode.name}, expected SAME_STEP: make the FMUVectorEnv "
@@ -147,7 +144,7 @@ class FMUVecEnv(VecEnv):
         return observations
 
     def _groups_of_options(self) -> list[tuple[MaskArray, dict[str, Any]]]:
-        """The environments that have the same options; most often there is one group, of all."""
+        """Group the environments by their options; most often all are in one group."""
         kinds: list[dict[str, Any]] = []
         for options in self._options:
             if options not in kinds:
@@ -155,15 +152,16 @@ class FMUVecEnv(VecEnv):
         return [(np.array([o == kind for o in self._options]), kind) for kind in kinds]
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Take the actions for ``step_wait``."""
+        """Keep the actions for ``step_wait``."""
         self._actions = actions
 
     def step_wait(self) -> StepReturn:
         """Step all environments; those whose episode ends start the next one.
 
         Returns:
-            Observations, rewards, dones and infos, as SB3 has them: where an episode ended, the
-            observation is the first of the next one, and the info has ``"terminal_observation"``.
+            Observations, rewards, dones and infos in SB3's form. Where an episode ended, the
+            observation is the first of the next episode, and the info has
+            ``"terminal_observation"``.
         """
         observations, rewards, terminated, truncated, infos = self.vector_env.step(self._actions)
         dones = terminated | truncated
@@ -181,7 +179,7 @@ class FMUVecEnv(VecEnv):
         infos: dict[str, Any],
         listed: list[dict[str, Any]],
     ) -> None:
-        """Sort infos of the last step from those of the reset that followed in the same call."""
+        """Separate the infos of the last step from those of the reset that followed it."""
         last, last_infos = infos.pop("final_obs"), infos.pop("final_info")
         _hand_out(last_infos, listed)
         others = list(listed)
@@ -198,16 +196,15 @@ class FMUVecEnv(VecEnv):
     # Single environments.
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Return an attribute, or a parameter of this episode, of some of the environments.
+        """Return an attribute, or a parameter of this episode, of some environments.
 
         Raises:
-            AttributeError: If there is none of this name.
+            ConfigError: If there is none of this name (it is an ``AttributeError``, too).
         """
-        singles = self.vector_env._singles()
-        return [attribute(singles[index], attr_name) for index in self._get_indices(indices)]
+        return self.vector_env._get_attr(attr_name, self._numbers(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute or, from the next episode on, a parameter of the FMU.
+        """Set an attribute, or a parameter of the FMU from the next episode on.
 
         Args:
             attr_name: An attribute that hooks read, or the name of a parameter.
@@ -215,24 +212,24 @@ class FMUVecEnv(VecEnv):
             indices: The environments, by default all.
 
         Raises:
-            ConfigError: If there is nothing of this name, or it is a parameter that the others draw
-                anew in each episode.
+            ConfigError: If there is nothing of this name, or it is a parameter that the other
+                environments draw in each episode.
         """
-        complete = self._completed(attr_name, dict.fromkeys(self._numbers(indices), value))
-        self.vector_env.set_attr(attr_name, _common(complete))
-        if self.vector_env._is_parameter(attr_name):
-            self._set_parameters[attr_name] = complete
+        env = self.vector_env
+        given = dict.fromkeys(self._numbers(indices), value)
+        if not env._is_parameter(attr_name):
+            env._set_attribute(attr_name, given)
+            return
+        complete = self._all_values(attr_name, given)
+        env.set_attr(attr_name, complete)
+        self._set_parameters[attr_name] = complete
 
-    def _completed(self, name: str, values: Mapping[int, Any]) -> list[Any]:
-        """These values by the number of the environment, and what the other ones have now."""
-        if len(values) < self.num_envs:
-            values = {**dict(enumerate(self._present(name))), **values}
-        return [values[index] for index in range(self.num_envs)]
+    def _all_values(self, name: str, given: Mapping[int, Any]) -> list[Any]:
+        """The values of a parameter for all environments: those given, or else the present ones."""
+        present = [] if len(given) == self.num_envs else self._present_values(name)
+        return [given[i] if i in given else present[i] for i in range(self.num_envs)]
 
-    def _present(self, name: str) -> list[Any]:
-        """What all environments have now, for those that are not to be changed."""
-        if not self.vector_env._is_parameter(name):
-            return self.get_attr(name)
+    def _present_values(self, name: str) -> list[Any]:
         if name in self._set_parameters:
             return self._set_parameters[name]
         env = self.vector_env._prototype
@@ -244,41 +241,19 @@ class FMUVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of some of the environments.
+        """Call a method of some environments.
 
-        Numbers that the method writes to attributes and to episode variables are kept.
+        Numbers that the method assigns to attributes and to episode variables take effect.
 
         Raises:
-            ConfigError: If the method would part one environment from the others.
+            ConfigError: If the method cannot be called for single environments, or changes what
+                they cannot have each for itself.
         """
-        if method_name in _TOGETHER:
-            raise ConfigError(f"{method_name!r} cannot be called on single environments of many")
         numbers = self._numbers(indices)
-        if method_name == "render":
-            pictures = self.vector_env.render() or [None] * self.num_envs
-            return [pictures[index] for index in numbers]
-        singles = self.vector_env._singles()
-        called = [_Called(singles[index], index) for index in numbers]
-        results = [call.method(method_name)(*method_args, **method_kwargs) for call in called]
-        if isinstance(self.vector_env._engine, BatchEngine):
-            self._keep(called, self.vector_env._engine)
-        return results
-
-    def _keep(self, called: list[_Called], engine: BatchEngine) -> None:
-        """Take over what methods wrote, for single environments are but views of a batch."""
-        written: dict[str, dict[int, Any]] = {}
-        for call in called:
-            for name, value in call.written_attributes().items():
-                written.setdefault(name, {})[call.index] = value
-            for name, value in call.written_variables().items():
-                row = np.array(engine._row(name))
-                row[call.index] = value
-                engine.env.variables[name] = row
-        for name, values in written.items():
-            self.vector_env._set_attribute(name, _common(self._completed(name, values)))
+        return self.vector_env._call(method_name, numbers, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
-        """Tell that no single environment has a wrapper."""
+        """Return False for each: single environments have no wrappers."""
         return [False for _ in self._numbers(indices)]
 
     def _numbers(self, indices: Indices) -> list[int]:
@@ -292,47 +267,12 @@ class FMUVecEnv(VecEnv):
         return self.env_method("render")
 
 
-class _Called:
-    """One environment before and after a method of it was called."""
-
-    def __init__(self, env: FMUEnv, index: int) -> None:
-        self.index = index
-        self._env = env
-        self._attributes = dict(vars(env))
-        self._variables = dict(env.variables)
-
-    def method(self, name: str) -> Callable[..., Any]:
-        method: Callable[..., Any] = getattr(self._env, name)
-        return method
-
-    def written_attributes(self) -> dict[str, Any]:
-        written = _changes(self._attributes, vars(self._env))
-        for name in written:
-            if name.startswith("_") or name in _KEPT_FOR_ALL:
-                raise ConfigError(f"a method wrote {name!r}, which single environments do not own")
-        return written
-
-    def written_variables(self) -> dict[str, Any]:
-        return _changes(self._variables, self._env.variables)
-
-
-def _common(values: list[Any]) -> Any:
-    """One value for all environments where it is the same number, or else the list."""
-    is_same = all(value is values[0] for value in values) and np.ndim(values[0]) == 0
-    return values[0] if is_same else values
-
-
-def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    missing = object()
-    return {name: v for name, v in after.items() if before.get(name, missing) is not v}
-
-
 def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
-    """Distribute the infos of a vector environment, arrays with masks, over dicts.
+    """Distribute the infos of a vector environment, arrays with masks, to dicts.
 
     Args:
         infos: The infos; the mask of ``name`` is ``_name``.
-        into: The dicts of the environments by number.
+        into: The dict of each environment, by number.
     """
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
@@ -344,7 +284,7 @@ def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
 
 
 def _parts(values: Any, indices: list[int]) -> list[Any]:
-    """Each environment's part, with Python's numbers as single environments have them."""
+    """Each environment's part; numbers become Python's, as in single environments."""
     if isinstance(values, Mapping):
         parts: dict[int, Any] = {index: {} for index in indices}
         _hand_out(values, parts)

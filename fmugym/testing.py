@@ -1,9 +1,9 @@
-"""The contract of this package's environments as functions: run them on an environment of yours.
+"""Checks that an environment of yours keeps the contract of this package.
 
-``check_fmu_env`` is what the project's own tests run on every environment and FMI version. It
-finds what goes wrong when a new FMU is integrated: a reset that does not restore everything,
-parameters without effect, observations outside of their space. ``check_hooks`` tells ahead whether
-a class's hooks work on the arrays of many environments.
+``check_fmu_env`` finds what often goes wrong when a new FMU is integrated: a reset that does not
+restore everything, parameters without effect, observations outside of their space. The project's
+own tests run it on every environment and FMI version. ``check_hooks`` finds out whether the hooks
+of a class work on the arrays of many environments.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import gymnasium
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 
+from fmugym.checks import has_method
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, ContractError
-from fmugym.vector.probe import CURE, find_difference
+from fmugym.errors import ConfigError, ContractError, shown
+from fmugym.vector.hooks.check import CURE, find_difference
 
 __all__ = ["check_fmu_env", "check_hooks"]
 
@@ -40,17 +41,17 @@ class _Transition:
 def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 200) -> None:
     """Check that an environment over an FMU keeps its contract.
 
-    The environment itself is not used: everything is tried on copies of it, made from its class
-    and the arguments of its constructor.
+    The checks run on copies, made from the class and the arguments of its constructor. The
+    environment itself is not used.
 
     Args:
         env: The environment, wrapped or not.
         seed: Seeds the episodes and the actions.
-        num_steps: Length of each trial in steps; episodes that end are followed by others.
+        num_steps: Length of each trial in steps. When an episode ends, another follows.
 
     Raises:
         ContractError: If the environment breaks the contract; the text says how.
-        ConfigError: If it is none of this package.
+        ConfigError: If it is not an environment of fmugym.
     """
     inner = _of_this_package(env)
     actions = _sample_actions(inner, seed, num_steps)
@@ -59,30 +60,34 @@ def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 
 
 
 def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any) -> None:
-    """Check that hooks give the same on arrays as in one environment at a time.
+    """Check that hooks return the same on arrays as for one environment at a time.
 
-    A vector environment calls such hooks once a step for all environments, others once for each.
+    A vector environment calls such hooks once a step for all environments. It calls others once for
+    each environment, which is slower.
 
     Args:
         make_env: The class, or another callable that makes an environment.
         kwargs: Its arguments.
 
     Raises:
-        ContractError: If a hook is different on arrays; the text names it and says what to do.
-        ConfigError: If the environment is none of this package.
+        ContractError: If a hook differs on arrays; the text names it and says what to do.
+        ConfigError: If it is not an environment of fmugym.
     """
+    if not callable(make_env):
+        raise ConfigError(f"expected a class or a function, got {shown(make_env)}")
     env = make_env(**kwargs)
     try:
         inner = _of_this_package(env)
         difference = find_difference(inner)
     finally:
-        env.close()
+        if has_method(env, "close"):
+            env.close()
     if difference is not None:
         raise ContractError(f"{type(inner).__name__}: {difference}. {CURE}")
 
 
 def _of_this_package(env: gymnasium.Env[Any, Any]) -> FMUEnv:
-    inner = env.unwrapped
+    inner = env.unwrapped if isinstance(env, gymnasium.Env) else env
     if not isinstance(inner, FMUEnv):
         raise ConfigError(f"expected an environment of fmugym, got {type(inner).__name__}")
     return inner
@@ -106,7 +111,7 @@ def _fresh(env: FMUEnv) -> Iterator[FMUEnv]:
 
 
 def _rollout(env: FMUEnv, actions: list[Any], seed: int) -> list[_Transition]:
-    """Run episodes one after another; the first is seeded, the others go on with the stream."""
+    """Run episodes one after another; only the first is seeded."""
     observation, _ = env.reset(seed=seed)
     transitions = [_Transition(observation, 0.0, False, False)]
     for action in actions:
@@ -188,7 +193,7 @@ def _check_time(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
-    """What was set must be read back, and a changed value must change the simulation."""
+    """A parameter must have the value that was set, and another value must have an effect."""
     with _fresh(env) as tried:
         tried.reset(seed=seed)
         given = dict(tried.parameters)
@@ -211,7 +216,7 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 def _changed(env: FMUEnv, name: str, value: float) -> float | None:
-    """Another value of a Real within its limits, a percent away; None for other types."""
+    """Return a value one percent away, within the limits of a Real; None for other types."""
     variable = env.fmu.variable(name)
     if variable.kind != "real":
         return None
@@ -225,7 +230,7 @@ def _changed(env: FMUEnv, name: str, value: float) -> float | None:
 def _trace(
     env: FMUEnv, actions: list[Any], seed: int, parameters: dict[str, float]
 ) -> list[tuple[float, ...]]:
-    """The outputs of one episode."""
+    """Return the outputs of one episode."""
     env.reset(seed=seed, options={"model_parameters": parameters})
     trace = [env.state]
     for action in actions:
@@ -237,7 +242,7 @@ def _trace(
 
 
 def _check_hooks(env: FMUEnv, actions: list[Any], seed: int) -> None:
-    """Evaluated once more after a step, every hook must say the same and change nothing."""
+    """A second call of a hook after a step must return the same and change nothing."""
     with _fresh(env) as tried:
         tried.reset(seed=seed)
         for action in actions[:20]:
@@ -265,7 +270,7 @@ def _hook_values(
 
 
 def _readable(env: FMUEnv) -> dict[str, Any]:
-    """What hooks may read."""
+    """Return the values that hooks may read."""
     return {
         "out": dict(env.out),
         "inputs": env.inputs,

@@ -60,7 +60,7 @@ size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
 static Status read_instance(Pool *pool, Instance *me, const Access *access, double *memory,
                             double *column) {
     if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
-        return instance_refuse(me, "nothing can be read before a reset has mended the instance");
+        return instance_refuse(me, "the instance needs a reset before anything can be read");
     }
     const Status status = access_get(access, me->library, me->component, memory,
                                      memory + access->count, &pool->floats);

@@ -10,7 +10,7 @@
 #include "floats.h"
 #include "library.h"
 
-/* FMI's own codes, and two of ours; the same values as fmugym.adapters.Status. */
+/* FMI's own codes, and two of ours; the same values as fmugym.fmi.instance.Status. */
 typedef enum {
     STATUS_OK = 0,
     STATUS_WARNING = 1,

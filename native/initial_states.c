@@ -7,11 +7,6 @@
 
 static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states of one pool */
 
-enum {
-    TRIALS = 5,
-    REHEARSED = 3 /* steps */
-};
-
 /* Initialization */
 
 typedef struct {
@@ -88,17 +83,7 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
  * and restored from then on. */
 
 static bool states_are_of_use(Pool *pool, const Instance *me) {
-    return pool->settings.can_save && !me->unsavable && !atomic_get(&pool->trial.refuted);
-}
-
-static void give_states_up(Pool *pool) {
-    atomic_set(&pool->trial.refuted, 1);
-}
-
-static bool owns_trial(Pool *pool, const Instance *me) {
-    const uint64_t mine = index_of(pool, me) + 1;
-    uint64_t owner = atomic_get(&pool->trial.owner);
-    return owner == mine || (owner == 0 && atomic_replace(&pool->trial.owner, &owner, mine));
+    return pool->settings.restores && !me->unsavable && !atomic_get(&pool->states_too_large);
 }
 
 static bool too_large(Pool *pool, Instance *me) {
@@ -108,69 +93,12 @@ static bool too_large(Pool *pool, Instance *me) {
     return size > STATES_LIMIT / s->count;
 }
 
-/* Steps with inputs; returns whether that went well. */
-static bool try_steps(Pool *pool, Instance *me, const double *inputs, double *outputs,
-                      void *typed) {
-    const Access *access = pool->settings.outputs;
-    const int64_t before = me->steps;
-
-    atomic_set(&pool->log.muted, index_of(pool, me) + 1); /* nobody has asked for these steps */
-    bool well = access_set(pool->settings.inputs, me->library, me->component, inputs, typed,
-                           &pool->floats) <= STATUS_WARNING;
-
-    for (size_t i = 0; i < REHEARSED && well; i++, outputs += access->count) {
-        well = instance_advance(pool, me) <= STATUS_WARNING &&
-               access_get(access, me->library, me->component, outputs, typed, &pool->floats) <=
-                   STATUS_WARNING;
-    }
-    atomic_set(&pool->log.muted, 0);
-    me->steps = before;
-    return well;
-}
-
-/* Steps twice from the kept state, with the inputs that were written last: an FMU may have left a
- * part of its state out. */
-static bool rehearse(Pool *pool, Instance *me, const Matrix *inputs, void *typed) {
-    const size_t width = pool->settings.inputs->count;
-    const size_t size = REHEARSED * pool->settings.outputs->count;
-    double *memory = malloc((width + 2 * size + 1) * sizeof *memory);
-    bool well = memory != NULL;
-
-    if (well) {
-        matrix_gather(inputs, index_of(pool, me), width, memory);
-        well = all_finite(memory, width);
-    }
-    for (size_t i = 0; i < 2 && well; i++) {
-        well = try_steps(pool, me, memory, memory + width + i * size, typed) &&
-               instance_restore(pool, me, me->saved) <= STATUS_WARNING;
-    }
-    well = well && memcmp(memory + width, memory + width + size, size * sizeof *memory) == 0;
-    free(memory);
-    return well;
-}
-
-static Status keep_state(Pool *pool, Instance *me, uint64_t initialization, const Matrix *inputs,
-                         void *typed) {
-    const Status status = instance_save(pool, me, &me->saved);
-
-    if (status > STATUS_WARNING) {
+static void keep_state(Pool *pool, Instance *me) {
+    if (instance_save(pool, me, &me->saved) > STATUS_WARNING) {
         me->unsavable = true;
-        return status;
+    } else if (too_large(pool, me)) {
+        atomic_set(&pool->states_too_large, 1);
     }
-    if (!owns_trial(pool, me)) {
-        return STATUS_OK;
-    }
-    pool->trial.initialization = initialization;
-    if (too_large(pool, me)) {
-        give_states_up(pool);
-    } else if (!pool->trial.rehearsed && !rehearse(pool, me, inputs, typed)) {
-        give_states_up(pool);
-        failure_drop(me);
-        instance_free_state(pool, me, &me->saved);
-        return instance_judge(me, STATUS_ERROR); /* to be initialized anew */
-    }
-    pool->trial.rehearsed = true;
-    return STATUS_OK;
 }
 
 static double *start_values_of(const Pool *pool, const Instance *me) {
@@ -185,7 +113,6 @@ static bool starts_as_before(const Pool *pool, const Instance *me, const Access 
 
 static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
     const Access *start = call->start;
-    const uint64_t began = again ? clock_now() : 0;
 
     instance_free_state(pool, me, &me->saved);
     const Status status = initialize(pool, me, start, scratch);
@@ -195,46 +122,20 @@ static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
     again = again && me->start_id == start->id; /* it may have been replaced */
     me->start_id = start->id;
     memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
-    if (!again || !states_are_of_use(pool, me)) {
-        return STATUS_OK;
-    }
-    if (keep_state(pool, me, clock_now() - began, &call->inputs, scratch.typed) <= STATUS_WARNING) {
-        return STATUS_OK;
+    if (again && states_are_of_use(pool, me)) {
+        keep_state(pool, me);
     }
     return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
 }
 
-/* Compares a restored instance with the initialized one; returns whether it may go on so. */
-static bool passes_trial(Pool *pool, Instance *me, uint64_t restoration, Scratch scratch) {
-    Trial *trial = &pool->trial;
-    const size_t size = pool->settings.outputs->count * sizeof(double);
-
-    instance_copy_outputs(pool, me, scratch.values);
-    if (memcmp(scratch.values, trial->outputs, size) != 0) {
-        give_states_up(pool);
-        return false;
-    }
-    if (trial->trials == 0 || restoration < trial->restoration) {
-        trial->restoration = restoration;
-    }
-    if (++trial->trials == TRIALS && trial->restoration > trial->initialization) {
-        give_states_up(pool);
-    }
-    return true;
-}
-
 static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
-    Status status = start_anew(pool, me, call, again, scratch);
+    const Status status = start_anew(pool, me, call, again, scratch);
 
     if (status > STATUS_WARNING) {
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
     instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    status = instance_read_outputs(pool, me, scratch);
-    if (status == STATUS_OK && me->saved != NULL && owns_trial(pool, me)) {
-        instance_copy_outputs(pool, me, pool->trial.outputs);
-    }
-    return status;
+    return instance_read_outputs(pool, me, scratch);
 }
 
 static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
@@ -249,7 +150,6 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
     return instance_read_outputs(pool, me, scratch);
 }
 
-/* By the cheapest way that gives the same as a fresh instance. */
 Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
     const Access *start = call->start;
     const Matrix *values = &call->start_values;
@@ -258,7 +158,7 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     health_count_steps(pool, me);
     health_of(pool, me)[RESETS]++;
     health_of(pool, me)[RETRIED] = 0;
-    if (me->due && instance_recycle(pool, me) > STATUS_WARNING) {
+    if (instance_renew_if_due(pool, me) > STATUS_WARNING) {
         return STATUS_FATAL;
     }
     matrix_gather(values, index_of(pool, me), start->count, scratch.values);
@@ -267,14 +167,10 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
         return restart(pool, me, call, again && stepped, scratch);
     }
-    const bool trying = owns_trial(pool, me) && pool->trial.trials < TRIALS;
-    const uint64_t began = trying ? clock_now() : 0;
     const Status status = return_to_start(pool, me, scratch);
-    const bool refused = me->saved == NULL;
-    if (!refused && (!trying || status > STATUS_WARNING ||
-                     passes_trial(pool, me, clock_now() - began, scratch))) {
+    if (me->saved != NULL) {
         return status;
     }
-    matrix_gather(values, index_of(pool, me), start->count, scratch.values);
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* it refused */
     return restart(pool, me, call, again, scratch);
 }

@@ -1,4 +1,4 @@
-/* Resets, by the cheapest way that gives the same as a fresh instance. */
+/* Resets, by the reset method of the settings. */
 
 #ifndef FMUGYM_INITIAL_STATES_H
 #define FMUGYM_INITIAL_STATES_H

@@ -82,12 +82,11 @@ static void reload_private_library(Pool *pool, Instance *me) {
     floats_restore(&pool->floats); /* code runs when a library is loaded, too */
 }
 
-static Status replace(Pool *pool, Instance *me) {
+static Status rebuild(Pool *pool, Instance *me) {
     const bool was_dead = me->phase == PHASE_DEAD;
 
-    health_of(pool, me)[REPLACEMENTS]++;
     instance_discard(pool, me);
-    if (was_dead) {
+    if (was_dead || pool->settings.reloads) {
         reload_private_library(pool, me);
     }
     const bool loaded = me->library->functions != NULL;
@@ -104,14 +103,23 @@ static Status replace(Pool *pool, Instance *me) {
     return STATUS_FATAL;
 }
 
-/* Memory that an instance has leaked may go with it. */
-Status instance_recycle(Pool *pool, Instance *me) {
+static Status replace(Pool *pool, Instance *me) {
+    health_of(pool, me)[REPLACEMENTS]++;
+    return rebuild(pool, me);
+}
+
+Status instance_renew_if_due(Pool *pool, Instance *me) {
+    const bool due = me->due;
+
     me->due = false;
     if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
         return STATUS_OK;
     }
-    health_of(pool, me)[RECYCLINGS]++;
-    return replace(pool, me);
+    if (due) {
+        health_of(pool, me)[RECYCLINGS]++;
+        return replace(pool, me);
+    }
+    return pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
 }
 
 /* Returns to the state just after instantiation: resets, or replaces what refuses or is past any

@@ -12,8 +12,8 @@ void instance_discard(Pool *pool, Instance *me);
 /* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
  * reset. */
 Status instance_return_to_start(Pool *pool, Instance *me);
-/* Replaces an instance, with which memory goes that it has leaked. */
-Status instance_recycle(Pool *pool, Instance *me);
+/* Replaces an instance that is to be recycled because of leaks, or that no reset makes as new. */
+Status instance_renew_if_due(Pool *pool, Instance *me);
 
 Status instance_save(Pool *pool, Instance *me, void **state);
 Status instance_restore(Pool *pool, Instance *me, void *state);

@@ -52,9 +52,8 @@ static bool allocate(Pool *pool) {
     pool->names = calloc(s->count, pool->name_size);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
-    pool->trial.outputs = calloc(s->outputs->count + 1, sizeof *pool->trial.outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
-           pool->chosen != NULL && pool->starts != NULL && pool->trial.outputs != NULL;
+           pool->chosen != NULL && pool->starts != NULL;
 }
 
 static void prepare_instance(Pool *pool, size_t index) {
@@ -98,7 +97,7 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     mutex_reset(&pool->making);
     pool->settings = *settings;
     pool->step_size = settings->time_step / (double)settings->substeps;
-    pool->no_return = !settings->can_save;
+    pool->no_return = !settings->restores && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
                    settings->outputs->direct;
     pool->open = true;
@@ -137,7 +136,6 @@ void pool_close(Pool *pool) {
     free(pool->starts);
     free(pool->names);
     free(pool->chosen);
-    free(pool->trial.outputs);
     unlink_pool(pool);
 }
 

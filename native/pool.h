@@ -30,6 +30,10 @@ typedef struct {
     bool private_libraries;   /* whether there is one for each instance */
     bool logging;
     bool can_save;
+    bool restores; /* whether episodes begin by a restored state where the start values are the same
+                    */
+    bool rebuilds; /* whether each episode begins with a new instance, */
+    bool reloads;  /* and with its private library loaded anew */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -120,18 +124,6 @@ typedef struct {
 
 enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
 
-/* The first instance that saves its initial state finds out whether that was a good idea: whether
- * the FMU comes out the same, sooner, and small enough. */
-typedef struct {
-    Atomic owner; /* its index + 1 */
-    Atomic refuted;
-    bool rehearsed; /* whether steps from a restored state were found to be the same */
-    size_t trials;
-    uint64_t initialization; /* shortest times, ns */
-    uint64_t restoration;
-    double *outputs; /* after the initialization */
-} Trial;
-
 typedef struct Pool {
     struct Pool *next; /* in the list of all pools */
     Settings settings;
@@ -154,7 +146,7 @@ typedef struct Pool {
     Snapshot *snapshots;
     Atomic abandoned; /* whether any of these has been abandoned */
     Cost costs[OPERATIONS];
-    Trial trial;
+    Atomic states_too_large;
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

@@ -13,8 +13,8 @@ enum {
     PROGRAM_RESULTS = 16  /* results, at most */
 };
 
-/* OPERATIONS in fmugym/vector/trace.py has their names in the same order, which is compared when
- * that is imported. */
+/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order. They are compared
+ * when that is imported. */
 typedef enum {
     LOAD_OUTPUT,
     LOAD_INPUT,

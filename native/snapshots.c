@@ -93,7 +93,7 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
         return instance_refuse(
             me, me->phase == PHASE_INSTANTIATED
                     ? "cannot save the FMU state before the first reset"
-                    : "cannot save the FMU state before a reset has mended the instance");
+                    : "the instance needs a reset before its FMU state can be saved");
     }
     snapshot->generations[index] = me->generation;
     snapshot->steps[index] = me->steps;
@@ -101,6 +101,7 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
 }
 
 ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot) {
+    pool->no_return = false;
     snapshot->next = pool->snapshots;
     pool->snapshots = snapshot;
     for (size_t i = 0; i < pool->settings.count; i++) {

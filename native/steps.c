@@ -152,7 +152,7 @@ Status instance_step(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
 
     if (me->phase != PHASE_STEPPING) {
-        return instance_refuse(me, "a step was asked for before a reset has mended the instance");
+        return instance_refuse(me, "the instance needs a reset before it can be stepped");
     }
     if (!scratch.sound && !all_finite(scratch.inputs, s->inputs->count)) {
         return instance_note_not_finite(me, BAD_INPUTS, scratch.inputs, s->inputs->count);

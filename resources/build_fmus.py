@@ -1,8 +1,8 @@
 """Builds the bundled FMUs: `python resources/build_fmus.py`.
 
-Needs two packages from PyPI, no system compiler: `ziglang`, which cross-compiles for all platforms,
-and `fmpy`, whose wheel has the FMI headers. The same sources and the same version of `ziglang` give
-the same bytes on every machine.
+The build needs two packages from PyPI and no system compiler: `ziglang` cross-compiles for all
+platforms, and the wheel of `fmpy` contains the FMI headers. The same sources and the same version
+of `ziglang` give the same bytes on every machine.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Platform(NamedTuple):
     Attributes:
         target: zig's target triple.
         extension: the file name extension of shared libraries.
-        folder: the platform's folder in FMI 1.0 and 2.0, None if these have none for it.
+        folder: the platform's folder in FMI 1.0 and 2.0; None if these versions do not have one.
         folder_fmi3: the platform's folder in FMI 3.0.
     """
 
@@ -65,7 +65,7 @@ def header_folder() -> Path:
 
 
 def description_file(model: str, fmi_version: str) -> Path:
-    """Return the path of a model description, which need not exist for every FMI version."""
+    """Return the path of a model description; some models lack one for some FMI versions."""
     return RESOURCES / model / f"FMI{fmi_version[0]}.xml"
 
 
@@ -79,15 +79,15 @@ def build_library(model: str, fmi_version: str, platform: str, folder: Path) -> 
         folder: where to put the library.
 
     Returns:
-        The path of the library, which is named after the model.
+        The path of the library, whose file name is the model's name.
     """
     target, extension, _, _ = PLATFORMS[platform]
     command = [sys.executable, "-m", "ziglang", "cc", "-target", target, *COMPILER_OPTIONS]
     command += [f"-DFMI_VERSION={fmi_version[0]}", f"-I{model}", "-Isrc"]
     command += ["-isystem", str(header_folder()), "src/fmu.c", "-lm"]
-    if extension == ".dylib":  # by default the path of the output file enters the library
+    if extension == ".dylib":  # otherwise the library contains the path of the output file
         command.append(f"-Wl,-install_name,@rpath/{model}{extension}")
-    # zig writes import libraries and debug files next to a DLL; only the library leaves this folder
+    # zig writes import libraries and debug files next to a DLL, so only the library is copied
     with tempfile.TemporaryDirectory() as scratch:
         library = Path(scratch) / f"{model}{extension}"
         subprocess.run([*command, "-o", str(library)], cwd=RESOURCES, check=True)
@@ -99,8 +99,7 @@ def universal_binary(libraries: list[bytes]) -> bytes:
     """Join Mach-O libraries of several architectures into one (Apple's mach-o/fat.h).
 
     Args:
-        libraries: the contents of the libraries, of which each begins with magic, CPU type and
-            CPU subtype.
+        libraries: the contents of the libraries. Each begins with magic, CPU type and CPU subtype.
     """
     alignment = 14  # as a power of two: the page size of arm64
     header = struct.pack(">II", 0xCAFEBABE, len(libraries))
@@ -132,9 +131,9 @@ def binaries(model: str, fmi_version: str, platforms: list[str]) -> dict[str, by
 
 
 def write_archive(path: Path, files: dict[str, bytes]) -> None:
-    """Write a zip file that depends on nothing but the names and contents of the files.
+    """Write a zip file whose bytes depend on the names and contents of the files only.
 
-    It is not compressed, as versions of zlib differ in their output.
+    It is not compressed because the output of zlib differs between its versions.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(path, "w") as archive:
@@ -152,7 +151,7 @@ def build_fmu(model: str, fmi_version: str, platforms: list[str], output: Path) 
         model: the name of the model, one of MODELS.
         fmi_version: one of FMI_VERSIONS for which the model has a description.
         platforms: keys of PLATFORMS.
-        output: the folder for the FMUs; the FMU goes to the subfolder of its FMI version.
+        output: the folder for the FMUs; each FMI version has a subfolder.
 
     Returns:
         The path of the FMU.
@@ -164,7 +163,7 @@ def build_fmu(model: str, fmi_version: str, platforms: list[str], output: Path) 
 
 
 def main() -> None:
-    """Build what the command line asks for."""
+    """Build the FMUs that the command line selects."""
     parser = argparse.ArgumentParser(description="Build the bundled FMUs (default: all of them).")
     parser.add_argument("--model", choices=MODELS, action="append")
     parser.add_argument("--fmi-version", choices=FMI_VERSIONS, action="append")
@@ -176,7 +175,7 @@ def main() -> None:
         (model, version) for model, version in asked if description_file(model, version).exists()
     ]
     if not pairs:
-        parser.error("there is no such model in this FMI version")
+        parser.error("this model does not exist in this FMI version")
     for model, version in pairs:
         path = build_fmu(model, version, options.platform or list(PLATFORMS), options.output)
         print(f"{path} ({path.stat().st_size / 1000:.0f} kB)")

@@ -1,5 +1,6 @@
 """Fixtures for the tests of several modules."""
 
+import collections
 import functools
 import os
 import tempfile
@@ -7,10 +8,24 @@ import tempfile
 import fmu_tools
 import pytest
 
-# Nearly every test makes an FMU that nobody has met; test_probing.py turns their trials on.
+# Nearly every test makes an FMU that nobody has met; test_trial.py turns their trials on.
 os.environ["FMUGYM_PROBE"] = "off"
 _cache = tempfile.TemporaryDirectory(prefix="fmugym-cache-")
 os.environ["FMUGYM_CACHE_DIR"] = _cache.name
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest looks at -m
+def pytest_collection_modifyitems(items):
+    """Mark as slow what the marker ``sampled`` leaves out of the default run."""
+    seen = collections.Counter()
+    for item in items:
+        marker = item.get_closest_marker("sampled")
+        if marker is None:
+            continue
+        test = item.nodeid.partition("[")[0]
+        if seen[test] % marker.kwargs["every"]:
+            item.add_marker(pytest.mark.slow)
+        seen[test] += 1
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@
 #include "fmi2_stubs.h"
 
 enum { U, Y, FAULT, STAGE, AT, COUNT };
-enum fault { NONE, CRASH, ABORT, EXIT, HANG, CLOSE };
+enum fault { NONE, CRASH, ABORT, EXIT, HANG, CLOSE, PAUSE };
 enum stage { NOWHERE, STEP, RESET, TERMINATE, FREE, INITIALIZE };
 enum { OK, WARNING, DISCARD, ERROR };
 
@@ -49,6 +49,9 @@ static void fail(Faulty *me, int fault) {
         for (int descriptor = 3; descriptor < 100; descriptor++) {
             close(descriptor);
         }
+    }
+    if (fault == PAUSE) {
+        usleep(200000);
     }
     for (volatile bool hanging = fault == HANG; hanging;) {
         usleep(1000);

@@ -1,28 +1,32 @@
-"""Broken FMUs by the thousand: nothing but the package's own errors may come of opening them.
+"""Broken FMUs by the thousand: opening them raises nothing but the package's own errors.
 
     python tests/fuzz.py --count 20000 --seed 0
 
-Each case is a sound FMU with one to four mutations, of its bytes, its archive, its model
-description or its library. It is opened and described, looked at as ``fmugym info`` and ``fmugym
-skeleton`` do, taken for an environment's config, and extracted; nothing of it is loaded. A case
-fails with an exception outside of ``FMUGymError``, if it leaves a file, or if it takes more than
-``SLOW`` seconds of processor time. A crash, or a hang after ``HANG`` seconds, ends the program with
-the Python stack, and ``case.fmu`` stays in a temporary folder.
+Each case is a sound FMU with one to four mutations of its bytes, its archive, its model description
+or its library. The program opens and describes it as ``fmugym info`` and ``fmugym skeleton`` do,
+makes a config of it, and extracts it. Nothing of the FMU is loaded. A case fails with an exception
+outside of ``FMUGymError``, with control characters in a text for people, if it leaves a file, if it
+takes more than ``SLOW`` seconds of processor time, or if it needs ``LARGE`` more bytes of memory
+than any case before. A crash, or a hang after ``HANG`` seconds, ends the program with the Python
+stack, and ``case.fmu`` stays in a temporary folder.
 
-Case number n of a seed is always the same, as long as the bundled FMUs are; ``--first`` and
-``--count 1`` repeat it.
+A case is determined by its seed and number while the bundled FMUs stay the same: ``--first N``
+and ``--count 1`` repeat case N.
 """
 
 import argparse
 import contextlib
 import copy
 import faulthandler
+import functools
 import io
 import math
 import random
+import stat
 import sys
 import tempfile
 import time
+import warnings
 import zipfile
 from collections import Counter
 from pathlib import Path
@@ -31,12 +35,15 @@ from fmu_tools import library_name, probe_xml, read_fmu
 from lxml import etree
 
 from fmugym import FMU, EnvConfig, FMUGymError
-from fmugym.bundled import BUNDLED, bundled_fmu
-from fmugym.overview import as_text, overview
-from fmugym.skeleton import Skeleton
-from fmugym.spaces import action_space, observation_space
+from fmugym.archive import fmu as fmu_module
+from fmugym.archive.bundled import BUNDLED, bundled_fmu
+from fmugym.task.interface import resolve
+from fmugym.task.spaces import action_space, observation_space
+from fmugym.tools.overview import as_text, overview
+from fmugym.tools.skeleton import Skeleton
 
 SLOW, HANG = 5.0, 60.0
+LARGE = 300 * 2**20
 XML = "modelDescription.xml"
 
 VALUES = (
@@ -53,6 +60,7 @@ VALUES = (
         "True",
         "None",
         "\u00e4\u200b\u4e2d",
+        "\x9b2J\x85\u202e\n",
     ),
     *("99999999999999999999", "4294967296", "-2147483649", "0x10", "1,5", "1 2 3", "a" * 5000),
     *("../../x", "/etc/passwd", "C:\\x", "%s%n", "{0}", "input", "parameter", "fixed", "constant"),
@@ -61,6 +69,8 @@ VALUES = (
 NAMES = (
     *("../x", "/x", "..", ".", "", "a/../../x", "c:x", "a\\b", "a//b", "./" + XML, XML.upper()),
     *("resources", "resources/x", XML, XML + "/x", "binaries", "con", "x\0y", "\u00e4", "x" * 300),
+    *("./", ".\\", "resources\\", "a\\..\\..\\x", "Binaries/linux64/x.so", "\x1b[2J", "\x9b"),
+    *("a/" * 30 + "x", "a/" * 70 + "x", "a/" * 30_000, "resources/" + "b/" * 50 + "x"),
 )
 PROLOGS = (
     "<!DOCTYPE x>",
@@ -152,14 +162,41 @@ def mutate_files(rng, files):
 
 def pack(rng, files):
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, content in files.items():
+    entries = list(files.items())
+    if rng.random() < 0.05:
+        untidy(rng, entries)
+    with zipfile.ZipFile(buffer, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of names that come twice
+        for name, content in entries:
             info = zipfile.ZipInfo(name or "/")
+            info.filename = name or "/"  # with backslashes on Windows, too
             info.compress_type = rng.choice((8, 8, 0, 0) * 10 + (12, 14))
             if rng.random() < 0.01:
-                info.external_attr = rng.getrandbits(32)
+                info.external_attr = rng.choice((rng.getrandbits(32), LINK))
             archive.writestr(info, content)
     return buffer.getvalue()
+
+
+LINK = (stat.S_IFLNK | 0o777) << 16
+
+
+def untidy(rng, entries):
+    """Write names as odd tools do, or give two files one name."""
+    change = rng.choice(
+        (
+            lambda name: name.replace("/", "\\"),
+            lambda name: f"./{name}",
+            lambda name: name.replace("/", "//"),
+            str.upper,
+            str.title,
+        )
+    )
+    for index, (name, content) in enumerate(entries):
+        if rng.random() < 0.7:
+            entries[index] = change(name), content
+    name, content = rng.choice(entries)
+    where = rng.randrange(len(entries) + 1)
+    entries.insert(where, (name, rng.choice((content, b"", b"/etc/passwd", b"a" * 5000))))
 
 
 # Mutations of the model description
@@ -175,7 +212,10 @@ def mutate_xml(rng, xml):
         rng.choice(XML_MUTATIONS)(rng, root, rng.choice(list(root.iter("*"))))
     if rng.random() < 0.05:
         return (rng.choice(PROLOGS) + etree.tostring(root, encoding="unicode")).encode()
-    encoding = rng.choice(("utf-8", "utf-8", "utf-8", "utf-16", "iso-8859-1"))
+    encoding = rng.choice(("utf-8", "utf-8", "utf-8", "utf-16", "iso-8859-1", "utf-7", "utf-32"))
+    if encoding in {"utf-7", "utf-32"}:
+        text = etree.tostring(root, encoding="unicode")
+        return f'<?xml version="1.0" encoding="{encoding}"?>{text}'.encode(encoding)
     return etree.tostring(root, encoding=encoding, xml_declaration=True)
 
 
@@ -271,18 +311,23 @@ def use(path):
     try:
         fmu = FMU(path)
         reached = "described"
-        as_text(overview(fmu, everything=True))
+        check_text(as_text(overview(fmu, everything=True)).replace("\n", " "))
         with contextlib.suppress(FMUGymError):
-            Skeleton(fmu).text()
+            check_text(Skeleton(fmu).text().replace("\n", " "))
         configure(fmu)
         fmu.extract()
         reached = "extracted"
-    except FMUGymError:
-        pass
+    except FMUGymError as error:
+        check_text(str(error))
     finally:
         if fmu is not None:
             fmu.close()
     return reached
+
+
+def check_text(text):
+    """Fail if a terminal could obey a text, or a log take it for several lines."""
+    assert text.isprintable(), ascii(text[:200])
 
 
 def configure(fmu):
@@ -299,7 +344,7 @@ def make_spaces(fmu, inputs, outputs):
     config = {"model_input_names": inputs, "model_output_names": outputs}
     config["time_step"] = fmu.description.step_size or 0.1
     with contextlib.suppress(FMUGymError):
-        interface = EnvConfig.from_dict(config).resolve(fmu.description)
+        interface = resolve(EnvConfig.from_dict(config), fmu.description)
         interface.pool_spec()
         observation_space(interface)
         action_space(interface)
@@ -315,7 +360,7 @@ def run(count, seed, first=0, report=lambda line: None):
     """
     bases = list(sound_fmus())
     counts, failures = Counter(), []
-    with temporary_folder() as folder:
+    with temporary_folder() as folder, one_answer_for_each_library():
         path = folder / "case.fmu"
         for number in range(first, first + count):
             path.write_bytes(make_case(bases, seed, number))
@@ -339,10 +384,22 @@ def temporary_folder():
             tempfile.tempdir = before
 
 
+@contextlib.contextmanager
+def one_answer_for_each_library():
+    """Ask the loader once for the same libraries: a child process for each case is slow."""
+    before = fmu_module.ask_in_a_child
+    remembered = functools.cache(before)
+    fmu_module.ask_in_a_child = lambda names: remembered(tuple(names))
+    try:
+        yield
+    finally:
+        fmu_module.ask_in_a_child = before
+
+
 def watch(path):
     """Use an FMU; returns how far it came and what is wrong with that."""
     faulthandler.dump_traceback_later(HANG, exit=True)
-    begin = time.process_time()  # the machine may be busy with something else
+    begin, memory = time.process_time(), peak_memory()  # other programs do not count
     try:
         reached = use(path)
     except Exception as error:
@@ -351,7 +408,20 @@ def watch(path):
         faulthandler.cancel_dump_traceback_later()
     duration = time.process_time() - begin
     left = [other.name for other in path.parent.iterdir() if other != path]
+    growth = peak_memory() - memory
+    if growth > LARGE:
+        return reached, f"{growth // 2**20} MiB"
     return reached, f"{duration:.1f} s" if duration > SLOW else f"left {left}" if left else ""
+
+
+def peak_memory():
+    """The most bytes that this process has had; 0 on Windows, where nothing is measured."""
+    if sys.platform == "win32":
+        return 0
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def say(text):

@@ -1,8 +1,8 @@
 /* An FMU that knows which calls the standard allows when, and notes those that it does not.
 
    FMI_VERSION is 1, 2 or 3. y' = k u, read with each step. Steps longer than "longest" are discarded,
-   if that is positive. A reset leaks as many bytes as "leak" says: until the instance is freed, or for
-   ever if that is negative. What is noted, and which call returns what, is in the file that the
+   if that is positive. A reset leaks as many bytes as "leak" says, and a step as many as "step_leak":
+   until the instance is freed, or for ever if that is negative. What is noted, and which call returns what, is in the file that the
    environment variable LAWFUL_RECORD names, if any; see lawful_tools.py. Instances are never really
    freed, so that calls of freed ones can be told. Functions that nobody should call are generated in
    lawful_tools.py, too. */
@@ -16,7 +16,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { U, Y, K, LONGEST, LEAK, VARIABLES };
+enum { U, Y, K, LONGEST, LEAK, STEP_LEAK, VARIABLES };
 enum call { INSTANTIATE, SETUP, ENTER, EXIT, SET, STEP, GET, RESET, GET_STATE, SET_STATE, FREE_STATE,
             TERMINATE, GET_STATUS, FREE, CALLS };
 enum { OK, WARNING, DISCARD, ERROR, FATAL, NOT_A_NUMBER, STOP };
@@ -202,6 +202,7 @@ static void check_step(const Lawful *me, double time, double step) {
 /* stop is set where the FMU asks for the end. */
 static int do_step(Lawful *me, double time, double step, bool no_return, bool *stop) {
     int status = require(me, STEP, STEPPING);
+    leak(me, me->model.values[STEP_LEAK]);
     *stop = me->asked_to_stop = status == STOP;
     if (status <= WARNING && step > me->model.values[LONGEST] && me->model.values[LONGEST] > 0) {
         status = DISCARD;

@@ -77,6 +77,7 @@ _VARIABLES = {
     "k": (_PARAMETER, 'start="1"'),
     "longest": (_PARAMETER, 'start="0"'),
     "leak": (_PARAMETER, 'start="0"'),
+    "step_leak": (_PARAMETER, 'start="0"'),
 }
 _FLAGS = 'canHandleVariableCommunicationStepSize="true"'
 _CO_SIMULATION = f'<CoSimulation modelIdentifier="Lawful" {_FLAGS} '
@@ -105,7 +106,7 @@ def _variable(version, reference, name):
 
 
 def lawful_fmu(folder, version):
-    """Write the FMU: an input u, an output y and the parameters k, longest and leak, all real."""
+    """Write the FMU, whose variables are all real: an input u, an output y, and parameters."""
     variables = "".join(_variable(version, i, name) for i, name in enumerate(_VARIABLES))
     xml = (
         f'<fmiModelDescription fmiVersion="{version}.0" modelName="Lawful" {_BEFORE[version]}'

@@ -123,6 +123,7 @@ int fmi2Terminate(Mortal *me) {
 }
 
 int fmi2Reset(Mortal *me) {
+    me->values[0] = me->values[1] = 0.0;
     return 0;
 }
 

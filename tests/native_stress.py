@@ -28,7 +28,7 @@ import numpy as np
 from fmugym import FMU, SimulationError, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
-from fmugym.vector.trace import OPERATIONS, Program
+from fmugym.vector.hooks.program import OPERATIONS, Program
 
 THREADS = 6
 PATIENCE = 120.0

@@ -1,6 +1,8 @@
 """An FMU that harms its process (``faulty.c``), and an environment over it."""
 
+import contextlib
 import functools
+import os
 import subprocess
 import sys
 import tempfile
@@ -11,7 +13,7 @@ import fmu_tools
 
 import fmugym
 
-FAULTS = {"none": 0, "crash": 1, "abort": 2, "exit": 3, "hang": 4, "close": 5}
+FAULTS = {"none": 0, "crash": 1, "abort": 2, "exit": 3, "hang": 4, "close": 5, "pause": 6}
 STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
 
 VARIABLES = {
@@ -21,6 +23,13 @@ VARIABLES = {
     "stage": 'causality="parameter" variability="fixed"><Real start="0"/>',
     "at": 'causality="parameter" variability="fixed"><Real start="0"/>',
 }
+
+
+INTERRUPTIBLE = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+"""
+"""The begin of a program that obeys Ctrl-C although its parent ignores it, as in the background."""
 
 
 @functools.cache
@@ -71,3 +80,37 @@ class FaultyEnv(fmugym.FMI2CSEnv):
 
     def _is_done(self):
         return self.state[0] < -1e9
+
+
+def processes_with(folder):
+    """The numbers of the processes, other than this one, that have a file of a folder mapped."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and int(process.name) != os.getpid():
+            try:
+                maps = (process / "maps").read_text()
+            except OSError:  # it has ended, or is another user's
+                continue
+            found += [int(process.name)] if str(folder) in maps else []
+    return found
+
+
+@contextlib.contextmanager
+def no_descriptors_left(left=0):
+    """Let this process open no files, sockets or pipes, or only a few."""
+    import resource  # not on Windows
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(256, hard), hard))
+    taken = []
+    try:
+        with contextlib.suppress(OSError):
+            while True:
+                taken.append(os.open(os.devnull, os.O_RDONLY))
+        for _ in range(left):
+            os.close(taken.pop())
+        yield
+    finally:
+        for descriptor in taken:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

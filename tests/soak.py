@@ -24,7 +24,7 @@ import numpy as np
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
-from fmugym.bundled import FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.envs.cart_pole import START_VALUES, CartPoleEnv
 
 SAMPLES = 200

@@ -9,7 +9,8 @@ import zipfile
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_fmu, write_fmu
 
-from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, safe_zip
+from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError
+from fmugym.archive import safe_zip
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ class TestGoodArchives:
         path = probe_fmu(tmp_path, 2, {'name="sum"': 'name="mix"'})
         with caplog.at_level("INFO", "fmugym"):
             assert FMU(path).runs_here
-        assert "Probe.fmu: 1 findings in the model description" in caplog.text
+        assert "Probe.fmu: 1 findings" in caplog.text
         assert "mix" in caplog.text
 
     def test_repr_names_the_file(self, fmu_path):
@@ -135,11 +136,16 @@ class TestBadArchives:
             "a\\..\\..\\evil",
             "\\\\server\\share\\evil",
             "//server/share/evil",
-            "resources/data.csv:stream",
         ],
     )
     def test_files_outside_of_the_folder(self, fmu_path, tmp_path, name):
-        refused(edited_fmu(fmu_path, tmp_path, add={name: "x"}), "outside of its own folder")
+        refused(edited_fmu(fmu_path, tmp_path, add={name: "x"}), "outside of the FMU's own folder")
+
+    def test_devices_of_windows(self, fmu_path, tmp_path, monkeypatch):
+        path = edited_fmu(fmu_path, tmp_path, add={"resources/nul.txt": "x"})
+        assert FMU(path).runs_here
+        monkeypatch.setattr(safe_zip, "_has_devices", True)
+        refused(path, "'resources/nul.txt' has the name of a device of Windows")
 
     def test_symbolic_links(self, fmu_path, tmp_path):
         path = edited_fmu(fmu_path, tmp_path)
@@ -157,21 +163,13 @@ class TestBadArchives:
         path.write_bytes(content)
         refused(path, "encrypted")
 
-    @pytest.mark.filterwarnings("ignore:Duplicate name")
-    @pytest.mark.parametrize("prefix", ["", "./"])
-    def test_two_files_of_one_name(self, fmu_path, tmp_path, prefix):
-        path = edited_fmu(fmu_path, tmp_path)
-        with zipfile.ZipFile(path, "a") as file:
-            file.writestr(f"{prefix}modelDescription.xml", "<other/>")
-        refused(path, "two files of one name")
-
     @pytest.mark.parametrize("folds", [True, False])
     def test_names_that_differ_in_case(self, fmu_path, tmp_path, monkeypatch, folds):
         """On Windows and macOS they are one file."""
         monkeypatch.setattr(safe_zip, "_folds_case", folds)
         path = edited_fmu(fmu_path, tmp_path, add={"resources/a": "", "resources/A": ""})
         if folds:
-            refused(path, "two files of one name")
+            refused(path, "'resources/A' and 'resources/a' differ only in case")
         else:
             assert FMU(path).runs_here
 
@@ -233,7 +231,6 @@ class TestBadArchives:
             file._didModify = True
         assert path.stat().st_size < 200_000
         refused(path, r"unpacks to \d+ times its size")
-        refused(path, "files that overlap: '.*' and the next one share", max_ratio=10**6)
 
     def test_damaged_contents(self, fmu_path, tmp_path):
         content = bytearray(edited_fmu(fmu_path, tmp_path).read_bytes())
@@ -241,34 +238,26 @@ class TestBadArchives:
         content[middle : middle + 50] = bytes(50)
         path = tmp_path / "Probe.fmu"
         path.write_bytes(content)
-        refused(path, "cannot be extracted")
+        refused(path, "is damaged: ")
 
     def test_contents_cut_out(self, fmu_path, tmp_path):
         """As after a download that lost a piece in the middle."""
         content = edited_fmu(fmu_path, tmp_path).read_bytes()
         path = tmp_path / "Probe.fmu"
         path.write_bytes(content[:500] + content[1500:])
-        refused(path, "is damaged|overlap|cut short|is not an FMU")
-
-    def test_a_file_longer_than_the_archive(self, fmu_path, tmp_path):
-        content = bytearray(edited_fmu(fmu_path, tmp_path).read_bytes())
-        entry = content.rindex(b"PK\x01\x02")
-        content[entry + 20 : entry + 24] = (10**6).to_bytes(4, "little")
-        path = tmp_path / "Probe.fmu"
-        path.write_bytes(content)
-        refused(path, "is cut short: .* is not all there")
+        refused(path, "is damaged|is not all there|is not an FMU")
 
     def test_a_header_that_is_not_there(self, fmu_path, tmp_path):
         content = edited_fmu(fmu_path, tmp_path).read_bytes()
         path = tmp_path / "Probe.fmu"
         path.write_bytes(content.replace(b"PK\x03\x04", b"PK\x00\x00"))
-        refused(path, "is damaged: .* is not where it should be")
+        refused(path, "is damaged: Bad magic number")
 
     def test_a_file_that_unpacks_to_more_than_it_says(self, fmu_path, tmp_path):
         path = edited_fmu(fmu_path, tmp_path, add={"resources/zeros": bytes(2**20)})
         content = path.read_bytes()
         path.write_bytes(content.replace((2**20).to_bytes(4, "little"), b"\x10\0\0\0"))
-        refused(path, "cannot be extracted: Bad CRC-32")
+        refused(path, "is damaged: Bad CRC-32")
 
     def test_other_ways_of_compression(self, fmu_path, tmp_path):
         path = edited_fmu(fmu_path, tmp_path)
@@ -282,14 +271,15 @@ class TestBadArchives:
         content[start : start + 50] = bytes(50)
         path = tmp_path / "Probe.fmu"
         path.write_bytes(content)
-        refused(path, "cannot be read")
+        refused(path, "is damaged: ")
 
     def test_a_file_that_is_also_a_folder(self, fmu_path, tmp_path):
-        more = {"resources/a": "", "resources/a/b": ""}
-        refused(edited_fmu(fmu_path, tmp_path, add=more), "a file that is also a folder")
+        more = {"resources/a": "x", "resources/a/b": ""}
+        match = "'resources/a' is a file, but other files lie inside of it"
+        refused(edited_fmu(fmu_path, tmp_path, add=more), match)
 
     def test_a_file_without_a_name(self, fmu_path, tmp_path):
-        refused(edited_fmu(fmu_path, tmp_path, add={".": "x"}), "without a name")
+        refused(edited_fmu(fmu_path, tmp_path, add={".": "x"}), "'.' has content but no name")
 
 
 class TestLibraries:

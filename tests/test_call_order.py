@@ -26,7 +26,8 @@ from hypothesis.stateful import (
 )
 
 from fmugym import FMU, FMUGymError
-from fmugym.pool import PoolSpec, has_native_pool, make_pool
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.trial.opening import make_pool
 from fmugym.vector import FMUVectorEnv
 
 LOG = logging.getLogger("fmugym.test")

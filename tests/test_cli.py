@@ -9,10 +9,11 @@ import zipfile
 import zlib
 
 import pytest
+from fmu_tools import library_name, probe_fmu, read_fmu
 
 import fmugym
-from fmugym.bundled import BUNDLED, FMI_VERSIONS
-from fmugym.cli import main
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.tools.cli import main
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{1}}" description="{description}">
@@ -144,7 +145,47 @@ class TestInfo:
         text = info(make_fmu(variable("u", "<Real/>"), OUTPUT))
         assert "does NOT run here" in text
         assert "platforms           plan9" in text
-        assert "Findings in the model description" in text
+        assert "Findings (" in text
+
+    @pytest.mark.parametrize(
+        ("tool", "flag", "named"),
+        [
+            ("Dymola 2024x", "true", "Dymola 2024x"),
+            ("", "true", "the tool that exported it"),
+            ("EnergyPlusToFMU 3.1", "false", "EnergyPlus"),
+            ("Overture 3.0", "false", "Java"),
+            ("Simulink (R2023b)", "true", "MATLAB"),
+            ("Simulink (R2023b)", "false", None),
+            ("Dymola 2024x", "false", None),
+        ],
+    )
+    def test_a_tool_that_must_be_installed_is_named(
+        self, info, facts, tmp_path, monkeypatch, tool, flag, named
+    ):
+        monkeypatch.setenv("PATH", str(tmp_path))  # nothing is installed
+        edits = {
+            "<CoSimulation ": f'<CoSimulation needsExecutionTool="{flag}" ',
+            'fmiVersion="2.0"': f'fmiVersion="2.0" generationTool="{tool}"',
+        }
+        path = probe_fmu(tmp_path, 2, edits)
+        end = f": runs here if it is installed: {named}\n" if named else ": runs here\n"
+        assert end in info(path)
+        assert facts(path)["missing_tool"] == named
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="programs of Unix")
+    def test_a_tool_that_is_installed_is_not(self, info, tmp_path, monkeypatch):
+        program = tmp_path / "energyplus"
+        program.touch(0o755)
+        monkeypatch.setenv("PATH", str(tmp_path))
+        edits = {'fmiVersion="2.0"': 'fmiVersion="2.0" generationTool="EnergyPlus 23.1"'}
+        assert ": runs here\n" in info(probe_fmu(tmp_path, 2, edits))
+
+    def test_a_library_of_another_processor_does_not_run_here(self, info, facts, tmp_path):
+        library = bytearray(read_fmu(probe_fmu(tmp_path))[library_name(2)])
+        library[18:20] = (22).to_bytes(2, "little")  # the machine of an ELF file: s390
+        text = info(probe_fmu(tmp_path, add={library_name(2): bytes(library)}))
+        assert "does NOT run here: Probe.fmu: " in text
+        assert "was built for ELF machine 22, this process runs on" in text
 
     def test_texts_of_a_foreign_file_are_made_harmless(self, info, make_fmu):
         path = make_fmu(INPUT, description="25 \u00b0C\u2028and &#x85; \u202e more")
@@ -246,8 +287,8 @@ class TestSkeleton:
         assert config_of(made.out)["model_input_names"] == []
         assert config_of(made.out)["model_output_names"] == ["x"]
         assert "spaces.Discrete(1)" in made.out
-        assert "no input" in made.err
-        assert "locals stand in" in made.err
+        assert "no numeric input" in made.err
+        assert "locals" in made.err
 
     def test_nothing_to_observe_is_an_error(self, make_fmu, capsys):
         assert main(["skeleton", str(make_fmu(INPUT))]) == 1
@@ -259,7 +300,7 @@ class TestSkeleton:
         command = [builder, "build", "-f", "decay.py", "--no-external-tool"]
         subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
         made = run("skeleton", tmp_path / "Decay.fmu", "--output", tmp_path / "made.py")
-        assert "no input" in made.stderr
+        assert "no numeric input" in made.stderr
         command = [sys.executable, "made.py"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert "DecayEnv keeps the contract" in done.stdout, done.stderr

@@ -8,11 +8,11 @@ import pytest
 from fmu_tools import MAJOR_VERSIONS, probe_config, probe_fmu
 
 from fmugym import FMU, ConfigError, EnvConfig, Uniform
-from fmugym.config import checked_value
+from fmugym.task.interface import checked_value, resolve
 
 
-def resolve(path, **changes):
-    return EnvConfig.from_dict(probe_config(**changes)).resolve(FMU(path).description)
+def resolved(path, **changes):
+    return resolve(EnvConfig.from_dict(probe_config(**changes)), FMU(path).description)
 
 
 class TestTaken:
@@ -58,24 +58,24 @@ class TestFilledInFromTheFMU:
     def test_time_step_and_start_time(self, tmp_path):
         experiment = '<DefaultExperiment startTime="2" stepSize="0.25"/><ModelVariables>'
         path = probe_fmu(tmp_path, 2, {"<ModelVariables>": experiment})
-        spec = resolve(path, time_step=None).pool_spec()
+        spec = resolved(path, time_step=None).pool_spec()
         assert (spec.time_step, spec.start_time) == (0.25, 2.0)
-        spec = resolve(path, time_step=0.5, start_time=0.0).pool_spec()
+        spec = resolved(path, time_step=0.5, start_time=0.0).pool_spec()
         assert (spec.time_step, spec.start_time) == (0.5, 0.0)
 
     def test_substeps_and_warm_up(self, probe):
-        spec = resolve(probe(2), time_step=0.3, substeps=3, warm_up=0.9).pool_spec()
+        spec = resolved(probe(2), time_step=0.3, substeps=3, warm_up=0.9).pool_spec()
         assert spec.warm_up_steps == 3
         assert spec.communication_step_size == pytest.approx(0.1, abs=1e-16)
         assert spec.communication_point(9) == pytest.approx(0.9, abs=1e-15)
 
     def test_time_does_not_drift(self, probe):
         """A sum of 1e5 tenths is off by 2e-8."""
-        spec = resolve(probe(2), time_step=0.1).pool_spec()
+        spec = resolved(probe(2), time_step=0.1).pool_spec()
         assert spec.communication_point(100_000) == 10_000.0
 
     def test_bounds_go_before_those_of_the_fmu(self, probe):
-        interface = resolve(probe(2), bounds={"a": (-3, 4)})
+        interface = resolved(probe(2), bounds={"a": (-3, 4)})
         assert interface.bounds(interface.inputs[0]) == (-3, 4)
 
 
@@ -237,12 +237,12 @@ class TestRefused:
     )
     def test_what_does_not_fit_the_fmu(self, probe, version, changes, match):
         with pytest.raises(ConfigError, match=match):
-            resolve(probe(version), **changes).pool_spec()
+            resolved(probe(version), **changes).pool_spec()
 
     def test_arrays(self, probe):
         for key in ("model_input_names", "model_output_names"):
             with pytest.raises(ConfigError, match=r"'array' cannot be an .*put: it is an array"):
-                resolve(probe(3), **{key: "array"})
+                resolved(probe(3), **{key: "array"})
 
     def test_tunable_parameters_may_be_inputs(self, probe):
-        assert resolve(probe(2), model_input_names="trim").inputs[0].name == "trim"
+        assert resolved(probe(2), model_input_names="trim").inputs[0].name == "trim"

@@ -90,7 +90,7 @@ class TestDraw:
         (lambda: Uniform(1.0, 0.0), "low must not be greater than high"),
         (lambda: Uniform(0.0, math.inf), "finite"),
         (lambda: Uniform(math.nan, 1.0), "finite"),
-        (lambda: Uniform("0", 1.0), "every number must be one"),
+        (lambda: Uniform("0", 1.0), "low must be a number, got .0."),
         (lambda: LogUniform(0.0, 1.0), "0 < low <= high"),
         (lambda: LogUniform(2.0, 1.0), "0 < low <= high"),
         (lambda: LogUniform(1.0, math.inf), "finite"),

@@ -1,28 +1,41 @@
-"""What the documents say: their Python runs, and what they quote is what the package has."""
+"""The documents: their Python runs, and their tables and quotations agree with the package."""
 
 import ast
 import dataclasses
+import inspect
 import re
 import subprocess
 import sys
 import textwrap
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import fmugym
-from fmugym.cli import main
+import fmugym.lab
 from fmugym.config import EnvConfig
+from fmugym.task.hooks import Hooks
+from fmugym.tools.cli import main
+from fmugym.trial.opening import make_pool
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted((ROOT / "docs").glob("*.md")) + sorted(ROOT.glob("README.md"))
-GUIDE = ROOT / "docs" / "integrating-an-fmu.md"
-CONFIG = ROOT / "docs" / "config.md"
+DOCS = ROOT / "docs"
+DOCUMENTS = sorted(DOCS.glob("*.md")) + sorted(ROOT.glob("*.md"))
+INDEX, TUTORIAL, ERRORS = DOCS / "README.md", DOCS / "tutorial.md", DOCS / "errors.md"
+CONFIG, HOOKS, RELIABILITY = DOCS / "config.md", DOCS / "hooks.md", DOCS / "reliability.md"
 FENCE = re.compile(r"^(?P<indent> *)```(?P<language>[^\n`]*)\n(?P<code>.*?)^ *```$", re.M | re.S)
+CLASS_ATTRIBUTES = {"metadata", "render_size", "reset_options", "steps_after_end"}
 EXTRAS = {"stable-baselines3.md": "stable_baselines3"}  # what a document's Python needs
 NOT_PYTHON = {"bash", "c", "console", "json", "mermaid", "text", "toml", "yaml"}
 
-each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+
+def name_of(document):
+    return "index" if document == INDEX else document.name
+
+
+each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
 
 
 def blocks(document, *languages):
@@ -49,9 +62,7 @@ def test_every_block_names_its_language(document):
     assert document.read_text().count("```") == 2 * len(FENCE.findall(document.read_text()))
 
 
-@pytest.mark.parametrize(
-    "document", [d for d in DOCUMENTS if blocks(d, "python")], ids=lambda path: path.name
-)
+@pytest.mark.parametrize("document", [d for d in DOCUMENTS if blocks(d, "python")], ids=name_of)
 def test_python_runs(document, tmp_path):
     if document.name in EXTRAS:
         pytest.importorskip(EXTRAS[document.name], reason="needs an extra of the package")
@@ -66,21 +77,57 @@ def test_python_runs(document, tmp_path):
 
 @each_document
 def test_links_within_the_repository_exist(document):
-    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text()):
-        assert (document.parent / target).exists(), target
+    for target, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]*))?\)", document.read_text()):
+        path = document.parent / target if target else document
+        assert path.exists(), target
+        if anchor:
+            assert anchor in anchors(path), f"{target}#{anchor}"
+
+
+def anchors(document):
+    """The anchors that GitHub makes of a document's headings."""
+    text = FENCE.sub("", document.read_text())
+    headings = re.findall(r"^#+ (.+)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+def test_the_index_names_every_page():
+    listed = set(re.findall(r"\]\(([\w-]+\.md)", INDEX.read_text()))
+    assert {path.name for path in DOCS.glob("*.md")} - {INDEX.name} == listed
+
+
+def test_the_index_lists_every_extra():
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    table = section(INDEX, "Install")
+    names = re.findall(r"`([\w-]+)`", " ".join(re.findall(r"^\| (`.+?) \|", table, re.M)))
+    assert set(names) == set(extras)
+
+
+def test_contributors_are_told_of_every_folder_of_the_package():
+    (tree,) = blocks(ROOT / "CONTRIBUTING.md", "text")
+    told = set(re.findall(r"(\w+)/", tree["code"]))
+    assert {path.parent.name for path in (ROOT / "fmugym").glob("*/__init__.py")} <= told
 
 
 def test_shown_output_of_info_is_what_it_prints(capsys):
     main(["info", str(fmugym.bundled_fmu("Pendulum"))])
     printed = capsys.readouterr().out.splitlines()
-    (shown,) = (b["code"] for b in blocks(GUIDE, "text") if b["code"].startswith("Pendulum (FMI"))
+    (shown,) = (
+        b["code"] for b in blocks(TUTORIAL, "text") if b["code"].startswith("Pendulum (FMI")
+    )
     for line in shown.splitlines():
         assert line == "..." or line in printed or "this machine" in line
 
 
-def test_messages_in_the_troubleshooting_table_exist():
+def test_messages_in_the_table_of_errors_exist():
     known = "\n".join(messages())
-    rows = re.findall(r"^\| `([^`]+)`", GUIDE.read_text(), re.M)
+    section = ERRORS.read_text().split("## Messages")[1]
+    rows = re.findall(r"^\| `([^`]+)`", section, re.M)
     assert len(rows) > 15
     for row in rows:
         pattern = r".*".join(map(re.escape, row.split("...")))
@@ -98,13 +145,88 @@ def messages():
                 yield re.sub(r"%[-+.\d]*[sdgr]", "...", node.value).replace("\n", " ")
 
 
+def test_the_classes_of_errors_are_those_of_the_package():
+    documented = re.findall(r"^\| `(\w+)`", ERRORS.read_text().split("## Messages")[0], re.M)
+    public = {name for name in fmugym.__all__ if name.endswith("Error")}
+    assert set(documented) == public - {"FMUGymError"} | {fmugym.lab.LabError.__name__}
+
+
 def test_config_table_has_every_key_with_its_default():
-    section = CONFIG.read_text().split("## ")[1]
-    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+?) \|", section, re.M))
+    rows = rows_of(CONFIG, "Config keys")
     fields = {field.name: field for field in dataclasses.fields(EnvConfig)}
     assert list(rows) == list(fields)
     for name, default in rows.items():
         assert shown_default(fields[name]) == default.strip("`"), name
+
+
+def rows_of(document, heading):
+    """The second column of a section's table by the name in the first."""
+    found = section(document, heading)
+    return dict(re.findall(r"^\| `(\w+)` \| ([^|]+?) \|", found, re.M))
+
+
+def section(document, heading):
+    return re.split(rf"^#+ {heading}\n", document.read_text(), flags=re.M)[1].split("\n## ")[0]
+
+
+def test_table_of_archive_limits_is_that_of_the_class():
+    units = {"GiB": 2**30, "MiB": 2**20}
+    rows = rows_of(RELIABILITY, "Archive limits")
+    fields = {field.name: field.default for field in dataclasses.fields(fmugym.ArchiveLimits)}
+    assert list(rows) == list(fields)
+    for name, text in rows.items():
+        number, unit = re.match(r"([\d,]+)(?: (GiB|MiB))?", text).groups()
+        assert int(number.replace(",", "")) * units.get(unit, 1) == fields[name], name
+
+
+def test_table_of_health_is_what_is_counted():
+    env = fmugym.envs.CartPoleEnv()
+    names = re.findall(r"^\| (`[^|]+`) \|", section(RELIABILITY, "Health"), re.M)
+    documented = re.findall(r"`(\w+)`", " ".join(names))
+    assert sorted(documented) == sorted(env.health)
+    env.close()
+
+
+def test_table_of_vector_arguments_has_every_argument():
+    documented = set(rows_of(CONFIG, "Vector environments"))
+    own = inspect.signature(fmugym.FMUVectorEnv.__init__).parameters
+    pool = inspect.signature(make_pool).parameters
+    pool_options = {name for name, p in pool.items() if p.kind is p.KEYWORD_ONLY} | {"backend"}
+    pool_options -= {"starts"}  # of the environment itself
+    assert documented == set(own) - {"self", "make_env", "pool_options"} | pool_options
+
+
+def test_table_of_shapes_is_what_hooks_see():
+    """Of the pendulum with two outputs and three environments."""
+    seen = {}
+
+    class Watched(fmugym.FMI2CSEnv):
+        def __init__(self):
+            config = {
+                "model_input_names": "tau",
+                "model_output_names": ["q", "q_dot"],
+                "model_parameters": {"m": fmugym.Uniform(0.05, 0.07)},
+                "episode_variables": {"target": 0.5},
+                "bounds": {"tau": (-1, 1)},
+                "time_step": 0.02,
+            }
+            super().__init__(fmugym.bundled_fmu("Pendulum"), config)
+
+        def _is_done(self):
+            for code in shapes:
+                seen[code] = np.shape(eval(f"env.{code}", {"env": self}))
+            return abs(self.state[0]) > 10.0
+
+    table = section(HOOKS, "What hooks may read").split("Shapes in")[1]
+    rows = re.findall(r"^\| (`.+?) \| .+ \| .*?(\(.*\)|last axis) \|$", table, re.M)
+    expected = {"(outputs, N)": (2, 3), "(inputs, N)": (1, 3), "(N,)": (3,), "last axis": (1, 3)}
+    shapes = {code: expected[text] for cell, text in rows for code in re.findall("`(.+?)`", cell)}
+    envs = fmugym.FMUVectorEnv(Watched, 3, hooks="array")
+    envs.reset(seed=0)
+    envs.step(envs.action_space.sample())
+    envs.close()
+    assert len(shapes) > 8
+    assert seen == shapes
 
 
 def shown_default(field):
@@ -115,14 +237,13 @@ def shown_default(field):
 
 def table(heading):
     """The names in the first column of the tables of a section."""
-    section = CONFIG.read_text().split(f"## {heading}")[1].split("\n## ")[0]
-    return set(re.findall(r"^\| `(\w+)", section, re.M)) - {"metadata"}
+    return set(re.findall(r"^\| `(\w+)", section(HOOKS, heading), re.M)) - CLASS_ATTRIBUTES
 
 
 def test_hook_table_has_every_hook():
-    hooks = {name for name in vars(fmugym.FMUEnv) if re.match(r"_(get|is)_", name)}
-    assert hooks | {"_update", "_reward_policy", "_goal_reward"} <= table("Hooks")
-    for name in table("Hooks"):
+    hooks = {name for name in vars(Hooks) if re.match(r"_(get|is)_", name)}
+    assert hooks | {"_update", "_reward_policy", "_goal_reward"} <= table("All hooks")
+    for name in table("All hooks"):
         assert callable(getattr(fmugym.FMUEnv, name)), name
 
 

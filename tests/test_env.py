@@ -9,7 +9,7 @@ import pytest
 
 import fmugym
 from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
-from fmugym.bundled import FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.testing import check_fmu_env
 
 ENV_IDS = [

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import fmugym
-from fmugym.bundled import FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 
 _angles = np.random.default_rng(0).uniform(-10, 10, 100_000)
 SINES_AGREE = all(

@@ -41,7 +41,7 @@ def run_training(*arguments, folder):
 
 
 def learnt(agents, method, seed, episodes=40):
-    """A fresh agent's first training episodes, and what it does afterwards."""
+    """The first training episodes of a new agent, and its actions afterwards."""
     env = gym.make("fmugym/CartPole-v0")
     env.reset(seed=seed)
     agent = getattr(agents, method)(env.observation_space, seed)

@@ -1,4 +1,4 @@
-"""The examples for an FMU of one's own and for the pendulum, run as a reader would run them."""
+"""The examples own_fmu.py and pendulum_swing_up.py, run as a reader would run them."""
 
 import re
 import subprocess

@@ -9,8 +9,9 @@ import threading
 import pytest
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, probe_config
 
-from fmugym import FMULoadError, fmu_log
-from fmugym.fmu_log import MessageLog
+from fmugym import FMULoadError
+from fmugym.fmi import log as fmu_log
+from fmugym.fmi.log import MessageLog
 
 LEVELS = {0: "INFO", 1: "WARNING", 2: "WARNING", 3: "ERROR", 4: "CRITICAL"}
 
@@ -100,9 +101,9 @@ def test_what_the_fmu_said_is_in_the_error(probe, tmp_path, version):
 
 def test_a_message_of_nobody_is_logged_too(caplog):
     fmu_log._deliver(None, 3, b"late", b"after the end\n")
-    assert records(caplog, "fmugym.fmu_log") == [("INFO", "[late] after the end")]
+    assert records(caplog, "fmugym.fmi.log") == [("INFO", "[late] after the end")]
     fmu_log._by_name(None, b"a name of its own", 0, None, None)
-    assert records(caplog, "fmugym.fmu_log")[1] == ("INFO", "[] ")
+    assert records(caplog, "fmugym.fmi.log")[1] == ("INFO", "[] ")
 
 
 def test_bytes_that_are_not_utf_8_and_odd_statuses(caplog):

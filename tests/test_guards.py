@@ -1,21 +1,28 @@
 """Guards in the process, in all pools: finite values, retries, health, recycling."""
 
+import ctypes
 import itertools
 import logging
+import platform
+import subprocess
 import sys
 
 import gymnasium as gym
 import lawful_tools
 import numpy as np
 import pytest
+import zoo_tools
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config
 from gymnasium import spaces
 
 import fmugym
 from fmugym import FMU, ConfigError, SimulationError
-from fmugym.adapters import Status
-from fmugym.pool import PoolSpec, has_native_pool, make_pool
-from fmugym.pool.leaks import LeakWatch, resident_bytes
+from fmugym.fmi.status import Status
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.arithmetic import restore_arithmetic
+from fmugym.pool.memory import grown_bytes, heap_is_known
+from fmugym.pool.spec import DEFAULT_LEAK_LIMIT
+from fmugym.trial.opening import make_pool
 from fmugym.vector import FMUVectorEnv
 
 LOG = logging.getLogger("fmugym.test")
@@ -133,6 +140,68 @@ class TestFiniteInputs:
             envs.step(np.array([1, 0]))
         envs.reset(seed=0)
         assert envs.step(np.array([1, 1]))[0].tolist() == [[pytest.approx(0.8)]] * 2
+
+
+class RoundedUp(PlainEnv):
+    """Steps an FMU of the zoo in Python."""
+
+    def __init__(self, path, values):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "model_parameters": values,
+            "time_step": 0.5,
+            "bounds": {"u": (-1, 1)},
+        }
+        super().__init__(path, config, logging.CRITICAL, backend="python")
+
+
+class TestArithmetic:
+    """In Python's pool; what the native one does is in test_native_pool.py."""
+
+    @pytest.mark.parametrize("call", ["instantiate", "exit", "set", "step", "get", "reset"])
+    def test_the_rounding_mode_of_an_fmu_does_not_stay(self, tmp_path, opened, call):
+        token = "{zoo}"
+        if call == "instantiate":
+            token = f"{{zoo {zoo_tools.FAULTS.index('round_up')} {zoo_tools.CALLS.index(call)} 0}}"
+        values = zoo_tools.parameters("round_up", call, at=0)
+        path = zoo_tools.zoo_fmu(tmp_path, 2, token)
+        tiny = float("1e-30")
+        env = opened(RoundedUp(path, values))
+        assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
+        for _ in range(2):
+            env.reset()
+            assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
+            env.step([1.0])
+            assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
+
+    def test_other_instances_do_not_notice(self, tmp_path, opened):
+        def rollout(fault):
+            fmu = FMU(zoo_tools.zoo_fmu(tmp_path, 2))
+            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
+            pool = opened(make_pool(fmu, spec, 2, LOG, backend="python", private_libraries=False))
+            values = np.zeros((4, 2))
+            values[:, 0] = list(zoo_tools.parameters(fault).values())
+            pool.reset(tuple(map(fmu.variable, zoo_tools.PARAMETERS)), values)
+            return [pool.step(np.full((1, 2), 1 / n))[0][:, 1].tolist() for n in range(3, 50)]
+
+        expected = rollout("none")
+        assert rollout("round_up") == expected
+
+    @pytest.mark.skipif(
+        sys.platform != "linux" or platform.machine() != "x86_64", reason="sets MXCSR"
+    )
+    def test_subnormal_numbers(self, tmp_path):
+        """As the start-up code of -ffast-math turns them off."""
+        library = tmp_path / "fast.so"
+        code = "#include <xmmintrin.h>\nvoid off(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }"
+        command = [*zoo_tools.compiler(), "-shared", "-fPIC", "-x", "c", "-", "-o", library]
+        subprocess.run(command, input=code, text=True, check=True)
+        ctypes.CDLL(library).off()
+        off = 0.5 * sys.float_info.min == 0.0
+        restore_arithmetic()
+        assert off
+        assert 0.5 * sys.float_info.min > 0.0
 
 
 class TestRetries:
@@ -276,51 +345,127 @@ class TestHealth:
             _ = env.health
 
 
+@pytest.fixture(name="backend", params=["python", "native"])
+def fixture_backend(request):
+    """The options of ``make_pool`` for each pool of this process."""
+    if request.param == "native" and not has_native_pool():
+        pytest.skip("the C extension was not built")
+    return WAYS[request.param]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows is not asked for its memory")
 class TestLeaks:
     RESETS, LEAK, LIMIT = 1200, 64 * 1024, 4 * MB
 
-    def reset_often(self, pool, leak):
-        """Returns by how much this process has grown."""
-        for _ in range(6):
-            set_up(pool, leak=leak)
-        before = resident_bytes()
-        for _, gain in zip(range(self.RESETS), itertools.cycle([1.0, 2.0]), strict=False):
-            _, status = set_up(pool, leak=leak, k=gain)
-            assert not status.any()
-        return resident_bytes() - before
+    @pytest.fixture(autouse=True)
+    def fixture_no_free_memory(self):
+        """Or else what leaks is put where other tests have freed memory."""
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(ctypes.c_size_t(0))
 
-    @pytest.mark.parametrize("backend", ["python", "native"])
+    def play(self, pool, resets=RESETS, between=lambda: None, steps=0, **leak):
+        """Play episodes; returns by how much this process has grown."""
+        for index in range(resets + 6):
+            if index == 6:
+                before = grown_bytes()
+            _, status = set_up(pool, k=1.0 + index % 2, **leak)  # other values: none is restored
+            assert not status.any()
+            for _ in range(steps):
+                step(pool, 1.0)
+            between()
+        return grown_bytes() - before
+
     @pytest.mark.parametrize("version", [1, 2])
     def test_instances_are_recycled(self, make, version, backend, caplog):
-        if backend == "native" and not has_native_pool():
-            pytest.skip("the C extension was not built")
-        pool = make(version, 1, way=WAYS[backend], leak_limit=self.LIMIT)
-        growth = self.reset_often(pool, self.LEAK)
+        pool = make(version, 1, way=backend, leak_limit=self.LIMIT)
+        growth = self.play(pool, leak=self.LEAK)
         assert growth < 4 * self.LIMIT < self.RESETS * self.LEAK / 4
         assert 0 < pool.health()["recyclings"][0] < 60  # few where there is much free memory
         assert caplog.text == ""
 
-    def test_that_it_does_not_help_is_said_once(self, make, caplog):
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        self.reset_often(pool, -self.LEAK)
-        assert caplog.text.count("isolation='process' does") == 1
+    def test_small_leaks_at_the_default_limit(self, make, backend, caplog):
+        pool = make(2, 1, way=backend, leak_limit=DEFAULT_LEAK_LIMIT)
+        assert self.play(pool, 20_000, leak=3600) < 1.25 * DEFAULT_LEAK_LIMIT
+        assert pool.health()["recyclings"][0] == 1
+        assert caplog.text == ""
+
+    def test_leaks_in_steps(self, make, backend, caplog):
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        growth = self.play(pool, 300, steps=16, step_leak=self.LEAK / 4)
+        assert growth < 4 * self.LIMIT < 300 * 4 * self.LEAK / 4
+        assert pool.health()["recyclings"][0] < 60
+        assert caplog.text == ""
+
+    def test_all_growth_is_counted(self, make, backend, tmp_path):
+        """Also where others have left free memory, which the FMU takes, and the other way round."""
+        path = tmp_path / "data"
+        path.write_bytes(bytes(100_000))
+        pool = make(2, 1, way=backend, leak_limit=1000 * MB)
+
+        def read():
+            with path.open(buffering=30_000) as file:
+                file.readline()
+
+        growth = self.play(pool, 8000, read, leak=3600)
+        assert growth > 20 * MB
+        assert pool.health()["memory_growth"][0] == pytest.approx(growth, rel=0.1)
+
+    @pytest.mark.parametrize("leak", [0, LEAK])
+    @pytest.mark.parametrize("keeps", [False, True])
+    def test_the_caller_may_take_memory(self, make, backend, caplog, leak, keeps):
+        """Much for a while, or more and more; the FMU's leaks are found all the same."""
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        kept, counter = [], itertools.count()
+
+        def allocate():
+            if keeps:
+                kept.append(np.ones(self.LEAK // 8))
+            else:
+                kept[:] = [np.ones(2 * MB)] if next(counter) % 100 < 50 else []
+
+        growth = self.play(pool, between=allocate, leak=leak)
+        growth -= sum(array.nbytes for array in kept)
+        recyclings = pool.health()["recyclings"][0]
+        assert growth < 5 * self.LIMIT
+        assert (10 if leak else 0) <= recyclings < (60 if leak else 8)
+        assert caplog.text == ""
+
+    def test_that_it_does_not_help_is_said_once(self, make, backend, caplog):
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        self.play(pool, leak=-self.LEAK)
+        assert caplog.text.count("isolation='process'") == 1
         assert pool.health()["recyclings"][0] < 10
 
-    def test_a_worker_that_leaks_is_replaced(self, make):
+    def test_snapshots_outlive_what_the_caller_takes(self, make, backend):
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        set_up(pool)
+        step(pool, 1.0)
+        snapshot, kept = pool.save(), []
+        self.play(pool, 200, lambda: kept.append(np.ones(self.LEAK // 8)))
+        assert pool.health()["recyclings"][0] == 0
+        assert pool.restore(snapshot)[0].tolist() == [[0.8]]
+
+    def test_snapshots_do_not_outlive_leaks(self, make, backend):
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        set_up(pool)
+        snapshot = pool.save()
+        assert self.play(pool, leak=self.LEAK) < 5 * self.LIMIT
+        with pytest.raises(SimulationError):
+            pool.restore(snapshot)
+
+    @pytest.mark.parametrize("leak", [{"leak": -LEAK}, {"step_leak": -LEAK / 4, "steps": 4}])
+    def test_a_worker_that_leaks_is_replaced(self, make, leak):
         pool = make(2, 1, way={"isolation": "process"}, leak_limit=self.LIMIT)
         (first,) = pool.processes()
-        self.reset_often(pool, -self.LEAK)
+        self.play(pool, **leak)
         assert pool.processes() != [first]
         health = pool.health()
         assert health["deaths"].tolist() == [0]
         assert health["memory_growth"][0] < 3 * self.LIMIT
 
-    @pytest.mark.parametrize("backend", ["python", "native"])
     def test_recycled_instances_are_as_before(self, make, backend):
-        if backend == "native" and not has_native_pool():
-            pytest.skip("the C extension was not built")
-        pool = make(2, 2, way=WAYS[backend])
+        pool = make(2, 2, way=backend)
         set_up(pool, k=[1.0, 3.0])
         expected = step(pool, 1.0, 1.0)[0].copy()
         pool.recycle()
@@ -329,13 +474,19 @@ class TestLeaks:
         np.testing.assert_array_equal(step(pool, 1.0, 1.0)[0], expected)
         assert pool.health()["replacements"].tolist() == [1, 1]
 
-    def test_one_that_gives_memory_back_to_the_system_is_no_leak(self):
-        counts, recycled = np.zeros((1, 11), np.int64), []
-        watch = LeakWatch(10 * MB, counts, lambda: recycled.append(1), LOG, "Boiler")
-        for growth in [0, 0, 0, 0, *[9 * MB, -9 * MB] * 50]:
-            counts[0, 0] += 1
-            watch.note(growth)
-        assert recycled == []
+    def test_counts_may_be_forgotten(self, make, backend):
+        """The watch goes on."""
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        for _ in range(4):
+            assert self.play(pool, 300, leak=self.LEAK) < 4 * self.LIMIT
+            pool.forget_health()
+
+    @pytest.mark.skipif(not heap_is_known(), reason="needs glibc 2.33")
+    def test_without_knowledge_of_the_heap(self, make, monkeypatch, backend, caplog):
+        monkeypatch.setattr("fmugym.pool.memory._mallinfo", lambda: None)
+        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        assert self.play(pool, leak=self.LEAK) < 4 * self.LIMIT
+        assert caplog.text == ""
 
 
 def test_bundled_fmus_are_not_watched():

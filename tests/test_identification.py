@@ -6,6 +6,7 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+import fuzz_identification
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -301,16 +302,16 @@ class TestOutputError:
         [
             ({"parameters": {}}, "no parameter"),
             ({"parameters": {"bb": 1.0}}, "unknown variable of Pendulum 'bb'"),
-            ({"parameters": {"q": 1.0}}, "'q' is no numeric parameter"),
+            ({"parameters": {"q": 1.0}}, "'q' is not a numeric parameter"),
             ({"parameters": {"b": (1.0, 0.5, 2.0, 3.0)}}, "low <= start <= high"),
             ({"parameters": {"b": -1.0}}, "low <= start <= high"),
             ({"fixed": {"b": 1e-4}}, "both fixed and to be fitted"),
-            ({"scales": {"q": 0.0}}, "positive"),
+            ({"scales": {"q": 0.0}}, "scale of 'q'"),
             ({"scales": {"p": 1.0}}, "unknown measured output 'p'"),
             ({"initial_states": {"q_0": "p"}}, "unknown measured output 'p'"),
             ({"trajectories": []}, "at least one trajectory"),
             ({"clustered": True}, "more trajectories than parameters"),
-            ({"time_step": 0.0}, "time_step must be positive"),
+            ({"time_step": 0.0}, "time_step"),
         ],
     )
     def test_mistakes(self, arguments, match):
@@ -323,6 +324,14 @@ class TestOutputError:
         fixed = {"v_c": -1.0}
         with pytest.raises(fmugym.SimulationError, match="v_c must be positive"):
             fit_parameters(PENDULUM, {"b": 1e-3}, noisy(0, 1.0), fixed=fixed)
+
+
+def test_odd_arguments_raise_nothing_but_our_own_errors(same_working_directory):
+    """A short form of ``python tests/fuzz_identification.py``."""
+    counts, failures = fuzz_identification.run(400, seed="tests")
+    assert failures == []
+    assert sum(counts.values()) == 400
+    assert min(counts["accepted"], counts["refused"]) > 10
 
 
 class TestTrajectory:

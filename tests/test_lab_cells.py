@@ -8,7 +8,7 @@ from lab_tools import TOKEN, experiment, track
 from scipy.integrate import solve_ivp
 
 from fmugym import ConfigError
-from fmugym.lab import HARDWARE, IDEAL, CellType, Client, Lab, ManualClock
+from fmugym.lab import HARDWARE, IDEAL, CellType, Client, Lab, LabError, ManualClock
 
 WEIGHT = 0.06 * 9.81 * 0.1  # N m
 INERTIA = 0.06 * 0.1**2  # kg m^2
@@ -84,11 +84,15 @@ class TestMotion:
         assert swing == pytest.approx(0.01 * np.cos(np.sqrt(9.81 / 0.4) * times), abs=1e-5)
 
     def test_unknown_parameter(self):
-        with (
-            make_lab(parameters={CellType.SINGLE: {"mass": 1.0}}) as lab,
-            pytest.raises(ConfigError, match="mass"),
-        ):
-            experiment(lab)
+        with pytest.raises(ConfigError, match="mass"):
+            make_lab(parameters={CellType.SINGLE: {"mass": 1.0}})
+
+    def test_parameters_that_the_plant_refuses(self):
+        with make_lab(parameters={CellType.SINGLE: {"m": -1.0}}) as lab:
+            with pytest.raises(LabError, match="m, l and v_c must be positive"):
+                experiment(lab, cell_id=101)
+            assert experiment(lab, "Acrobot")
+            assert lab.clock.time() == 0.0
 
 
 class TestDrive:

@@ -103,6 +103,27 @@ class TestVideo:
         assert all(len(frames_of(path)[1]) == 3 for path in paths)
 
 
+class TestUnusableFolder:
+    def test_is_refused_at_the_start_and_costs_nothing(self, tmp_path):
+        (tmp_path / "file").touch()
+        with Lab("ideal", clock=ManualClock(), video_folder=tmp_path / "file" / "x") as lab:
+            with pytest.raises(LabError, match="no video can be written"):
+                experiment(lab, record=True)
+            assert Client(lab).get_user_info(TOKEN).number_of_attempts == 1000
+            experiment(lab)
+
+    def test_that_vanishes_does_not_keep_the_session(self, tmp_path):
+        folder = tmp_path / "videos"
+        with Lab("ideal", clock=ManualClock(), video_folder=folder) as lab:
+            client, token = experiment(lab, record=True, cell_id=101)
+            folder.rmdir()
+            folder.touch()
+            with pytest.raises(LabError, match="no video can be written"):
+                client.stop_experiment(token)
+            experiment(lab, cell_id=101)
+            assert lab.clock.time() == 0.0
+
+
 class TestWithoutFFmpeg:
     def test_is_a_gif(self, lab, no_ffmpeg):
         path = swing(lab, 1.0)

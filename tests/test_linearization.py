@@ -11,8 +11,9 @@ from pythonfmu.builder import FmuBuilder
 from scipy.linalg import expm
 
 import fmugym
-from fmugym.bundled import BUNDLED
-from fmugym.pool import PoolSpec, make_pool
+from fmugym.archive.bundled import BUNDLED
+from fmugym.pool import PoolSpec
+from fmugym.trial.opening import make_pool
 
 M, L, B, G, V_C = 0.06, 0.1, 4e-4, 9.81, 0.05  # of the bundled pendulum
 with_derivatives = pytest.mark.parametrize(

@@ -14,11 +14,11 @@ from test_native_threads import run_python
 import fmugym
 from fmugym import FMU, bundled_fmu
 from fmugym import pool as pools
-from fmugym.adapters import Status
 from fmugym.envs import CartPoleEnv
+from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.health import no_counts
-from fmugym.vector.trace import OPERATIONS
+from fmugym.vector.hooks.program import OPERATIONS
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():

@@ -18,9 +18,12 @@ import pytest
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
-from fmugym.adapters import Status
-from fmugym.bundled import BUNDLED, FMI_VERSIONS
-from fmugym.pool import PoolSpec, PythonPool, isolation
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.fmi.status import Status
+from fmugym.pool import PoolSpec, PythonPool
+from fmugym.trial import opening
+from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.trial import Candidate
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():
@@ -535,23 +538,18 @@ class TestInitialStates:
             assert not outputs.any()
             pool.step()
 
-    def test_are_restored_where_it_helps(self, native):
-        pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 3)
+    def test_are_restored_where_that_is_asked_for(self, native):
+        pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 3, reset_method="restore")
         self.resets(pool)
         assert pool.uses_states
 
-    def test_not_where_restoring_is_slower(self, native, busy):
-        pool = native(busy, ["work"], ["steps"], 3)
-        self.resets(pool, restore_work=200)
-        assert not pool.uses_states
-
-    def test_not_where_restoring_is_wrong(self, native, busy):
-        pool = native(busy, ["work"], ["offset"], 3)
-        self.resets(pool, drift=1)
+    def test_not_otherwise(self, native):
+        pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 3)
+        self.resets(pool)
         assert not pool.uses_states
 
     def test_not_in_fmi_1(self, native):
-        pool = native(bundled_fmu("CartPole", "1.0"), ["f"], ["x"], 3)
+        pool = native(bundled_fmu("CartPole", "1.0"), ["f"], ["x"], 3, reset_method="restore")
         self.resets(pool)
         assert not pool.uses_states
 
@@ -599,8 +597,8 @@ class TestIsolation:
         assert pool.reset((), np.zeros((0, 2)))[0].tolist() == [[1, 1]]
 
     def test_probe_finds_shared_globals(self, shared, busy, temp_root):
-        assert isolation.shares_globals(FMU(shared))
-        assert not isolation.shares_globals(FMU(busy))
+        assert disturb_in_turn(Candidate.of(FMU(shared)))
+        assert not disturb_in_turn(Candidate.of(FMU(busy)))
         assert list(temp_root.iterdir()) == []
 
     def test_vector_environments_give_private_libraries_by_themselves(self, shared, caplog):
@@ -628,14 +626,14 @@ class TestIsolation:
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):
-        assert not isolation.shares_globals(FMU(bundled_fmu(model, version)))
+        assert not disturb_in_turn(Candidate.of(FMU(bundled_fmu(model, version))))
 
     def test_probe_writes_all_types_of_inputs(self, probe):
         fmu = FMU(probe(3))
         outputs = tuple(map(fmu.variable, ("mix", "sum", "n_out", "on_out", "mode_out")))
         inputs = tuple(map(fmu.variable, ("a", "n", "on", "mode", "free")))
-        assert not isolation.shares_globals(fmu, PoolSpec(inputs, outputs, 0.1))
-        assert isolation.shares_globals(fmu)  # it counts its instances
+        assert not disturb_in_turn(Candidate.of(fmu), PoolSpec(inputs, outputs, 0.1))
+        assert disturb_in_turn(Candidate.of(fmu))  # it counts its instances
 
 
 # Memory
@@ -709,6 +707,6 @@ def test_pools_live_and_die_apart(temp_root):
 
 def test_auto_takes_the_native_pool(probe):
     fmu = FMU(probe())
-    pool = pools.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG)
+    pool = opening.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG)
     assert isinstance(pool, NativePool)
     pool.close()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fmugym.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 
 ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(
@@ -28,7 +28,7 @@ import json
 import gymnasium
 
 import fmugym
-from fmugym.bundled import FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 
 steps = []
 for env_id in sorted(name for name in gymnasium.registry if name.startswith("fmugym/")):

@@ -17,7 +17,7 @@ from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config
 
 import fmugym
 from fmugym import ConfigError, Uniform
-from fmugym.bundled import FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 
 every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 
@@ -127,8 +127,8 @@ class TestFMUGym:
 
         for owner, name in [
             (zipfile, "ZipFile"),
-            (fmugym.adapters, "Library"),
-            (fmugym.adapters.Library, "instantiate"),
+            (fmugym.pool.python, "Library"),
+            (fmugym.fmi.library.Library, "instantiate"),
         ]:
             monkeypatch.setattr(owner, name, refuse)
         folder = env.fmu.extract()
@@ -220,7 +220,7 @@ class TestModelicaGym:
             _one_step(env)
 
     def test_logger_levels_of_others_stay(self, probe):
-        names = (None, "fmugym", "gymnasium", "fmpy", "fmugym.archive")
+        names = (None, "fmugym", "gymnasium", "fmpy", "fmugym.archive.fmu")
         before = [logging.getLogger(name).level for name in names]
         env = PlainEnv(probe(2), probe_config(), logging.DEBUG)
         assert env.logger.level == logging.DEBUG

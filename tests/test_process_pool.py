@@ -19,19 +19,29 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from process_tools import FaultyEnv, faulty_fmu, start_values
+from process_tools import (
+    INTERRUPTIBLE,
+    FaultyEnv,
+    faulty_fmu,
+    no_descriptors_left,
+    processes_with,
+    start_values,
+)
+from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
-from fmugym.adapters import Status
+from fmugym.archive.temporary import make_folder, sweep
+from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.block_worker import BlockWorker
-from fmugym.pool.channel import Channel
-from fmugym.pool.launcher import _fork_server, _SpawnedProcess
-from fmugym.pool.process import ProcessPool
-from fmugym.pool.shared_memory import Memory
-from fmugym.temporary import make_folder, sweep
+from fmugym.pool.process import launcher
+from fmugym.pool.process.channel import Channel
+from fmugym.pool.process.launcher import _fork_server, _SpawnedProcess
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.shared_memory import Memory
+from fmugym.pool.process.worker import BlockWorker
+from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
 HERE = Path(__file__).parent
@@ -88,7 +98,7 @@ def fixture_make_pool(faulty, opened):
         outputs = tuple(map(fmu.variable, ["y", "fault"]))
         spec = PoolSpec((fmu.variable("u"),), outputs, time_step=0.5, num_observed=1)
         options = {"isolation": "process", "workers": 2, "call_timeout": 20.0} | options
-        return opened(pools.make_pool(fmu, spec, num_instances, LOG, **options))
+        return opened(opening.make_pool(fmu, spec, num_instances, LOG, **options))
 
     return make
 
@@ -252,10 +262,189 @@ class TestVector:
         ends = [env.step(np.ones((3, 1)))[3].tolist() for _ in range(9)]
         assert ends == [[False] * 3, [True, True, False], [False] * 3] * 3
 
-    def test_from_make_vec(self, opened):
+    @linux_only
+    def test_from_make_vec(self, opened, temp_root):
         options = {"isolation": "process", "workers": 3}
-        env = opened(gymnasium.make_vec("fmugym/CartPole-v0", num_envs=5, **options))
-        assert len(env.unwrapped._prototype._pool.processes()) == 3
+        opened(gymnasium.make_vec("fmugym/CartPole-v0", num_envs=5, **options))
+        assert len(processes_with(temp_root)) == 3
+
+
+@linux_only
+class TestForks:
+    """An FMU that forks: the new process has all that the worker has, its connection too."""
+
+    @pytest.fixture(name="make")
+    def fixture_make(self, tmp_path, opened):
+        def make(fault, **config):
+            config = {"isolation": "process", "call_timeout": 60.0} | config
+            return opened(
+                ZooEnv(zoo_fmu(tmp_path, 2), model_parameters=parameters(fault), **config)
+            )
+
+        return make
+
+    def test_a_death_is_noticed_at_once(self, make, temp_root):
+        env = make("fork_and_crash")
+        env.reset()
+        env.step([1.0])
+        begin = time.monotonic()
+        truncated, info = env.step([1.0])[3:]
+        assert time.monotonic() - begin < 10.0
+        assert truncated
+        assert "ended with signal SIGSEGV in a step" in info["fault"]
+        env.reset()
+        assert len(processes_with(temp_root)) == 1
+        env.close()
+        assert processes_with(temp_root) == []
+
+    def test_a_death_between_two_calls(self, make):
+        env = make("fork")
+        env.reset()
+        for _ in range(2):
+            assert not env.step([1.0])[3]
+        os.kill(env._pool.processes()[0], signal.SIGKILL)
+        assert "SIGKILL" in env.step([1.0])[4]["fault"]
+
+    @pytest.mark.parametrize("fault", ["fork", "fork_and_loop"])
+    def test_no_process_is_left(self, make, temp_root, fault):
+        env = make(fault, call_timeout=0.7 if fault == "fork_and_loop" else 60.0)
+        env.reset()
+        fine = [not env.step([1.0])[3] for _ in range(2)]
+        assert fine == [True, fault == "fork"]
+        if fault == "fork":
+            assert len(processes_with(temp_root)) == 2
+        env.close()
+        assert processes_with(temp_root) == []
+
+    def test_a_twin_does_not_take_part(self, make, temp_root):
+        """Its function returns in both processes."""
+        env = make("fork_a_twin")
+        for _ in range(3):
+            env.reset()
+            assert [env.step([1.0])[0].item() for _ in range(4)] == [0.5, 1.0, 1.5, 2.0]
+        wait_until(lambda: len(processes_with(temp_root)) == 1)
+
+    def test_a_killed_parent_leaves_none(self, tmp_path, temp_root):
+        zoo_fmu(tmp_path, 2)
+        program = subprocess.Popen(
+            [sys.executable, "-c", FORKING_PROGRAM, tmp_path / "Zoo.fmu"],
+            env=os.environ | {"PYTHONPATH": str(HERE)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        with program:
+            assert program.stdout.readline() == "ready\n"
+            assert len(processes_with(temp_root)) == 2
+            program.kill()
+        wait_until(lambda: not processes_with(temp_root))
+
+
+@posix_only
+class TestShortages:
+    """What the system refuses is blamed on the system; other workers' episodes go on."""
+
+    def test_a_worker_that_dies_when_no_descriptor_is_left(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        with no_descriptors_left():
+            assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+            assert "SIGSEGV in a step" in pool.failure(0)
+            assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+            set_up(pool, faulty, ["none"] * 2, np.array([True, False]))
+            outputs, statuses = step(pool)
+        assert statuses.tolist() == [Status.FATAL, Status.OK]
+        assert outputs[0].tolist() == [0.0, 1.5]
+        assert "Too many open files" in pool.failure(0)
+        set_up(pool, faulty, ["none"] * 2)
+        assert step(pool)[1].tolist() == [Status.OK] * 2
+
+    @pytest.mark.parametrize("left", range(5))
+    def test_a_pool_without_descriptors(self, make_pool, left):
+        make_pool().close()  # the fork server is there
+        with no_descriptors_left(left), pytest.raises(FMULoadError, match="Too many open files"):
+            make_pool(3, workers=3)
+
+    def test_no_process_can_be_forked(self, make_pool, faulty, monkeypatch):
+        """The fork server lives on, and so do its other workers."""
+        popen = subprocess.Popen
+        monkeypatch.setattr(
+            subprocess,
+            "Popen",
+            lambda args, **options: popen([*args[:2], FORKS_BUT_THE_THIRD + args[2]], **options),
+        )
+        launcher._cached_fork_server.cache_clear()
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+        assert "SIGSEGV" in pool.failure(0)
+        assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+        set_up(pool, faulty, ["none"] * 2, np.array([True, False]))
+        outputs, statuses = step(pool)
+        assert statuses.tolist() == [Status.OK] * 2
+        assert outputs[0].tolist() == [0.5, 1.5]
+        pool.close()
+        launcher._cached_fork_server.cache_clear()
+
+    def test_no_temporary_folder(self, make_pool, monkeypatch, tmp_path):
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+        with pytest.raises(FMULoadError, match=r"no temporary folder can be made: .*missing"):
+            make_pool()
+
+    def test_a_full_temporary_folder(self, make_pool):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+        try:
+            with pytest.raises(FMULoadError, match=r"Faulty.fmu cannot be extracted: .*large"):
+                make_pool()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+class TestOptions:
+    @pytest.mark.parametrize("value", [0, 0.0, -1, np.nan, np.inf, "5", [1.0], 10**400, 1j])
+    def test_call_timeouts_that_are_none(self, make_pool, value):
+        with pytest.raises(ConfigError, match="call_timeout must be"):
+            make_pool(call_timeout=value)
+
+    @pytest.mark.parametrize("name", ["workers", "threads"])
+    @pytest.mark.parametrize("value", [0, -1, 1.5, "2", True])
+    def test_numbers_of_workers_and_threads_that_are_none(self, make_pool, name, value):
+        with pytest.raises(ConfigError, match=f"{name} must be a positive integer, got"):
+            make_pool(**{name: value})
+
+    @pytest.mark.parametrize("value", [1e9, 1e308, 10**12, np.float32(50.0), None])
+    def test_long_call_timeouts(self, make_pool, faulty, value):
+        """They wait that long: the slow answer comes after the first look."""
+        pool = make_pool(call_timeout=value)
+        set_up(pool, faulty, ["pause"], at=1)
+        assert step(pool)[1].tolist() == [Status.OK]
+        with contextlib.closing(pool):
+            os.kill(pool.processes()[0], signal.SIGKILL)
+            assert step(pool)[1].tolist() == [Status.FATAL]
+
+
+FORKS_BUT_THE_THIRD = """
+import errno, itertools, os
+def limited(fork=os.fork, count=itertools.count(1)):
+    if next(count) == 3:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+    return fork()
+os.fork = limited
+"""
+
+
+FORKING_PROGRAM = """
+import sys, time, zoo_tools
+env = zoo_tools.ZooEnv(
+    sys.argv[1], model_parameters=zoo_tools.parameters("fork", at=1), isolation="process"
+)
+env.reset()
+env.step([1.0])
+print("ready", flush=True)
+time.sleep(60)
+"""
 
 
 class TestPool:
@@ -373,7 +562,8 @@ class TestPool:
 
     def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
         monkeypatch.setattr(
-            "fmugym.pool.supervisor.launch", lambda end, memory, _: _SpawnedProcess(end, memory)
+            "fmugym.pool.process.supervisor.launch",
+            lambda end, memory, _: _SpawnedProcess(end, memory),
         )
         pool = make_pool()
         set_up(pool, faulty, ["crash"], at=2)
@@ -399,7 +589,7 @@ class TestPool:
 class WorkerThread:
     """A worker in this process, which shows what it does to those who look at this process only."""
 
-    pid = 0
+    pid, sentinel = 0, None
 
     def __init__(self, end, memory, folder):
         self._end, self._memory = end.dup(), Memory(memory.size, os.dup(memory.descriptor))
@@ -411,18 +601,21 @@ class WorkerThread:
         with contextlib.suppress(OSError):
             self._end.shutdown(socket.SHUT_RDWR)
 
-    def exit_status(self):
+    def exit_status(self, patience):
         self._thread.join()
         self._end.close()
         self._memory.close()
         return 0
+
+    def forget(self):
+        pass
 
 
 @posix_only
 @pytest.mark.parametrize("backend", ["auto", "python"])
 def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, backend):
     here = make_pool(3, isolation="none")
-    monkeypatch.setattr("fmugym.pool.supervisor.launch", WorkerThread)
+    monkeypatch.setattr("fmugym.pool.process.supervisor.launch", WorkerThread)
     pool = make_pool(3, backend=backend)
     with pytest.raises(SimulationError):
         pool.save()  # before the first reset
@@ -452,7 +645,7 @@ class TestChoice:
         pool = make_pool(3, path, isolation=None, workers=None)
         assert isinstance(pool, ProcessPool)
         assert len(pool.processes()) == 3
-        assert "each gets a process of its own" in caplog.text
+        assert "each gets a process" in caplog.text
 
     def test_by_its_own_word(self, make_pool, tmp_path):
         flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
@@ -470,13 +663,17 @@ class TestChoice:
 PROGRAM = """
 import os, signal, sys, time
 import process_tools
-from fmugym.pool.launcher import _fork_server
+from fmugym.pool.process.launcher import _fork_server
 
 env = process_tools.FaultyEnv(sys.argv[1])
 env.reset()
 env.step([1.0])
 print(*env._pool.processes(), _fork_server().pid, flush=True)
 """
+
+
+def program_that_ends(end):
+    return INTERRUPTIBLE + PROGRAM + textwrap.dedent(end)
 
 
 class TestEndOfParent:
@@ -488,7 +685,7 @@ class TestEndOfParent:
         def start(end):
             path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
             program = subprocess.Popen(
-                [sys.executable, "-W", "error", "-c", PROGRAM + textwrap.dedent(end), faulty],
+                [sys.executable, "-W", "error", "-c", program_that_ends(end), faulty],
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,

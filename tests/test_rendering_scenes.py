@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 
+import fuzz_rendering
 import numpy as np
 import pygame
 import pytest
@@ -429,3 +430,21 @@ class TestWindow:
         first.render(UPRIGHT)
         open_window().render(UPRIGHT)
         assert pygame.display.get_surface() is not None
+
+
+def test_odd_arguments_raise_nothing_but_our_own_errors():
+    """A short form of ``python tests/fuzz_rendering.py``."""
+    counts, failures = fuzz_rendering.run(800, seed="tests")
+    assert failures == []
+    assert sum(counts.values()) == 800
+    assert min(counts["accepted"], counts["refused"]) > 20
+
+
+def test_a_window_without_a_display_says_so_each_time(monkeypatch):
+    pygame.display.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no such driver")
+    renderer = Renderer(PendulumScene(1.0), render_mode="human")
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="needs a display"):
+            renderer.render(PendulumFrame(0.0))
+    renderer.close()

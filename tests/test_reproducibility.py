@@ -11,9 +11,9 @@ from pythonfmu.builder import FmuBuilder
 from test_foreign_fmu import TankEnv
 
 import fmugym
-from fmugym.bundled import FMI_VERSIONS
-from fmugym.env import request_pool
+from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.envs import CartPoleEnv, PendulumEnv
+from fmugym.task.opening import request_pool
 
 NUM_ENVS = 3
 STEPS = 60

@@ -1,5 +1,7 @@
 """The bundled FMUs: rebuilt, validated, and their states and derivatives tried through FMPy."""
 
+import graphlib
+import re
 import sys
 import zipfile
 from pathlib import Path
@@ -12,7 +14,7 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
 import fmugym
-from fmugym.bundled import BUNDLED, FMI_VERSIONS, MODELS, bundled_fmu
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, bundled_fmu
 
 ROOT = Path(__file__).parents[1]
 STATES = {
@@ -51,6 +53,28 @@ def test_linux_libraries_are_rebuilt_byte_for_byte(model, version, tmp_path, mon
     with zipfile.ZipFile(bundled_fmu(model, version)) as archive:
         committed = archive.read(f"binaries/{folder}/{model}.so")
     assert library.read_bytes() == committed
+
+
+def test_c_sources_form_no_circle():
+    """A source includes the headers of all that it calls, and none of these leads back to it."""
+    folder = ROOT / "resources" / "src"
+    includes, defines = {}, {}
+    for path in [*folder.glob("*.c"), *folder.glob("*.h")]:
+        if path.name == "fmu.c":  # joins all sources
+            continue
+        text = path.read_text()
+        includes.setdefault(path.stem, set()).update(re.findall(r'#include "(\w+)\.h"', text))
+        if path.suffix == ".c":
+            names = re.findall(r"^(?!static)(?:\w+ )+\*?(\w+)\([^;]*?\) {$", text, re.M)
+            defines[path.stem] = set(names)
+    assert "report" in defines["log"]
+    needs = {name: found & includes.keys() - {name} for name, found in includes.items()}
+    for caller in defines:
+        text = (folder / f"{caller}.c").read_text()
+        for other in defines.keys() - {caller}:
+            if any(re.search(rf"\b{name}\(", text) for name in defines[other] - {"emit_message"}):
+                assert other in needs[caller], f"{caller}.c calls functions of {other}.c"
+    graphlib.TopologicalSorter(needs).prepare()  # raises CycleError
 
 
 @pytest.mark.parametrize(("model", "version"), BUNDLED)

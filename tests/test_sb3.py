@@ -504,3 +504,15 @@ def test_the_examples_policies_score_the_same_on_both_sides(quick):
         _, on_fmu, on_gymnasium, _, same, *_ = (cell.strip() for cell in row.strip("│").split("│"))
         assert on_fmu == on_gymnasium
         assert same == "20/20"
+
+
+@pytest.mark.parametrize("env", [None, 3, "nothing/Nothing-v0", "no_module:No-v0", "a b"])
+def test_environments_that_do_not_exist(env):
+    with pytest.raises(ConfigError):
+        make_sb3_env(env)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "1", True])
+def test_seeds_that_do_not_fit(seed):
+    with pytest.raises(ConfigError, match="seed"):
+        make_sb3_env(CartPoleEnv, 2, seed=seed)

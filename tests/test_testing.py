@@ -83,7 +83,7 @@ class Infinite(Sound):
         (TooNarrow, "is not in Box"),
         (SameArray, "returns the same array again|reset does not|differ"),
         (Failing, "a step with a sampled action failed: .* returned Discard"),
-        (Infinite, "a reward is inf"),
+        (Infinite, "_reward_policy returned inf"),
     ],
 )
 def test_a_broken_environment_is_found(env_class, text):

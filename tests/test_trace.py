@@ -7,7 +7,8 @@ import pytest
 import fmugym
 from fmugym import ConfigError, Uniform
 from fmugym.pool import has_native_pool
-from fmugym.vector.trace import MOST_INSTRUCTIONS, UntraceableError, trace_hooks
+from fmugym.vector.hooks.program import MOST_INSTRUCTIONS, UntraceableError
+from fmugym.vector.hooks.trace import trace_hooks
 
 needs_native = pytest.mark.skipif(
     not has_native_pool(), reason="the C extension was not built: no compiler at install"

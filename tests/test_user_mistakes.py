@@ -96,11 +96,83 @@ def test_no_config(probe):
 
 
 def test_unknown_render_mode(probe, temp_root):
-    with pytest.raises(ConfigError, match="unknown render mode 'human'; known are: none"):
-        PlainEnv(probe(2), probe_config(), render_mode="human")
     with pytest.raises(ConfigError, match="'rgb_aray'; did you mean 'rgb_array'"):
         fmugym.envs.CartPoleEnv(render_mode="rgb_aray")
+    with pytest.raises(ConfigError, match="render mode 3; known are: none"):
+        PlainEnv(probe(2), probe_config(), render_mode=3)
     assert list(temp_root.iterdir()) == []
+
+
+@pytest.mark.parametrize("mode", ["human", "rgb_array", "rgb_array_list"])
+def test_a_render_mode_that_the_class_does_not_have(make_env, mode):
+    """As in Gymnasium a warning; libraries ask for pictures of any environment."""
+    with pytest.warns(UserWarning, match=f"PlainEnv has no render_mode '{mode}'"):
+        env = make_env(render_mode=mode)
+    assert env.render_mode is None
+    env.reset()
+    env.step(0.0)
+
+
+def test_make_asks_for_pictures_of_a_class_without_render_modes(probe):
+    """What Stable-Baselines3's make_vec_env does first; on a TypeError it goes without."""
+
+    class Modest(PlainEnv):
+        def __init__(self, render_mode=None):
+            super().__init__(probe(2), probe_config(), render_mode=render_mode)
+
+    fmugym.register("tests/Modest-v0", Modest)
+    with pytest.warns(UserWarning, match="rgb_array"):
+        env = gymnasium.make("tests/Modest-v0", render_mode="rgb_array")
+    env.reset()
+    env.close()
+    del gymnasium.registry["tests/Modest-v0"]
+
+
+@pytest.mark.parametrize(
+    ("make", "names"),
+    [
+        (lambda: fmugym.envs.CartPoleEnv(isolatoin="none"), ["'isolatoin'", "'isolation'"]),
+        (lambda: gymnasium.make("fmugym/Pendulum-v0", graviti=1.0), ["'graviti'"]),
+        (lambda: PlainEnv("x.fmu", {}, rendermode="human"), ["'rendermode'", "'render_mode'"]),
+    ],
+)
+def test_unknown_arguments_are_type_errors_of_the_family(make, names):
+    with pytest.raises(TypeError) as caught:
+        make()
+    assert isinstance(caught.value, fmugym.ConfigError)
+    assert all(name in str(caught.value) for name in names)
+    assert isinstance(pickle.loads(pickle.dumps(caught.value)), TypeError)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.0, 0.5, "1", True, [1], np.ones(2), np.array([1]), 1j, {}])
+def test_seeds_that_are_none(make_env, seed):
+    env, twin = make_env(), make_env()
+    env.reset(seed=5)
+    twin.reset(seed=5)
+    env.step(0.5)
+    with pytest.raises(ConfigError, match="seed must be an integer of at least 0"):
+        env.reset(seed=seed)
+    assert env.step_count == 1  # the episode goes on, and so does the generator
+    env.step(0.5)
+    assert env.np_random.random() == twin.np_random.random()
+
+
+@pytest.mark.parametrize("seed", [0, 7, 2**40, np.int64(7), np.uint8(7), np.array(7)])
+def test_seeds_of_any_type_of_integers(make_env, seed):
+    env = make_env()
+    env.reset(seed=seed)
+    assert env.np_random_seed == int(seed)
+    assert env.np_random.random() == np.random.default_rng(int(seed)).random()
+
+
+def test_a_refused_option_leaves_the_generator_alone(make_env):
+    env, twin = make_env(), make_env()
+    env.reset(seed=5)
+    twin.reset(seed=5)
+    with pytest.raises(ConfigError):
+        env.reset(seed=6, options={"parameters": {}})
+    assert env.np_random_seed == 5
+    assert env.np_random.random() == twin.np_random.random()
 
 
 @pytest.mark.parametrize(
@@ -186,10 +258,10 @@ class TestActions:
     @pytest.mark.parametrize(
         ("names", "action", "match"),
         [
-            ("a", math.nan, "makes a = nan; every input must be finite"),
+            ("a", math.nan, "action nan .* finite"),
             ("a", [math.inf], "makes a = inf; every input must be finite"),
             (["a", "b"], [0.0, -math.inf], r"makes a = 0\.0, b = -inf; every input must be finite"),
-            (["a", "on"], [0.0, math.nan], "on = nan; every input must be finite"),
+            (["a", "on"], [0.0, math.nan], r"action \[0\.0, nan\] .* finite"),
             ("a", [0.0, 0.0], r"makes 2 values, expected 1, one for each input \(a\)"),
             (["b", "a"], [0.0], r"makes 1 values, expected 2, one for each input \(b, a\)"),
             (["b", "a"], 0.0, "makes 1 values, expected 2"),

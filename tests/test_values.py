@@ -1,12 +1,14 @@
 """Reading outputs and writing episode variables by name."""
 
 import copy
+import json
 import pickle
+from collections.abc import Mapping
 
 import pytest
 
 from fmugym import ConfigError
-from fmugym.values import EpisodeVariables, LateDict, NamedValues
+from fmugym.task.values import EpisodeVariables, LateDict, NamedValues
 
 
 class TestNamedValues:
@@ -19,6 +21,17 @@ class TestNamedValues:
         assert list(named) == ["x", "y"]
         assert len(named) == 2
         assert repr(named) == "NamedValues({'x': 1.0, 'y': 3.0})"
+
+    def test_it_is_a_mapping(self):
+        named = NamedValues("output", ["x", "y"], lambda: (1.0, 2.0))
+        assert isinstance(named, Mapping)
+        assert (named.get("y"), named.get("z"), named.get("z", 3.0)) == (2.0, None, 3.0)
+        assert list(named.items()) == [("x", 1.0), ("y", 2.0)]
+        assert list(named.values()) == [1.0, 2.0]
+        assert named.keys() == {"x", "y"}
+        assert named.keys() & {"y", "z"} == {"y"}
+        assert ("x" in named, "z" in named, [] in named) == (True, False, False)
+        assert named == {"x": 1.0, "y": 2.0}
 
     def test_unknown_name(self):
         named = NamedValues("output", ["theta"], lambda: [0.0])
@@ -83,50 +96,111 @@ class TestEpisodeVariables:
         assert clone(variables) == {"target": 1.0, "integral": 0.0}
 
 
+LOOKS = {
+    "__contains__": lambda d: ("a" in d, "z" in d),
+    "__delitem__": lambda d: d.__delitem__("a"),
+    "__eq__": lambda d: (d == {"a": 1, "b": 2}, d == {"a": 1, "b": 2}, d == {}, d == {}),
+    "__ge__": lambda d: d.keys() >= {"a"},
+    "__getitem__": lambda d: d["a"],
+    "__gt__": lambda d: d.keys() > {"a"},
+    "__ior__": lambda d: d.__ior__({"c": 3}),
+    "__iter__": list,
+    "__le__": lambda d: d.keys() <= {"a"},
+    "__len__": lambda d: (len(d), bool(d)),
+    "__lt__": lambda d: d.keys() < {"a"},
+    "__ne__": lambda d: (d != {"a": 1, "b": 2}, d != {"a": 1, "b": 2}, d != {}, d != {}),
+    "__or__": lambda d: d | {"a": 9, "c": 3},
+    "__repr__": lambda d: (repr(d), str(d), f"{d}"),
+    "__reversed__": lambda d: list(reversed(d)),
+    "__ror__": lambda d: {"a": 9, "c": 3} | d,
+    "__setitem__": lambda d: d.__setitem__("c", 3),
+    "__sizeof__": lambda d: d.__sizeof__() > 0,
+    "clear": lambda d: d.clear(),
+    "copy": lambda d: d.copy(),
+    "get": lambda d: (d.get("a"), d.get("z"), d.get("z", 5)),
+    "items": lambda d: list(d.items()),
+    "keys": lambda d: list(d.keys()),
+    "pop": lambda d: (d.pop("a"), d.pop("z", 7)),
+    "popitem": lambda d: d.popitem(),
+    "setdefault": lambda d: (d.setdefault("a", 7), d.setdefault("z", 8)),
+    "update": lambda d: (d.update({"a": 5}, z=7), d.update([("y", 1)])),
+    "values": lambda d: list(d.values()),
+}
+"""A use of each method of ``dict`` that depends on its items."""
+
+FUNCTIONS = [
+    dict,
+    list,
+    set,
+    sorted,
+    len,
+    lambda d: {**d},
+    lambda d: (lambda **items: items)(**d),
+    lambda d: {"a": 9, **d},
+    lambda d: {"a": 9}.__or__(d),
+    lambda d: plain_after(lambda plain: plain.update(d)),
+    lambda d: plain_after(lambda plain: plain.__ior__(d)),
+    json.dumps,
+    lambda d: json.dumps(d, indent=1),
+    lambda d: json.dumps({"drawn": d}),
+    lambda d: pickle.loads(pickle.dumps(d)),
+    lambda d: pickle.loads(pickle.dumps(d, protocol=2)),
+    copy.copy,
+    copy.deepcopy,
+    lambda d: "{a}".format(**d),
+    lambda d: "{a}".format_map(d),
+    lambda d: d == d.copy(),
+]
+
+
+def plain_after(change):
+    plain = {"a": 9, "c": 3}
+    change(plain)
+    return plain
+
+
+def outcome(function, values):
+    """What a function returns, or the type of what it raises, and the items afterwards."""
+    try:
+        result = function(values)
+    except Exception as error:
+        result = type(error)
+    return result, dict(values)
+
+
 class TestLateDict:
     def make(self):
         self.calls = 0
 
-        def fill():
+        def fill(offset):
             self.calls += 1
-            return {"a": 1, "b": 2}
+            return {"a": 1 + offset, "b": 2}
 
-        return LateDict.of(fill)
+        return LateDict.of(fill, 0)
 
-    @pytest.mark.parametrize(
-        "look",
-        [
-            lambda d: d["a"],
-            lambda d: "a" in d,
-            list,
-            len,
-            dict,
-            lambda d: {**d},
-            lambda d: d.get("a"),
-            lambda d: list(d.items()),
-            lambda d: list(d.values()),
-            lambda d: list(d.keys()),
-            lambda d: d.copy(),
-            lambda d: d == {},
-            repr,
-            pickle.dumps,
-            copy.deepcopy,
-        ],
-    )
-    def test_is_filled_once_by_any_look(self, look):
-        late = self.make()
+    def test_every_method_of_dict_is_tried(self):
+        others = {
+            *("__class_getitem__", "__doc__", "__getattribute__", "__hash__", "__init__"),
+            *("__new__", "fromkeys"),
+        }
+        assert set(vars(dict)) - others == set(LOOKS)
+
+    @pytest.mark.parametrize("function", [*LOOKS.values(), *FUNCTIONS])
+    def test_is_like_a_plain_dict(self, function):
+        late, plain = self.make(), {"a": 1, "b": 2}
         assert isinstance(late, dict)
         assert self.calls == 0
-        look(late)
-        look(late)
+        assert outcome(function, late) == outcome(function, plain)
+        assert outcome(function, late) == outcome(function, plain)  # now that it is filled
         assert self.calls == 1
-        assert late == {"a": 1, "b": 2}
 
-    def test_is_like_a_plain_dict(self):
-        late = self.make()
-        late["c"] = 3
-        del late["a"]
-        assert dict(late) == {"b": 2, "c": 3}
-        assert pickle.loads(pickle.dumps(late)) == {"b": 2, "c": 3}
-        assert repr(late) == "{'b': 2, 'c': 3}"
-        assert late | {"d": 4} == {"b": 2, "c": 3, "d": 4}
+    @pytest.mark.parametrize(
+        "together",
+        [lambda a, b: a == b, lambda a, b: a | b, lambda a, b: a.__ior__(b), lambda a, b: a != b],
+    )
+    def test_two_of_them(self, together):
+        assert together(self.make(), self.make()) == together({"a": 1, "b": 2}, {"a": 1, "b": 2})
+
+    def test_cannot_be_hashed(self):
+        with pytest.raises(TypeError):
+            hash(self.make())

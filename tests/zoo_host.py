@@ -4,6 +4,7 @@ It reads cells from standard input, a line of JSON each, and answers each with a
 visited by a fork, which may die or hang; or ``here``, where nothing is to happen to this process.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -14,8 +15,8 @@ from pathlib import Path
 
 import zoo_tools
 
-from fmugym.last_words import describe_exit
 from fmugym.pool import has_native_pool
+from fmugym.pool.process.last_words import describe_exit
 
 
 def main(folder, *modes):
@@ -47,9 +48,12 @@ def visit_in_fork(cell, path):
     path.unlink(missing_ok=True)
     child = os.fork()
     if child == 0:
+        os.setsid()
         visit_and_write(cell, path)
         os._exit(0)
     code = wait(child, cell["patience"])
+    with contextlib.suppress(ProcessLookupError):  # what the FMU has forked
+        os.killpg(child, signal.SIGKILL)
     if code is None:
         return [("hangs", "")], []
     if path.exists():

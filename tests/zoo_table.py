@@ -182,7 +182,7 @@ SPECIMENS = (
     dies("raises SIGFPE, as a division of integers by 0 does", "signal SIGFPE", fault="fpe"),
     dies("raises SIGILL, as an illegal instruction does", "signal SIGILL", fault="ill"),
     dies(
-        "raises SIGBUS, as reading a mapped file that was cut short does",
+        "raises SIGBUS, as reading a truncated mapped file does",
         "signal SIGBUS",
         fault="bus",
     ),
@@ -191,6 +191,18 @@ SPECIMENS = (
     dies("overflows its stack", "signal SIGSEGV", fault="overflow"),
     Specimen("loops for ever", Outcome("hangs"), LATE, fault="loop", versions=(1, 3)),
     Specimen("sleeps for ever", Outcome("hangs"), LATE, fault="sleep", versions=(2,)),
+    dies(
+        "forks a process, which lives on, and crashes",
+        "signal SIGSEGV",
+        fault="fork_and_crash",
+    ),
+    Specimen(
+        "forks a process and loops for ever",
+        Outcome("hangs"),
+        LATE,
+        fault="fork_and_loop",
+        versions=(2,),
+    ),
     Specimen(
         "crashes in a constructor of its library",
         TRIED,
@@ -235,7 +247,7 @@ SPECIMENS = (
     # Statuses
     returns("refuses to be instantiated", Outcome("refused", TOLD.reason), "instantiate"),
     returns(
-        "returns Warning, in any call",
+        "returns Warning in any call",
         TOLD,
         *("enter", "exit", "set", "step", "get", "reset"),
         statuses=(1,),
@@ -244,40 +256,50 @@ SPECIMENS = (
         heals=False,
     ),
     returns(
-        "returns another status than OK and Warning when it is set up",
+        "returns a bad status when it is set up",
         Outcome("reset", "returned"),
         "setup",
         at=0,
         heals=False,
     ),
     returns(
-        "the same when it is initialized",
+        "returns a bad status when it is initialized",
         Outcome("reset", "initialization returned"),
         *("enter", "exit"),
         at=0,
     ),
     returns(
-        "the same when its inputs are set",
+        "returns a bad status when its inputs are set",
         Outcome("truncated", "setting the inputs returned"),
         "set",
         at=1,
     ),
-    returns("the same in a step", Outcome("truncated", "the step at t = 0.5 s returned"), "step"),
     returns(
-        "the same when its outputs are read",
+        "returns a bad status in a step",
+        Outcome("truncated", "the step at t = 0.5 s returned"),
+        "step",
+    ),
+    returns(
+        "returns a bad status when its outputs are read",
         Outcome("truncated", "reading the outputs returned"),
         "get",
     ),
-    returns("the same when it is reset (another instance takes its place)", TOLD, "reset"),
+    returns("returns a bad status when it is reset (a new instance replaces it)", TOLD, "reset"),
     returns(
-        "the same when its state is saved or restored (it is initialized then)",
+        "returns a bad status when its state is saved or restored (it is initialized instead)",
         TOLD,
         *("get_state", "set_state"),
         at=0,
         rounds=4,
         versions=(2, 3),
     ),
-    returns("the same when it is terminated", TOLD, "terminate", statuses=(3, 4, 99), heals=False),
+    returns(
+        "returns a bad status when it is terminated",
+        TOLD,
+        "terminate",
+        statuses=(3, 4, 99),
+        heals=False,
+    ),
     # Values
     same(
         "gives NaN",
@@ -294,7 +316,7 @@ SPECIMENS = (
     same("prints without a newline", Outcome("fine", harm="output"), fault="print_no_newline"),
     same("prints 20,000 lines in a step", Outcome("fine", harm="output"), fault="print_much"),
     same(
-        "logs from a thread of its own",
+        "logs from another thread",
         Outcome("told", "hello from another thread"),
         fault="log_from_thread",
     ),
@@ -314,13 +336,14 @@ SPECIMENS = (
         Outcome("truncated", "in a step"),
         fault="close_others",
     ),
+    same("forks a process, which lives on", FINE, fault="fork"),
     survives("leaks in each step", "memory", fault="leak", at=0, rounds=10),
     survives(
         "leaks in each reset", "memory", fault="leak", calls=("reset",), rounds=10, versions=(1,)
     ),
     # Lies
     Specimen(
-        "allows one instance in a process, but does not say so",
+        "allows one instance in a process, without declaring it",
         FINE,
         FINE,
         vector=APART,
@@ -335,7 +358,7 @@ SPECIMENS = (
         versions=(1,),
     ),
     same(
-        "keeps part of its state out of its FMU state (it is initialized then)",
+        "leaves part of its state out of its FMU state (it is initialized instead)",
         FINE,
         vector=APART,
         token="{zoo share}",
@@ -344,7 +367,7 @@ SPECIMENS = (
         heals=False,
     ),
     same(
-        "says that it can restore its state, and does nothing",
+        "declares that it can restore its state, and does nothing",
         FINE,
         fault="do_nothing",
         calls=("set_state",),

@@ -27,6 +27,7 @@ FAULTS = (
     *("close_standard", "close_others", "status", "not_a_number", "infinite"),
     *("print", "print_no_newline", "print_much", "log_from_thread", "round_up", "flush_denormals"),
     *("change_directory", "change_environment", "leak", "do_nothing"),
+    *("fork", "fork_and_crash", "fork_and_loop", "fork_a_twin"),
 )
 """In the order of the enumerations in ``zoo.h``."""
 
@@ -50,10 +51,14 @@ FINE = ("fine", "")
 # The FMUs
 
 
+def compiler():
+    """The command of a C compiler: the system's, which is faster, or else zig's."""
+    return ["cc"] if shutil.which("cc") else [sys.executable, "-m", "ziglang", "cc"]
+
+
 @functools.cache
 def library(version, *definitions):
     """The compiled library of an FMI version; made once a session, in a tenth of a second."""
-    compiler = ["cc"] if shutil.which("cc") else [sys.executable, "-m", "ziglang", "cc"]
     flags = ["-shared", "-fPIC", "-O1", "-g0", "-Wall", "-Wextra", "-Wno-unused-parameter"]
     macros = [f"-D{name}" for name in (f"FMI_VERSION={version}", *definitions)]
     shim = FOLDER / f"fmi{version}.c"
@@ -61,7 +66,7 @@ def library(version, *definitions):
         path = Path(folder) / f"Zoo{fmpy.sharedLibraryExtension}"
         prefix = "Zoo_fmi" if version == 1 else f"fmi{version}"
         (path.parent / "stubs.h").write_text(fmu_tools.stubs(version, prefix, shim))
-        command = [*compiler, *flags, *macros, f"-I{folder}", '-DSTUBS="stubs.h"']
+        command = [*compiler(), *flags, *macros, f"-I{folder}", '-DSTUBS="stubs.h"']
         command += [FOLDER / "zoo.c", shim, "-o", path, "-lm", "-lpthread"]
         subprocess.run(command, check=True)
         return path.read_bytes()

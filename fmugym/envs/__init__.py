@@ -9,7 +9,6 @@ from fmugym.envs.modelica_cart_pole import (
 )
 from fmugym.envs.pendulum import PendulumEnv
 from fmugym.registration import register
-from fmugym.vector import vectorized
 
 __all__ = [
     "CartPoleEnv",
@@ -19,12 +18,6 @@ __all__ = [
     "ModelicaCartPoleEnv",
     "PendulumEnv",
 ]
-
-# By name, so that the specs can be written as JSON.
-CartPoleVectorEnv = vectorized(CartPoleEnv)
-PendulumVectorEnv = vectorized(PendulumEnv)
-CloudPendulumVectorEnv = vectorized(CloudPendulumEnv)
-ModelicaCartPoleVectorEnv = vectorized(ModelicaCartPoleEnv)
 
 for name, steps, threshold in (
     ("CartPole", 500, 475.0),
@@ -36,6 +29,5 @@ for name, steps, threshold in (
         f"fmugym/{name}-v0",
         f"fmugym.envs:{name}Env",
         steps,
-        vector_entry_point=f"fmugym.envs:{name}VectorEnv",
         reward_threshold=threshold,
     )

@@ -1,4 +1,4 @@
-"""The cart-pole FMU as the equal of Gymnasium's CartPole-v1."""
+"""The cart-pole FMU as a replacement for Gymnasium's CartPole-v1."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_flag, check_mapping
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.rendering import CartPoleFrame, CartPoleScene
@@ -36,9 +37,11 @@ class CartPoleEnv(FMUEnv):
     """Balance a pole on a cart by pushing the cart left or right.
 
     ## Description
-    The drop-in equal of Gymnasium's ``CartPole-v1``, simulated by a compiled FMU: same spaces,
-    rewards, limits, start distribution, arguments and reset options, and from the same seed and
-    actions the same observations, bit for bit, where numpy's sine and the C library's agree.
+    A drop-in replacement for Gymnasium's ``CartPole-v1``, simulated by a compiled FMU. Spaces,
+    rewards, limits, start distribution, arguments and reset options are the same. From the same
+    seed and actions the observations are the same, too, bit for bit, on processors where numpy's
+    sine equals the C library's.
+
     The plant is that of Barto, Sutton and Anderson, "Neuronlike Adaptive Elements That Can Solve
     Difficult Learning Control Problems" (1983), in the corrected equations of Florian (2005).
 
@@ -61,8 +64,8 @@ class CartPoleEnv(FMUEnv):
     | 3   | pole velocity [rad/s]   | -inf              | inf              |
 
     ## Rewards
-    +1 for each step, the last one included. With ``sutton_barto_reward=True`` 0 for each step and
-    -1 for the one that ends the task.
+    +1 for each step, including the last one. With ``sutton_barto_reward=True``: -1 for the step
+    that ends the task, and 0 for all others.
 
     ## Starting State
     Each of the four values uniform in [-0.05, 0.05). The reset options ``low`` and ``high``
@@ -74,7 +77,7 @@ class CartPoleEnv(FMUEnv):
 
     ## Arguments
     * ``sutton_barto_reward``: see above.
-    * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
+    * ``fmi_version``: which FMU to use: "1.0", "2.0" (default) or "3.0".
     * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
     * ``render_mode``: "human", "rgb_array" or None.
     * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
@@ -97,7 +100,8 @@ class CartPoleEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        self.sutton_barto_reward = sutton_barto_reward
+        self.sutton_barto_reward = check_flag("sutton_barto_reward", sutton_barto_reward)
+        given = {} if model_parameters is None else model_parameters
         self.force_mag = 10.0
         self.x_threshold = 2.4
         self.theta_threshold_radians = 12 * 2 * math.pi / 360
@@ -105,7 +109,11 @@ class CartPoleEnv(FMUEnv):
         config = {
             "model_input_names": "f",
             "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
-            "model_parameters": {**start, **_GYMNASIUM_PLANT, **(model_parameters or {})},
+            "model_parameters": {
+                **start,
+                **_GYMNASIUM_PLANT,
+                **check_mapping("model_parameters", given),
+            },
             "time_step": 0.02,
         }
         fmu_path = bundled_fmu("CartPole", fmi_version)

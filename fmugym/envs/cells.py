@@ -1,7 +1,7 @@
-"""Cells of the CloudPendulum lab as backends, by the methods of the published client alone.
+"""Cells of the CloudPendulum lab as backends.
 
-The lab itself is not imported: whatever has these methods will do, the real client and that of the
-simulated lab.
+They use the methods of the published client only. So the client of the real lab fits as well as
+that of the simulated lab, and neither is imported here.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from fmugym.adapters import Status
-from fmugym.clock import RealClock
-from fmugym.errors import ConfigError
+from fmugym.checks import check_number, check_text, has_method
+from fmugym.errors import ConfigError, shown
+from fmugym.fmi.status import Status
 from fmugym.pool import Paced
+from fmugym.pool.backend.clock import RealClock
 
 __all__ = ["Cell", "Lease", "paced_cells"]
 
@@ -25,7 +26,7 @@ EXPERIMENT: Final = "SimplePendulum"
 
 _DEFAULT_GYM_TIME: Final = 600.0  # s, of leases for several cells
 
-_ANY_USER: Final = "fmugym"  # the default simulated lab takes any user token
+_ANY_USER: Final = "fmugym"  # by default the simulated lab takes any user token
 
 _METHODS: Final = (
     "start_experiment",
@@ -35,10 +36,10 @@ _METHODS: Final = (
     "set_torque",
     "set_impedance_controller_params",
 )
-"""What makes a client; those for leases are only needed there."""
+"""The methods that every client has; those for leases are needed for leases only."""
 
 _LEAVING = re.compile("(Position|Velocity) ?Limit ?Violation")
-"""How the lab says that it has ended a session because of where the arm went."""
+"""The lab's message that it has ended a session because the arm passed a limit."""
 
 
 def paced_cells(
@@ -51,42 +52,48 @@ def paced_cells(
     """Make cells that are stepped in the lab's time.
 
     Args:
-        client: A client, or a lab that gives one by its method ``client``.
-        user_token: For experiments, or for a lease of one's own.
-        gym_token: Of a lease that is there already.
-        gym_time: Length of a lease of one's own, in s.
+        client: A client, or a lab whose method ``client`` returns one.
+        user_token: For experiments, or for a new lease.
+        gym_token: The token of an existing lease.
+        gym_time: Length of a new lease, in s.
         session_time: Longest time of an episode, in s.
 
     Raises:
-        ConfigError: If that is no client, or the tokens do not fit.
+        ConfigError: If that is no client, or the tokens or times do not fit.
     """
-    if not _is_client(client) and callable(getattr(client, "client", None)):
+    if not _is_client(client) and has_method(client, "client"):
         client = client.client()
     if not _is_client(client):
         raise ConfigError(
             "backend must be 'fmu', or a client of the lab such as fmugym.lab.Client(), "
-            f"not {client!r}"
+            f"not {shown(client)}"
         )
     lab = _simulated_lab(client)
     if user_token is None and gym_token is None:
         if lab is None:
-            raise ConfigError("the lab wants user_token= or gym_token=")
+            raise ConfigError("the lab needs user_token= or gym_token=")
         user_token = _ANY_USER
     if gym_token is not None and (user_token is not None or gym_time is not None):
-        raise ConfigError("a gym_token= stands for a lease: give no user_token and no gym_time")
+        raise ConfigError("gym_token= names a lease: give no user_token and no gym_time with it")
+    for name, token in (("user_token", user_token), ("gym_token", gym_token)):
+        if token is not None:
+            check_text(name, token)
+    session_time = check_number("session_time", session_time, positive=True)
+    if gym_time is not None:
+        gym_time = check_number("gym_time", gym_time, positive=True)
     lease = Lease(client, user_token, gym_token, gym_time, session_time)
     return Paced(lease, RealClock() if lab is None else lab.clock)
 
 
 class Lease:
-    """Where cells get their sessions from; called with a number, it gives so many cells.
+    """The source of the cells' sessions. A call with a number returns that many cells.
 
     Args:
-        client: The client; each cell gets one of its own.
-        user_token: Whose experiments or lease it is.
-        gym_token: A lease that is there already, and is not stopped.
-        gym_time: Length of the lease that `open` makes and `close` stops, in s. None for a lease
-            only where there are several cells.
+        client: The client; each cell gets its own client of the same kind.
+        user_token: The user of the experiments or of the lease.
+        gym_token: An existing lease, which is not stopped.
+        gym_time: Length of the lease that `open` makes and `close` stops, in s. None: a lease is
+            made for several cells only.
         session_time: Longest time of an episode, in s.
     """
 
@@ -112,19 +119,19 @@ class Lease:
         return [Cell(self, _like(self._client)) for _ in range(count)]
 
     def open(self) -> None:
-        """Make the lease if there is to be one, and there is none."""
+        """Make the lease if one is needed and there is none."""
         if self._gym_time is not None and self._gym_token is None:
             cell_types = [_cell_type(self._client)] * self._count
             self._gym_token = self._client.start_gym(self._user_token, self._gym_time, cell_types)
 
     def close(self) -> None:
-        """Stop the lease if it is an own one."""
+        """Stop the lease if it was made here."""
         if self._is_own and self._gym_token is not None:
             gym_token, self._gym_token = self._gym_token, None
             self._client.stop_gym(gym_token)
 
     def start(self, client: Any, angle: float) -> tuple[str, bool]:
-        """Start a session at an angle in rad; returns its token and whether it is on a lease."""
+        """Start a session at an angle in rad; returns its token and whether a lease has it."""
         is_leased = self._gym_token is not None
         start = client.start_episode if is_leased else client.start_experiment
         owner = self._gym_token if is_leased else self._user_token
@@ -133,10 +140,12 @@ class Lease:
 
 
 class Cell:
-    """A cell as a backend: position and velocity at the tick, then the torque; see ``Backend``.
+    """A cell as a backend: it reads position and velocity at the tick, then sets the torque.
+
+    See ``Backend``.
 
     Args:
-        lease: Where it gets its sessions from.
+        lease: Makes its sessions.
         client: A client for the thread that steps it.
     """
 
@@ -146,7 +155,7 @@ class Cell:
         self._outputs: dict[str, float] = {}
 
     def reset(self, start_values: Mapping[str, float]) -> dict[str, float]:
-        """Start a session, in torque control and without torque."""
+        """Start a session in torque control, with the torque zero."""
         self._end_session()
         client = self._client
         self._session = self._lease.start(client, start_values["q_0"])
@@ -159,8 +168,8 @@ class Cell:
         """Read the arm and set the torque that acts until the next step.
 
         Returns:
-            The outputs, and ``TERMINATED`` with the last ones where the lab has ended the session
-            because the arm went beyond a limit.
+            The outputs and a status. If the lab has ended the session because the arm passed a
+            limit, these are the last outputs and ``TERMINATED``.
         """
         token = self._token()
         try:
@@ -173,7 +182,7 @@ class Cell:
         return outputs, Status.OK
 
     def hold(self) -> None:
-        """Take the torque away, which is a sign of life as well."""
+        """Set the torque to zero, which also keeps the session alive."""
         self._client.set_torque(0.0, self._token())
 
     def stop(self) -> None:
@@ -196,7 +205,7 @@ class Cell:
         (token, is_leased), self._session = self._session, None
         try:
             self._client.set_torque(0.0, token)
-        except RuntimeError as error:  # it has ended by itself
+        except RuntimeError as error:  # the lab has ended the session
             logger.debug("the torque was not taken away: %s", error)
         stop = self._client.stop_episode if is_leased else self._client.stop_experiment
         try:
@@ -206,23 +215,23 @@ class Cell:
 
 
 def _is_client(client: Any) -> bool:
-    return all(callable(getattr(client, method, None)) for method in _METHODS)
+    return all(has_method(client, method) for method in _METHODS)
 
 
 def _simulated_lab(client: Any) -> Any:
-    """The lab with a clock that a client of the simulated lab talks to; None for other clients."""
+    """Return the simulated lab, which has a clock, of a client; None for other clients."""
     lab = getattr(client, "lab", None)
     return lab if hasattr(lab, "clock") else None
 
 
 def _like(client: Any) -> Any:
-    """A client of the same lab: each thread wants one of its own."""
+    """Make a client of the same lab, because each thread needs its own."""
     lab = _simulated_lab(client)
     return type(client)() if lab is None else lab.client()
 
 
 def _cell_type(client: Any) -> Any:
-    """The kind of cell with one joint, of the package that the client is of."""
+    """Return the cell type with one joint, from the package of the client."""
     package = type(client).__module__.rpartition(".")[0]
     try:
         return importlib.import_module(f"{package}.data").CellType.SINGLE

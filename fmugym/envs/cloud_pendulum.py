@@ -1,4 +1,4 @@
-"""A cell of the CloudPendulum lab as a Gymnasium environment: simulated by an FMU, or reached."""
+"""A cell of the CloudPendulum lab as a Gymnasium environment: simulated by an FMU, or remote."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_mapping, number_of
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.envs.cells import paced_cells
@@ -32,8 +33,8 @@ VELOCITY_LIMIT: Final = 50.0
 """Angular velocity at which the lab ends a session, in rad/s."""
 
 _FMU_PARAMETERS: Final = {
-    "theta_dot_max": 1000.0,  # rad/s: it shall pass the limit to be stopped there
-    "max_step": 0.002,  # s: off by 1e-4 rad after 10 s with Coulomb friction, by 4e-8 without
+    "theta_dot_max": 1000.0,  # rad/s: beyond the limit at which an episode ends
+    "max_step": 0.002,  # s: error after 10 s 1e-4 rad with Coulomb friction, 4e-8 without
 }
 
 _VELOCITY_WEIGHT: Final = 0.1 * 15.0 / 98.1
@@ -44,14 +45,14 @@ class CloudPendulumEnv(FMUEnv):
     """Swing the pendulum of a CloudPendulum cell up and hold it upright.
 
     ## Description
-    A pendulum of 0.06 kg and 0.1 m hangs at a motor, which is asked for a torque 50 times a second.
-    The same environment runs on the bundled FMU, on a cell of the simulated lab and on one of the
-    real lab: ``backend`` chooses.
+    A pendulum of 0.06 kg and 0.1 m hangs at a motor. A controller sets the motor's torque 50 times
+    a second. ``backend`` chooses where the environment runs: on the bundled FMU, on a cell of the
+    simulated lab, or on a cell of the real lab.
 
     **Timing.** Observation k is sampled at the tick ``t_k = t_0 + k * 0.02 s``. The action computed
-    from it takes effect at the next tick and lasts until the one after, so that it shows for the
-    first time in observation k + 2. On the FMU that is exact; in the lab position, velocity and
-    torque are one request each, in this order, from the tick on.
+    from it takes effect at the next tick and lasts until the one after. So observation k + 2 is the
+    first to show it. On the FMU these times are exact. In the lab each tick starts three requests,
+    one after the other: position, velocity, torque.
 
     ## Action Space
     ``Box(-1.0, 1.0, (1,), float32)``
@@ -72,38 +73,38 @@ class CloudPendulumEnv(FMUEnv):
     ## Rewards
     ``-(theta^2 + 0.0153 q_dot^2 + 0.004 action^2)`` with theta, the angle from upright, normalized
     to [-pi, pi), and the velocity, both before the step. That is the reward of Gymnasium's
-    ``Pendulum-v1`` in units of each plant: 0.1 times the square of the velocity over the natural
-    frequency, which squared is 3 g / (2 l) = 15 there and g / l = 98.1 here, and 0.001 times
-    that of the torque over half its limit. The step that violates a limit of the platform gets
-    1000 less, which is a little more than hanging still for ever costs at a discount of 0.99.
+    ``Pendulum-v1`` in the units of this plant. The velocity counts relative to the natural
+    frequency, whose square is 3 g / (2 l) = 15 there and g / l = 98.1 here; the torque counts
+    relative to its limit. The step that violates a limit of the platform gets 1000 less. That is a
+    little more than hanging still for ever costs at a discount of 0.99.
 
     ## Starting State
-    At rest, q uniform in [-0.05, 0.05) rad. The lab's cells sag towards hanging before they are
-    released.
+    At rest, q uniform in [-0.05, 0.05) rad. The arm of a lab's cell sags a little before the
+    episode begins.
 
     ## Episode End
-    Terminated when q is more than 2 pi or q_dot more than 50 rad/s from zero: there the lab ends a
-    session. Truncated after 500 steps, 10 s (by ``gymnasium.make``), and by faults.
+    Terminated when q is more than 2 pi or q_dot more than 50 rad/s from zero, as the lab ends a
+    session there. Truncated after 500 steps, 10 s (by ``gymnasium.make``), and by faults.
 
     ## Information
-    ``info`` has ``sample_age``: how old the observation was when ``step`` returned it, in s; on the
-    FMU, where no time passes meanwhile, 0. In the lab it also has ``deadline_misses`` (of this
-    episode) and ``worst_lateness`` (in s). A step that comes too late shifts those that follow;
-    while none comes, the torque is zero and the session is kept alive.
+    ``info`` has ``sample_age``, the age of the observation in s when ``step`` returned it; on the
+    FMU it is 0. In the lab ``info`` also has ``deadline_misses`` (of this episode) and
+    ``worst_lateness`` (in s). A late step delays the steps that follow. While no step comes, the
+    torque is zero and the session is kept alive.
 
     ## Arguments
-    * ``torque_limit``: torque of an action of 1, at most 0.15 N m.
+    * ``torque_limit``: the torque of an action of 1, at most 0.15 N m.
     * ``backend``: "fmu", a client (``fmugym.lab.Client()`` or the real
       ``cloudpendulumclient.client.Client()``), or a ``fmugym.lab.Lab``.
     * ``model_parameters``: values or distributions for the FMU's parameters, such as ``l``, ``b``
-      and ``c``. In the lab there is only ``q_0``, the start angle.
+      and ``c``. In the lab only ``q_0``, the start angle, can be given.
     * ``user_token``: the lab's user token, which the simulated lab does not need. Each episode is
       an experiment of its own, or an episode of a lease if ``gym_time`` is given.
-    * ``gym_token``: a lease of yours, used instead of a user token; it is not stopped.
-    * ``gym_time``: length in s of the lease that is made at the first reset and stopped at the
-      close. A vector environment always makes one, of 600 s by default.
-    * ``session_time``: longest time of an episode in the lab, in s, pauses included.
-    * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
+    * ``gym_token``: a lease that you have already, instead of a user token. It is not stopped.
+    * ``gym_time``: length in s of the lease that the first reset makes and ``close`` stops. A
+      vector environment always makes one, of 600 s by default.
+    * ``session_time``: longest time of an episode in the lab, in s, including pauses.
+    * ``fmi_version``: which FMU to use: "1.0", "2.0" (default) or "3.0".
     * ``render_mode``: "human", "rgb_array" or None.
     * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
@@ -129,15 +130,16 @@ class CloudPendulumEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        if not 0.0 < torque_limit <= PLATFORM_TORQUE:
+        self.torque_limit = number_of("torque_limit", torque_limit)
+        if not 0.0 < self.torque_limit <= PLATFORM_TORQUE:
             raise ConfigError(
                 f"torque_limit must be more than 0 and at most {PLATFORM_TORQUE} N m, "
-                f"got {torque_limit!r}"
+                f"got {self.torque_limit}"
             )
-        self.torque_limit = torque_limit
         self.limit_penalty = 1000.0
         self._in_lab = not isinstance(backend, str) or backend == "lab"  # an error will say how
-        given = dict(model_parameters or {})
+        given = {} if model_parameters is None else model_parameters
+        given = check_mapping("model_parameters", given)
         self._require_settable(given)
         if self._in_lab:
             backend = paced_cells(backend, user_token, gym_token, gym_time, session_time)
@@ -153,17 +155,17 @@ class CloudPendulumEnv(FMUEnv):
             config,
             log_level,
             render_mode=render_mode,
-            backend=None if backend == "fmu" else backend,
+            backend=backend if self._in_lab or backend != "fmu" else None,
             **options,
         )
 
     def _require_settable(self, names: Mapping[str, Any]) -> None:
-        """Refuse to set what no request to the lab can."""
+        """Refuse parameters that no request to the lab can set."""
         for name in names:
             if self._in_lab and name != "q_0":
                 raise ConfigError(
-                    f"{name!r} cannot be set in the lab: a cell's parameters are what they are, "
-                    "and its arm starts at rest; only 'q_0', the start angle, can"
+                    f"{name!r} cannot be set in the lab, only 'q_0', the start angle: a cell's "
+                    "parameters are fixed, and its arm starts at rest"
                 )
 
     def _get_action_space(self) -> spaces.Space[Any]:
@@ -179,7 +181,7 @@ class CloudPendulumEnv(FMUEnv):
         return parameters
 
     def _get_inputs(self) -> Any:
-        """The last action's torque on the FMU; in the lab cells wait for the tick themselves."""
+        """Delay the torque by a step on the FMU; in the lab the cells wait for the tick."""
         torque = self._torque(self.action)
         if self._in_lab:
             return torque

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_number
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMUEnv
 from fmugym.rendering import CartPoleFrame, CartPoleScene
 
@@ -21,7 +22,7 @@ THETA_0 = math.radians(85)
 
 
 class ModelicaCartPoleEnv(FMUEnv):
-    """Balance a heavy pole that starts with a lean of 5 degrees, as in the ModelicaGym study.
+    """Balance a heavy pole that starts at a lean of 5 degrees, as in the ModelicaGym study.
 
     ## Description
     A cart of 10 kg carries a cylinder of 1 m and 1.77 kg with a point mass of 1 kg at its end.
@@ -48,12 +49,12 @@ class ModelicaCartPoleEnv(FMUEnv):
     | 3   | pole velocity [rad/s]       | -inf             | inf              |
 
     ## Rewards
-    ``positive_reward`` (+1) for each step, ``negative_reward`` (-100) for the one that ends the
-    task.
+    ``negative_reward`` (-100) for the step that ends the task, ``positive_reward`` (+1) for all
+    others.
 
     ## Starting State
-    Cart at rest in the centre, pole at ``theta_0`` (85 degrees) with ``theta_dot_0`` (0). Every
-    parameter may be a distribution.
+    The cart is at rest in the centre. The pole is at the angle ``theta_0`` (85 degrees) with the
+    velocity ``theta_dot_0`` (0). Every parameter may be a distribution.
 
     ## Episode End
     Terminated when the cart is more than 2.4 m from the centre or the pole leans more than
@@ -92,7 +93,7 @@ class ModelicaCartPoleEnv(FMUEnv):
         **options: Any,
     ) -> None:
         names = self._variable_names(own_fmu=fmu_path is not None)
-        self.force = force
+        self.force = check_number("force", force)
         self.x_threshold = 2.4
         self.theta_threshold = math.radians(12)
         parameters = (m_cart, m_pole, theta_0, theta_dot_0)
@@ -143,14 +144,15 @@ class ModelicaCartPoleEnv(FMUEnv):
 
 
 class JModelicaCSCartPoleEnv(ModelicaCartPoleEnv, FMI2CSEnv):
-    """The task over an FMU of FMI 2.0 with the names that JModelica's export has."""
+    """The task with an FMU of FMI 2.0 that JModelica exported."""
 
 
 class DymolaCSCartPoleEnv(ModelicaCartPoleEnv, FMI1CSEnv):
-    """The task over an FMU of FMI 1.0 with the names that Dymola's export has.
+    """The task with an FMU of FMI 1.0 that Dymola exported.
 
-    The arguments are those of ``ModelicaCartPoleEnv`` in Dymola's names. Without ``fmu_path`` the
-    bundled FMU of FMI 1.0 is used, whose variables have the names of the bundled model.
+    The arguments are those of ``ModelicaCartPoleEnv``, with the variables' names in Dymola's
+    export. Without ``fmu_path`` the environment uses the bundled FMU of FMI 1.0, whose variables
+    have the names of the bundled model.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The pendulum FMU as the equal of Gymnasium's Pendulum-v1."""
+"""The pendulum FMU as a replacement for Gymnasium's Pendulum-v1."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.checks import check_mapping
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.rendering import PendulumFrame, PendulumScene
@@ -30,13 +31,14 @@ _GYMNASIUM_PLANT = {
 
 
 class PendulumEnv(FMUEnv):
-    """Swing a rod up and hold it upright with a torque that is too weak to lift it at once.
+    """Swing a rod up and hold it upright, with a torque too weak to lift it directly.
 
     ## Description
-    The drop-in equal of Gymnasium's ``Pendulum-v1``, simulated by a compiled FMU: same spaces,
-    rewards, limits, start distribution, arguments and reset options, and from the same seed and
-    actions the same observations and rewards, bit for bit, where numpy's sine and the C library's
-    agree. The plant is a uniform rod of 1 kg and 1 m on a frictionless pivot.
+    A drop-in replacement for Gymnasium's ``Pendulum-v1``, simulated by a compiled FMU. Spaces,
+    rewards, limits, start distribution, arguments and reset options are the same. From the same
+    seed and actions the observations and rewards are the same, too, bit for bit, on processors
+    where numpy's sine equals the C library's. The plant is a uniform rod of 1 kg and 1 m on a
+    frictionless pivot.
 
     ## Action Space
     ``Box(-2.0, 2.0, (1,), float32)``
@@ -67,7 +69,7 @@ class PendulumEnv(FMUEnv):
 
     ## Arguments
     * ``g``: acceleration of gravity in m/s^2, by default 10.
-    * ``fmi_version``: "1.0", "2.0" (default) or "3.0", the FMU to be used.
+    * ``fmi_version``: which FMU to use: "1.0", "2.0" (default) or "3.0".
     * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
     * ``render_mode``: "human", "rgb_array" or None.
     * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
@@ -91,13 +93,19 @@ class PendulumEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
+        given = {} if model_parameters is None else model_parameters
         self.max_speed = 8.0
         self.max_torque = 2.0
         start = {"theta_0": Uniform(-np.pi, np.pi), "theta_dot_0": Uniform(-1.0, 1.0)}
         config = {
             "model_input_names": "tau",
             "model_output_names": ["theta", "theta_dot"],
-            "model_parameters": {**start, **_GYMNASIUM_PLANT, "g": g, **(model_parameters or {})},
+            "model_parameters": {
+                **start,
+                **_GYMNASIUM_PLANT,
+                "g": g,
+                **check_mapping("model_parameters", given),
+            },
             "time_step": 0.05,
         }
         fmu_path = bundled_fmu("Pendulum", fmi_version)
@@ -124,15 +132,16 @@ class PendulumEnv(FMUEnv):
         return np.minimum(np.maximum(self.action[0], -self.max_torque), self.max_torque)
 
     def _get_inputs(self) -> Any:
-        """The torque whose threefold is Gymnasium's ``3 * u``, which is rounded to float32.
+        """Return the torque that makes the FMU's product equal Gymnasium's ``3 * u``.
 
-        The FMU computes ``3 / (m l^2) * tau`` in float64, and thrice a third of a float64 is that
-        float64 again.
+        Gymnasium rounds ``3 * u`` to float32. The FMU computes ``3 / (m l^2) * tau`` in float64, so
+        that a third of the rounded product is the right ``tau``: three times a third of a float64
+        is exact.
         """
         return np.float64(3.0 * self._clipped_torque()) / 3.0
 
     def _is_done(self) -> Any:
-        return self.state[0] != self.state[0]  # never, in the shape of the state
+        return self.state[0] != self.state[0]  # False, in the shape of the state
 
     def _reward_policy(self) -> Any:
         theta, theta_dot = self.previous_state
@@ -155,9 +164,9 @@ class PendulumEnv(FMUEnv):
 
 
 def _squared(value: Any) -> Any:
-    """The C library's ``pow``, as in Gymnasium: it differs from a product in one bit at times.
+    """Square by the C library's ``pow``, as Gymnasium does; a product differs in a bit at times.
 
-    For arrays numpy has loops of its own; this one comes nearest.
+    For arrays numpy has its own loops; ``float_power`` comes nearest.
     """
     if isinstance(value, np.ndarray):
         return np.float_power(value, 2.0).astype(value.dtype)

@@ -1,10 +1,10 @@
-"""Identification: the parameters of an FMU from logged trajectories, and how well they are known.
+"""Identification: fit the parameters of an FMU to logged trajectories, with their uncertainty.
 
 ``fit_swing`` fits the equation of motion of a single pendulum to free swings, by linear least
-squares. ``fit_parameters`` fits any parameters of any FMU, by simulation. What both find can be
-passed on as parameter values or, with its uncertainty, as distributions.
+squares. ``fit_parameters`` fits any parameters of any FMU, by simulation. An environment takes the
+results as parameter values or, with their uncertainty, as distributions.
 
-Needs SciPy: ``pip install "fmugym-toolbox[identification]"``.
+The package needs SciPy: ``pip install "fmugym-toolbox[identification]"``.
 """
 
 from fmugym.identification.output_error import FitResult, fit_parameters

@@ -1,4 +1,4 @@
-"""SciPy, imported where it is used: the rest of the package does without."""
+"""Late import of SciPy, so that the rest of the package works without it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def scipy_module(name: str) -> Any:
     """Import a module of SciPy.
 
     Raises:
-        ImportError: If SciPy is not there; the text names the extra that brings it.
+        ImportError: If SciPy is not installed; the text names the extra that installs it.
     """
     try:
         return importlib.import_module(f"scipy.{name}")

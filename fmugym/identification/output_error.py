@@ -1,8 +1,8 @@
-"""Output-error fitting: the values under which an FMU's simulation follows the measurement.
+"""Output-error fitting: find values for which an FMU's simulation follows the measurement.
 
-The method is maximum likelihood where the measured outputs have independent normal noise of the
-given relative sizes; see Ljung, "System Identification" (1999), chapter 7. Many short trajectories
-with initial states of their own (multiple shooting) fit what a long one cannot: a chaotic plant.
+The method is maximum likelihood if the measured outputs have independent normal noise of the given
+relative sizes; see Ljung, "System Identification" (1999), chapter 7. To fit a chaotic plant, use
+many short trajectories with their own initial states (multiple shooting) instead of a long one.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive import FMU
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
 from fmugym.distributions import Normal
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.identification.problem import Experiment, Limits, Problem
 from fmugym.identification.results import Comparison
 from fmugym.identification.statistics import confidence_intervals, normal_distributions
-from fmugym.identification.trajectory import Trajectory
+from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray
 
 __all__ = ["FitResult", "fit_parameters"]
@@ -29,18 +30,18 @@ __all__ = ["FitResult", "fit_parameters"]
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """What ``fit_parameters`` found.
+    """The result of ``fit_parameters``.
 
     Attributes:
-        values: The fitted values by name, to be passed on as ``model_parameters``.
-        standard_errors: By name, in the units of the values; infinite where the data do not
-            determine a value.
-        covariance: Of the values, in their order, shape (k, k).
+        values: The fitted values by name, in the form of ``model_parameters``.
+        standard_errors: Standard errors by name, in the units of the values; infinite for a value
+            that the data do not determine.
+        covariance: Covariance of the values, in their order, shape (k, k).
         bounds: Lower and upper bound of each value by name.
-        degrees_of_freedom: For the confidence intervals.
+        degrees_of_freedom: Degrees of freedom of the confidence intervals.
         comparison: The fitted trajectories and their simulation.
-        converged: Whether the optimization ended by itself, not by its limit of evaluations.
-        message: How the optimization ended.
+        converged: Whether the optimization converged within its limit of evaluations.
+        message: Why the optimization ended.
     """
 
     values: dict[str, float]
@@ -52,26 +53,30 @@ class FitResult:
     converged: bool
     message: str
     experiment: Experiment
-    """For predictions."""
+    """The settings, which predictions need."""
 
     def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return lower and upper end by name; they may exceed the bounds."""
+        """Return lower and upper end by name; they may exceed the bounds.
+
+        Raises:
+            ConfigError: If the level is not between 0 and 1.
+        """
         return confidence_intervals(
             self.values, self.standard_errors, self.degrees_of_freedom, level
         )
 
     def distributions(self) -> dict[str, Normal]:
-        """Give each value as a normal distribution, truncated at its bounds.
+        """Return each value as a normal distribution, truncated at its bounds.
 
-        Its standard deviation is the standard error. Correlations between the values are lost.
+        The standard deviation is the standard error. Correlations between the values are lost.
 
         Raises:
-            ConfigError: If the data did not determine a value.
+            ConfigError: If the data do not determine a value.
         """
         return normal_distributions(self.values, self.standard_errors, self.bounds)
 
     def rms(self, output: str) -> float:
-        """Return the RMS of the fitted trajectories' residuals, in the unit of the output."""
+        """Return the RMS of the residuals of the fit, in the unit of the output."""
         return self.comparison.rms(output)
 
     def predict(
@@ -85,14 +90,22 @@ class FitResult:
 
         Args:
             trajectories: Held-out measurements, with the same outputs and inputs.
-            refit_initial_states: Fit the initial state of each one to its samples; otherwise it is
-                what the first sample says.
-            lead_in: Refit to the samples of the first so many seconds only: what follows is
-                predicted in the strict sense. None for all samples.
+            refit_initial_states: Whether to fit the initial state of each trajectory to its
+                samples. Otherwise the first sample gives the initial state.
+            lead_in: How many seconds of samples the refit uses. The rest is then a prediction in
+                the strict sense. None for all samples.
 
         Returns:
             Measured and simulated outputs.
+
+        Raises:
+            ConfigError: If an argument has a wrong type or range.
+            SimulationError: If the FMU fails.
         """
+        refit_initial_states = check_flag("refit_initial_states", refit_initial_states)
+        if lead_in is not None:
+            lead_in = check_number("lead_in", lead_in, positive=True, may_be_infinite=True)
+        common_names(trajectories)
         experiment, shifted = self._for_prediction(trajectories)
         if lead_in is None or not refit_initial_states:
             return _simulate(experiment, shifted, refit_initial_states)
@@ -103,7 +116,7 @@ class FitResult:
     def _for_prediction(
         self, trajectories: Sequence[Trajectory]
     ) -> tuple[Experiment, list[Trajectory]]:
-        """Fix the fitted values, and add those of inputs to what was logged."""
+        """Fix the fitted values, and add fitted constants to the logged inputs."""
         description = self.experiment.fmu.description
         offsets = {n for n in self.values if description.variable(n).causality == "input"}
         fixed = {n: v for n, v in self.values.items() if n not in offsets}
@@ -117,7 +130,7 @@ def _simulate(
     refit: bool,
     states: Sequence[Mapping[str, float]] | None = None,
 ) -> Comparison:
-    """Simulate without fitting parameters, from refitted, measured or given initial states."""
+    """Simulate with fixed parameters from refitted, measured or given initial states."""
     with closing(Problem(experiment, {}, trajectories, refit)) as problem:
         return problem.compare(problem.start, states)
 
@@ -139,59 +152,78 @@ def fit_parameters(
 ) -> FitResult:
     """Fit parameters of an FMU to logged trajectories.
 
-    Minimized is the sum of the squared differences between simulated and measured outputs, each
-    divided by its scale. The simulations for all trajectories and all finite differences of a
-    Jacobian run at once, an instance of one pool each.
+    The fit minimizes the sum of the squared differences between simulated and measured outputs,
+    each divided by its scale. The simulations for all trajectories and all finite differences of a
+    Jacobian run at once, each in its own instance of one pool.
 
     Args:
-        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` hold.
-        parameters: What to fit, by the name of the FMU's variable: a number to start from; or
-            bounds ``(low, high)``; or ``(start, low, high)``. Missing bounds are the variable's
-            min and max, a missing start is its own start value or the middle. The name of an
-            input stands for a constant that is added to it.
-        trajectories: The measurements. Simulated time begins at 0 with each.
-        initial_states: The FMU's start parameters of the states, each with the name of the output
-            that measures it, or with a number. None where every trajectory starts as the FMU does.
-        fit_initial_states: Fit the start parameters of each trajectory too; otherwise its first
-            sample is trusted.
+        fmu: The path of the FMU, or an ``FMU`` with its own ``limits``, ``preload`` and
+            ``probe_timeout``.
+        parameters: The variables to fit by name, each with a start value, with bounds
+            ``(low, high)``, or with ``(start, low, high)``. Missing bounds are the variable's min
+            and max. A missing start is the variable's start value, or the middle of the bounds.
+            The name of an input stands for a constant that is added to the input.
+        trajectories: The measurements. Simulated time begins at 0 in each of them.
+        initial_states: The FMU's start parameters of the states. Each has the name of the output
+            that measures the state, or a number. None if the FMU's own start values are right.
+        fit_initial_states: Whether to fit the initial states of each trajectory too. Otherwise the
+            first samples give them.
         fixed: Values of other parameters by name.
-        scales: The noise's standard deviation of each output, in its unit; only their ratios
-            count. None for every output's own standard deviation.
+        scales: Standard deviation of the noise of each output, in its unit. Only the ratios
+            matter. None for the standard deviation of each output.
         time_step: Communication step size in seconds; None for the median sampling interval.
-        clustered: Take the residuals of a trajectory for correlated, as they are where the model
-            is not exact, and only trajectories for independent; needs more of these than there
-            are parameters. Otherwise all residuals count as independent, and standard errors are
-            too small where they are not. See Cameron and Miller, "A Practitioner's Guide to
-            Cluster-Robust Inference", Journal of Human Resources 50 (2015).
-        drop_repeats: Leave out stale samples first; see ``Trajectory.without_repeats``.
-        max_evaluations: Limit of the optimization's steps.
-        backend: See ``fmugym.pool.make_pool``.
+        clustered: Whether the residuals of a trajectory may be correlated, as they are if the
+            model is not exact. This needs more trajectories than parameters. Otherwise all
+            residuals count as independent, and correlation makes the standard errors too small.
+            See Cameron and Miller, "A Practitioner's Guide to Cluster-Robust Inference", Journal
+            of Human Resources 50 (2015).
+        drop_repeats: Whether to drop stale samples first; see ``Trajectory.without_repeats``.
+        max_evaluations: Largest number of evaluations of the optimization.
+        backend: See ``fmugym.trial.opening.make_pool``.
 
     Returns:
         Values, standard errors, and the comparison of measurement and simulation.
 
     Raises:
-        ConfigError: If a name, a bound or a trajectory does not fit.
-        SimulationError: If the FMU fails at the start or next to a point of the way.
-        ImportError: If SciPy is not there.
+        ConfigError: If an argument has a wrong type or range, or does not fit the FMU.
+        FMULoadError: If the FMU cannot be opened.
+        SimulationError: If the FMU fails with the start values or near a tried point.
+        ImportError: If SciPy is not installed.
     """
-    if not parameters:
-        raise ConfigError("there is no parameter to be fitted")
+    wanted = check_mapping("parameters", parameters)
+    if not wanted:
+        raise ConfigError("there is no parameter to fit")
     experiment = Experiment(
-        FMU.of(fmu),
-        initial_states or {},
-        fixed or {},
-        scales or {},
+        _opened(fmu),
+        _mapping("initial_states", initial_states),
+        _mapping("fixed", fixed),
+        _mapping("scales", scales),
         time_step,
-        drop_repeats,
-        backend,
+        check_flag("drop_repeats", drop_repeats),
+        check_text("backend", backend),
     )
-    with closing(Problem(experiment, parameters, trajectories, fit_initial_states)) as problem:
+    clustered = check_flag("clustered", clustered)
+    max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
+    fit_states = check_flag("fit_initial_states", fit_initial_states)
+    with closing(Problem(experiment, wanted, trajectories, fit_states)) as problem:
         return _result(experiment, problem, problem.solve(max_evaluations), clustered)
 
 
+def _opened(fmu: Any) -> FMU:
+    if not isinstance(fmu, FMU):
+        try:
+            fmu = check_text("fmu", os.fspath(fmu))
+        except Exception:  # a path may be any object
+            raise ConfigError(f"fmu must be a path or an FMU, not {shown(fmu)}") from None
+    return FMU.of(fmu)
+
+
+def _mapping(what: str, value: Any) -> dict[Any, Any]:
+    return {} if value is None else check_mapping(what, value)
+
+
 def _result(experiment: Experiment, problem: Problem, solution: Any, clustered: bool) -> FitResult:
-    """Put together what the optimization left."""
+    """Collect the results of the optimization."""
     covariance, freedom = problem.covariance(solution, clustered)
     names = list(problem.bounds)
     return FitResult(
@@ -208,7 +240,7 @@ def _result(experiment: Experiment, problem: Problem, solution: Any, clustered: 
 
 
 def _shifted(trajectory: Trajectory, offsets: Mapping[str, float]) -> Trajectory:
-    """Add fitted constants to the inputs."""
+    """Add fitted constants to the logged inputs."""
     nothing = np.zeros(len(trajectory))
     shifted = {n: trajectory.inputs.get(n, nothing) + value for n, value in offsets.items()}
     return replace(trajectory, inputs={**trajectory.inputs, **shifted})

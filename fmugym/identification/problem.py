@@ -1,10 +1,10 @@
 """The least-squares problem behind an output-error fit.
 
-The initial states of the trajectories are eliminated: for given parameters each trajectory is
-fitted by its own initial state, and what the parameters' Jacobian has in the directions of that
-state is projected away (variable projection in Kaufman's form; Golub and Pereyra, "Separable
-nonlinear least squares", Inverse Problems 19, 2003). The number of trajectories thus does not
-enter the size of the optimization.
+Variable projection eliminates the initial states of the trajectories. For given parameters, the fit
+of each trajectory finds its best initial state. The Jacobian of the parameters then loses its part
+in the directions of these states (Kaufman's form; see Golub and Pereyra, "Separable nonlinear least
+squares", Inverse Problems 19, 2003). The size of the optimization therefore does not depend on the
+number of trajectories.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive import FMU
-from fmugym.errors import ConfigError, SimulationError, unknown_name
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_number, check_text, float_or_nan
+from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.identification._scipy import scipy_module
 from fmugym.identification.results import Comparison
 from fmugym.identification.simulation import Simulator
 from fmugym.identification.statistics import information_inverse
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.model_description import Variable
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Experiment", "Limits", "Problem"]
@@ -30,18 +31,18 @@ __all__ = ["Experiment", "Limits", "Problem"]
 Limits = float | tuple[float, float] | tuple[float, float, float]
 
 DIFFERENCE = 1e-6
-"""Of the finite differences, as a fraction of a value's typical size."""
+"""Step of the finite differences, as a fraction of a value's typical size."""
 
 FAILED = 1e3
-"""The residual, in units of the scale, of a simulation that fails: no step goes there."""
+"""Residual of a failed simulation, in units of the scale; it keeps the optimizer away."""
 
 MAX_ITERATIONS = 50
-"""Of the fits of the initial states."""
+"""Largest number of iterations in the fit of the initial states."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What a fit and its predictions have in common; see ``fit_parameters``."""
+    """The common settings of a fit and its predictions; see ``fit_parameters``."""
 
     fmu: FMU
     initial_states: Mapping[str, str | float]
@@ -52,7 +53,7 @@ class Experiment:
     backend: str
 
     def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
-        """Leave out stale samples if that was asked for."""
+        """Check the trajectories, and drop stale samples if requested."""
         common_names(trajectories)
         return tuple(t.without_repeats() if self.drop_repeats else t for t in trajectories)
 
@@ -62,8 +63,8 @@ class _Block:
     """One trajectory's part of the problem at one point.
 
     Attributes:
-        residual: Shape (m,); NaN where the simulation failed.
-        slopes: Of the residual with respect to the parameters or states, shape (m, k).
+        residual: The residuals, shape (m,); NaN after a failed simulation.
+        slopes: Their derivatives with respect to parameters or states, shape (m, k).
     """
 
     residual: FloatArray
@@ -75,7 +76,7 @@ class _Block:
         return float(self.residual @ self.residual)
 
     def step(self, damping: float) -> FloatArray:
-        """Compute the step of Levenberg and Marquardt, shape (k,); none after a failure."""
+        """Compute the Levenberg-Marquardt step, shape (k,); zeros after a failure."""
         matrix = self.slopes.T @ self.slopes
         matrix += damping * np.diag(np.diag(matrix))
         gradient = self.slopes.T @ self.residual
@@ -84,30 +85,30 @@ class _Block:
         return np.asarray(-np.linalg.lstsq(matrix, gradient, rcond=None)[0], np.float64)
 
     def is_solved(self, step: FloatArray) -> bool:
-        """Whether a step promises next to nothing."""
+        """Whether a step promises a negligible gain."""
         gain = -step @ self.slopes.T @ self.residual
         return not gain > 1e-10 * self.cost + 1e-20 * len(self.residual)
 
     def project(self, count: int) -> FloatArray:
-        """Return the first slopes, less what the others can explain; shape (m, count)."""
+        """Return the first slopes without the part that the others explain; shape (m, count)."""
         wanted, others = self.slopes[:, :count], self.slopes[:, count:]
         projected: FloatArray = wanted - others @ np.linalg.lstsq(others, wanted, rcond=None)[0]
         return projected
 
 
 class Problem:
-    """Residuals, their Jacobian, and what follows from a solution.
+    """The residuals, their Jacobian, and the covariance at a solution.
 
     Args:
-        experiment: What does not change.
-        parameters: What to fit; see ``fit_parameters``.
-        trajectories: What to fit it to.
+        experiment: The settings.
+        parameters: The parameters to fit; see ``fit_parameters``.
+        trajectories: The measured trajectories.
         fit_states: Whether to fit the initial states.
 
     Attributes:
-        trajectories: Without stale samples.
-        bounds: Of each parameter by name.
-        start: The parameters to start from, shape (k,).
+        trajectories: The trajectories without stale samples.
+        bounds: Lower and upper bound of each parameter by name.
+        start: The start values of the parameters, shape (k,).
     """
 
     def __init__(
@@ -155,8 +156,8 @@ class Problem:
         self._simulator.close()
 
     def solve(self, max_evaluations: int) -> Any:
-        """Minimize; returns what SciPy returns."""
-        self.compare(self.start, refit=False)  # fails early, with the FMU's reason
+        """Minimize the residuals, and return SciPy's result."""
+        self.compare(self.start, refit=False)  # fails early with the FMU's reason
         count = len(self.start)
         return scipy_module("optimize").least_squares(
             self._residuals,
@@ -178,8 +179,8 @@ class Problem:
 
         Args:
             parameters: Their values, shape (k,).
-            states: Initial states to simulate from, for each trajectory.
-            refit: Fit the initial states to the trajectories, if the problem does so at all.
+            states: Given initial states of each trajectory, or None.
+            refit: Whether to fit the initial states, if the problem fits them.
         """
         values = self._states
         if states is not None:
@@ -188,7 +189,7 @@ class Problem:
             values = self._fit_states(parameters)[0]
         simulated = self._simulator.simulate(self._join(parameters, values))
         if not all(np.isfinite(outputs).all() for outputs in simulated):
-            raise SimulationError(f"the FMU cannot be simulated: {self._simulator.failure}")
+            raise SimulationError(f"the simulation failed: {self._simulator.failure}")
         names = self._simulator.outputs
         return Comparison(
             self.trajectories,
@@ -197,7 +198,7 @@ class Problem:
         )
 
     def covariance(self, solution: Any, clustered: bool) -> tuple[FloatArray, int]:
-        """Estimate the covariance of the parameters, and its degrees of freedom."""
+        """Estimate the covariance of the parameters; returns it with its degrees of freedom."""
         inverse, undetermined = information_inverse(solution.jac)
         num_states = (len(self._rows) - len(self.start)) * len(self.trajectories)
         freedom = max(1, len(solution.fun) - len(self.start) - num_states)
@@ -225,24 +226,26 @@ class Problem:
         return list(zip(np.split(solution.jac, ends), np.split(solution.fun, ends), strict=True))
 
     def _residuals(self, parameters: FloatArray) -> FloatArray:
-        """What SciPy minimizes, with the initial states at their best."""
+        """Return what SciPy minimizes: the residuals at the best initial states."""
         states, blocks = self._fit_states(parameters)
         self._last = parameters.copy(), states
         residuals = np.concatenate([block.residual for block in blocks])
         return np.where(np.isfinite(residuals), residuals, FAILED)
 
     def _jacobian(self, parameters: FloatArray) -> FloatArray:
-        """The residuals' derivative; SciPy asks for it where it goes on from."""
+        """Return the derivative of the residuals, at a point that SciPy has accepted."""
         if not np.array_equal(parameters, self._last[0]):
             self._residuals(parameters)
         self._states = self._last[1]
         blocks = self._evaluate(parameters, self._states, self._rows)
         if not all(np.isfinite(block.slopes).all() for block in blocks):
-            raise SimulationError(f"a simulation nearby failed: {self._simulator.failure}")
+            raise SimulationError(
+                f"a simulation with slightly other values failed: {self._simulator.failure}"
+            )
         return np.concatenate([block.project(len(parameters)) for block in blocks])
 
     def _fit_states(self, parameters: FloatArray) -> tuple[FloatArray, list[_Block]]:
-        """Return the best initial states, shape (states, W), and the problem there."""
+        """Return the best initial states, shape (states, W), and the blocks there."""
         count = len(parameters)
         rows = self._rows[count:]
 
@@ -257,7 +260,7 @@ class Problem:
     def _evaluate(
         self, parameters: FloatArray, states: FloatArray, rows: Sequence[int]
     ) -> list[_Block]:
-        """Simulate, and differentiate with respect to some of the parameters and states."""
+        """Simulate, and differentiate with respect to the parameters and states of some rows."""
         base = self._join(parameters, states)
         signs = np.where(
             base[:, 0] + self._differences[:, np.newaxis] > self._high[:, np.newaxis], -1, 1
@@ -270,7 +273,7 @@ class Problem:
         return [_Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w]) for w, e in enumerate(errors)]
 
     def _join(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
-        """Return the values of one simulation of each trajectory, shape (names, 1, W)."""
+        """Return the values for one simulation of each trajectory, shape (names, 1, W)."""
         shared = np.tile(parameters[:, np.newaxis], len(self.trajectories))
         return np.concatenate([shared, states])[:, np.newaxis]
 
@@ -287,15 +290,15 @@ def _levenberg_marquardt(
     states: FloatArray,
     limits: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, list[_Block]]:
-    """Fit the initial state of every trajectory, each with a damping of its own.
+    """Fit the initial state of every trajectory, each with its own damping.
 
     Args:
-        evaluate: Returns the problem of each trajectory at given states.
-        states: To start from, shape (states, W).
-        limits: Least and largest states, shape (states, 1).
+        evaluate: Returns the block of each trajectory at given states.
+        states: Start values, shape (states, W).
+        limits: Lowest and highest states, shape (states, 1).
 
     Returns:
-        The states, shape (states, W), and the problem there.
+        The states, shape (states, W), and the blocks there.
     """
     damping = np.full(states.shape[1], 1e-4)
     blocks = evaluate(states)
@@ -314,15 +317,17 @@ def _levenberg_marquardt(
 
 def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
     """Return start value, lower and upper bound of a parameter."""
-    numbers = tuple(float(number) for number in np.atleast_1d(limits))
+    entries = limits if isinstance(limits, tuple | list | np.ndarray) else (limits,)
+    numbers = tuple(float_or_nan(entry) for entry in entries)
     if len(numbers) == 1:
         numbers = (*numbers, variable.minimum, variable.maximum)
     elif len(numbers) == 2:
         numbers = (_start_between(variable, *numbers), *numbers)
-    if len(numbers) != 3 or not numbers[1] <= numbers[0] <= numbers[2] > numbers[1]:
+    is_ordered = len(numbers) == 3 and numbers[1] <= numbers[0] <= numbers[2] > numbers[1]
+    if not (is_ordered and np.isfinite(numbers[0])):
         raise ConfigError(
             f"{variable.name!r}: expected a start, (low, high) or (start, low, high) "
-            f"with low <= start <= high, got {limits!r}"
+            f"with low <= start <= high, got {shown(limits)}"
         )
     return numbers[0], numbers[1], numbers[2]
 
@@ -336,13 +341,16 @@ def _start_between(variable: Variable, low: float, high: float) -> float:
 def _measured_states(
     initial_states: Mapping[str, str | float], trajectories: Sequence[Trajectory]
 ) -> FloatArray:
-    """Return the initial states that the first samples tell, shape (states, W)."""
+    """Return the initial states from the first samples or from numbers, shape (states, W)."""
     states = np.empty((len(initial_states), len(trajectories)))
-    for k, source in enumerate(initial_states.values()):
-        for w, trajectory in enumerate(trajectories):
-            if isinstance(source, str) and source not in trajectory.outputs:
-                raise unknown_name("measured output", source, trajectory.outputs)
-            states[k, w] = trajectory.outputs[source][0] if isinstance(source, str) else source
+    for k, (name, source) in enumerate(initial_states.items()):
+        if isinstance(source, str):
+            source = check_text("initial_states", source)
+            if source not in trajectories[0].outputs:
+                raise unknown_name("measured output", source, trajectories[0].outputs)
+            states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
+        else:
+            states[k] = check_number(f"the initial state {shown(name)}", source)
     return states
 
 
@@ -350,13 +358,11 @@ def _scales(
     given: Mapping[str, float], trajectories: Sequence[Trajectory], outputs: Sequence[str]
 ) -> FloatArray:
     """Return the scale of each output, shape (outputs,)."""
-    for name in given:
-        if name not in outputs:
+    for name, scale in given.items():
+        if check_text("scales", name) not in outputs:
             raise unknown_name("measured output", name, outputs)
+        check_number(f"the scale of {name!r}", scale, positive=True)
     spread = {
         n: float(np.std(np.concatenate([t.outputs[n] for t in trajectories]))) for n in outputs
     }
-    scales = np.array([given.get(name, spread[name] or 1.0) for name in outputs])
-    if not (np.isfinite(scales) & (scales > 0)).all():
-        raise ConfigError(f"scales must be positive and finite, got {dict(given)}")
-    return scales
+    return np.array([float(given.get(name, spread[name] or 1.0)) for name in outputs])

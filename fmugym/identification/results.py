@@ -1,14 +1,15 @@
-"""Measured against simulated, in numbers and in a picture."""
+"""Comparison of measurement and simulation, in numbers and in a plot."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fmugym.errors import unknown_name
+from fmugym.checks import check_integer, check_mapping, check_number, check_text
+from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
 
@@ -19,16 +20,17 @@ if TYPE_CHECKING:
 __all__ = ["Comparison", "plot_comparison"]
 
 NUM_RESAMPLES = 2000
+"""Resamples of the bootstrap."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Trajectories and what the FMU makes of them.
+    """Measured trajectories and their simulations.
 
     Attributes:
-        trajectories: The measured ones, without their stale samples.
-        simulated: The outputs at the same instants by name, for each trajectory.
-        initial_values: The start values by name from which each was simulated.
+        trajectories: The measured trajectories, without stale samples.
+        simulated: The simulated outputs by name at the same instants, for each trajectory.
+        initial_values: The start values by name of each simulation.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -36,8 +38,12 @@ class Comparison:
     initial_values: tuple[dict[str, float], ...]
 
     def residuals(self, output: str) -> list[FloatArray]:
-        """Return simulated less measured, an array for each trajectory."""
-        known = self.trajectories[0].outputs
+        """Return simulated minus measured values, an array for each trajectory.
+
+        Raises:
+            ConfigError: If the output was not measured.
+        """
+        known, output = self.trajectories[0].outputs, check_text("output", output)
         if output not in known:
             raise unknown_name("measured output", output, known)
         pairs = zip(self.simulated, self.trajectories, strict=True)
@@ -48,20 +54,25 @@ class Comparison:
         return float(np.sqrt(np.mean(np.concatenate(self.residuals(output)) ** 2)))
 
     def rms_interval(self, output: str, level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-        """Estimate how far the RMS depends on the trajectories that happen to be there.
+        """Estimate how much the RMS depends on the choice of trajectories.
 
-        A bootstrap that draws whole trajectories (windows) with replacement; Efron and
-        Tibshirani, "An Introduction to the Bootstrap" (1993). It needs ten of them or more to
-        mean much.
+        The bootstrap draws whole trajectories (windows) with replacement; see Efron and
+        Tibshirani, "An Introduction to the Bootstrap" (1993). With fewer than ten trajectories
+        the interval means little.
 
         Args:
             output: Name of the output.
-            level: Probability of the interval.
-            seed: Of the draws.
+            level: Probability of the interval, between 0 and 1.
+            seed: Seed of the draws.
 
         Returns:
             Lower and upper end of the interval, in the unit of the output.
+
+        Raises:
+            ConfigError: If the output was not measured, or an argument is out of its range.
         """
+        level = check_number("level", level, 0.0, 1.0)
+        seed = check_integer("seed", seed, 0, 2**128 - 1)
         residuals = self.residuals(output)
         squares = np.array([np.sum(residual**2) for residual in residuals])
         counts = np.array([len(residual) for residual in residuals])
@@ -75,33 +86,49 @@ class Comparison:
 def plot_comparison(
     comparison: Comparison,
     outputs: Sequence[str] | None = None,
-    labels: dict[str, str] | None = None,
+    labels: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Draw measured and simulated outputs over time.
+    """Plot measured and simulated outputs over time.
 
     Args:
-        comparison: From a fit or a prediction.
-        outputs: Which outputs to draw, one below the other; None for all.
+        comparison: The result of a fit or a prediction.
+        outputs: The outputs to plot, one below the other; None for all.
         labels: Names with units for the axes, by output.
 
     Returns:
-        A figure of matplotlib, to be saved with ``figure.savefig(path)``.
+        A figure of matplotlib. ``figure.savefig(path)`` saves it.
+
+    Raises:
+        ConfigError: If an output was not measured, or an argument has a wrong type.
     """
     from matplotlib.figure import Figure
 
-    outputs = list(comparison.trajectories[0].outputs) if outputs is None else outputs
+    if not isinstance(comparison, Comparison):
+        raise ConfigError(f"expected a Comparison, not {shown(comparison)}")
+    outputs = _chosen(comparison, outputs)
+    texts = {} if labels is None else check_mapping("labels", labels)
     figure = Figure(figsize=(8, 1 + 2 * len(outputs)), layout="constrained")
     axes = figure.subplots(len(outputs), sharex=True, squeeze=False)[:, 0]
     for ax, output in zip(axes, outputs, strict=True):
         _draw_output(ax, comparison, output)
-        ax.set_ylabel((labels or {}).get(output, output))
+        ax.set_ylabel(check_text("labels", texts.get(output, output)))
     axes[0].legend(loc="upper right")
     axes[-1].set_xlabel("time [s]")
     return figure
 
 
+def _chosen(comparison: Comparison, outputs: Sequence[str] | None) -> list[str]:
+    if outputs is None:
+        return list(comparison.trajectories[0].outputs)
+    if not isinstance(outputs, list | tuple) or not outputs:
+        raise ConfigError(f"outputs must be a list of names, not {shown(outputs)}")
+    names = [check_text("outputs", output) for output in outputs]
+    for name in names:
+        comparison.residuals(name)  # refuses an unknown name
+    return names
+
+
 def _draw_output(ax: Axes, comparison: Comparison, output: str) -> None:
-    comparison.residuals(output)  # refuses an unknown name
     labels = ("measured", "simulated")
     for measured, simulated in zip(comparison.trajectories, comparison.simulated, strict=True):
         points = measured.outputs[output]

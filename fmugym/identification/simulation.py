@@ -1,4 +1,4 @@
-"""Simulations of all trajectories at once, each under several sets of values."""
+"""Simulation of all trajectories at once, each with several sets of values."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fmugym.adapters import Status
-from fmugym.archive import FMU
-from fmugym.config import checked_value
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError
+from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.model_description import Variable
-from fmugym.pool import make_pool
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
+from fmugym.task.interface import checked_value
+from fmugym.trial.opening import make_pool
 
 __all__ = ["Simulator"]
 
@@ -22,28 +23,30 @@ logger = logging.getLogger(__name__)
 
 WARNING = int(Status.WARNING)
 
+MOST_STEPS = 10_000_000
+"""A trajectory that needs more steps has a wrong time step."""
+
 
 class Simulator:
     """One pool with an instance for each trajectory and each set of values.
 
-    Simulated time begins at 0 with each trajectory's first sample and goes on in steps of the
-    same size. Values at the sampling instants are interpolated by cubics; there is nothing to
-    interpolate where the samples lie on the steps.
+    Simulated time begins at 0 with each trajectory's first sample and advances in equal steps.
+    Cubics interpolate the outputs at sampling instants between the steps.
 
     Args:
-        fmu: The FMU; what runs is another one with the same arguments.
-        trajectories: With the same outputs and inputs all of them.
-        names: The variables of which each set has a value: parameters, start values or inputs.
-            The value of an input is added to what was logged of it.
+        fmu: The FMU. The simulator opens it again with the same arguments.
+        trajectories: Trajectories with the same outputs and inputs.
+        names: The variables whose values form a set: parameters, start values or inputs. The
+            value of an input is added to the logged input.
         fixed: Values of further parameters.
         num_sets: Largest number of sets.
         time_step: In seconds; None for the trajectories' median sampling interval.
-        backend: See ``fmugym.pool.make_pool``.
+        backend: See ``fmugym.trial.opening.make_pool``.
 
     Attributes:
         description: The FMU's model description.
         outputs: The names of the outputs, in the order of the results.
-        failure: Why the last simulation failed that did.
+        failure: The reason of the last failed simulation.
     """
 
     def __init__(
@@ -56,8 +59,8 @@ class Simulator:
         time_step: float | None = None,
         backend: str = "auto",
     ) -> None:
-        if time_step is not None and not 0 < time_step < np.inf:
-            raise ConfigError(f"time_step must be positive and finite, got {time_step!r}")
+        if time_step is not None:
+            time_step = check_number("time_step", time_step, positive=True)
         fmu = FMU.of(fmu)
         self.failure = ""
         self.description = fmu.description
@@ -80,14 +83,14 @@ class Simulator:
         self._pool.close()
 
     def simulate(self, values: FloatArray) -> list[FloatArray]:
-        """Simulate every trajectory under every set of values.
+        """Simulate every trajectory with every set of values.
 
         Args:
             values: Shape (names, sets, trajectories).
 
         Returns:
-            For each trajectory the outputs at its sampling instants, shape (sets, n, outputs);
-            NaN where a simulation failed.
+            The outputs of each trajectory at its sampling instants, shape (sets, n, outputs);
+            NaN for a failed simulation.
         """
         names, num_sets, num_trajectories = values.shape
         record = self._run(values.reshape(names, num_sets * num_trajectories))
@@ -95,7 +98,7 @@ class Simulator:
         return [grid.sample(record[..., w]) for w, grid in enumerate(self._grids)]
 
     def _note(self, failed: MaskArray) -> MaskArray:
-        """Keep the reason of the first failure."""
+        """Keep the reason of the first failure among the instances."""
         if failed.any():
             self.failure = self._pool.failure(int(failed.argmax()))
         return failed
@@ -120,7 +123,7 @@ class Simulator:
         return record
 
     def _arrange(self, values: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
-        """Sort the values into start values and offsets of inputs, a column for each instance."""
+        """Split the values into start values and offsets of inputs, a column for each instance."""
         starts = np.zeros((len(self._variables), size))
         starts[len(self._start_rows) :] = np.reshape(self._constants, (-1, 1))
         starts[: len(self._start_rows), : values.shape[1]] = values[self._start_rows]
@@ -141,19 +144,26 @@ class Simulator:
 
 
 class _Grid:
-    """The steps of one trajectory, and the way back to its sampling instants.
+    """The steps of one trajectory, and the interpolation at its sampling instants.
 
     Args:
-        trajectory: Of n samples.
+        trajectory: A trajectory of n samples.
         step: Step size in seconds.
 
     Attributes:
-        num_steps: Number of steps until the last sample is reached; at least three, as a cubic
-            needs.
+        num_steps: Number of steps up to the last sample; at least three, for the cubics.
         held: The sample whose input holds during each step, shape (num_steps,).
+
+    Raises:
+        ConfigError: If there would be more than ten million steps.
     """
 
     def __init__(self, trajectory: Trajectory, step: float) -> None:
+        duration = trajectory.time[-1] - trajectory.time[0]
+        if not duration <= MOST_STEPS * step:
+            raise ConfigError(
+                f"a time step of {step:g} s is too small for a trajectory of {duration:g} s"
+            )
         position = (trajectory.time - trajectory.time[0]) / step
         whole = np.round(position)
         position = np.where(np.abs(position - whole) < 1e-6, whole, position)
@@ -164,7 +174,7 @@ class _Grid:
         self._weights = _lagrange_weights(position - first)
 
     def sample(self, record: FloatArray) -> FloatArray:
-        """Interpolate.
+        """Interpolate the outputs at the sampling instants.
 
         Args:
             record: Outputs at each step, shape (steps + 1, k, sets).
@@ -177,7 +187,7 @@ class _Grid:
 
 
 def _lagrange_weights(x: FloatArray) -> FloatArray:
-    """Return the weights of the points 0, 1, 2, 3 in the cubic at x, shape (n, 4)."""
+    """Return the weights of the values at 0, 1, 2, 3 in the cubic at x, shape (n, 4)."""
     points = np.arange(4.0)
     weights = np.ones((len(x), 4))
     for j in range(4):
@@ -188,9 +198,9 @@ def _lagrange_weights(x: FloatArray) -> FloatArray:
 
 
 def median_interval(trajectories: Sequence[Trajectory]) -> float:
-    """The median sampling interval of the trajectories, in seconds.
+    """Return the median sampling interval of the trajectories, in seconds.
 
-    Rounded to a nanosecond, so that sampling instants that were rounded give no odd step size.
+    It is rounded to a nanosecond, so that rounded sampling instants give a round step size.
     """
     intervals = np.concatenate([np.diff(trajectory.time) for trajectory in trajectories])
     return round(float(np.median(intervals)), 9) or float(np.median(intervals))
@@ -199,7 +209,7 @@ def median_interval(trajectories: Sequence[Trajectory]) -> float:
 def _settable(fmu: FMU, name: str, fixed: Mapping[str, float | str]) -> Variable:
     variable = fmu.variable(name)
     if not (variable.numeric and variable.settable_at_start):
-        raise ConfigError(f"{name!r} is no numeric parameter, start value or input of the FMU")
+        raise ConfigError(f"{name!r} is not a numeric parameter, start value or input of the FMU")
     if name in fixed:
         raise ConfigError(f"{name!r} is both fixed and to be fitted")
     return variable
@@ -208,12 +218,12 @@ def _settable(fmu: FMU, name: str, fixed: Mapping[str, float | str]) -> Variable
 def _inputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:
     for name in names:
         if fmu.variable(name).causality != "input":
-            raise ConfigError(f"{name!r} was logged as an input, but is none of the FMU")
+            raise ConfigError(f"{name!r} was logged as an input, but is not an input of the FMU")
     return tuple(map(fmu.variable, names))
 
 
 def _outputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:
     for name in names:
         if not fmu.variable(name).numeric:
-            raise ConfigError(f"{name!r} cannot be compared with a measurement: not a number")
+            raise ConfigError(f"{name!r} cannot be compared with a measurement: it is not numeric")
     return tuple(map(fmu.variable, names))

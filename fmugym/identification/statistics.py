@@ -1,4 +1,4 @@
-"""Covariances of estimates, and the intervals that follow from them."""
+"""Covariances of estimates and their confidence intervals."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fmugym.checks import check_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
 from fmugym.identification._scipy import scipy_module
@@ -21,7 +22,7 @@ __all__ = [
 ]
 
 RANK_TOLERANCE = 1e-9
-"""Singular values below this fraction of the largest are taken for zero."""
+"""Singular values below this fraction of the largest one count as zero."""
 
 
 class Inverse(NamedTuple):
@@ -29,7 +30,7 @@ class Inverse(NamedTuple):
 
     Attributes:
         matrix: The (pseudo-)inverse of J' J, shape (k, k).
-        undetermined: The parameters that the data say nothing of, shape (k,).
+        undetermined: Whether the data leave each parameter undetermined, shape (k,).
     """
 
     matrix: FloatArray
@@ -37,10 +38,10 @@ class Inverse(NamedTuple):
 
 
 def information_inverse(jacobian: FloatArray) -> Inverse:
-    """Invert J' J by a singular value decomposition of J with columns of length one.
+    """Invert J' J by a singular value decomposition of J with columns scaled to length one.
 
     Args:
-        jacobian: Of the residuals, shape (n, k).
+        jacobian: The derivatives of the residuals, shape (n, k).
     """
     lengths = np.linalg.norm(jacobian, axis=0)
     safe = np.where(lengths > 0, lengths, 1.0)
@@ -59,10 +60,10 @@ def newey_west(scores: Sequence[FloatArray], lags: int) -> FloatArray:
 
     Args:
         scores: Regressors times residuals, an array (n, k) for each experiment.
-        lags: The largest lag with a weight, in samples.
+        lags: The largest lag with a weight above 0, in samples.
 
     Returns:
-        The covariance of the scores' sum, shape (k, k).
+        The covariance of the sum of the scores, shape (k, k).
     """
     total = sum(score.T @ score for score in scores)
     for lag in range(1, lags + 1):
@@ -78,15 +79,19 @@ def confidence_intervals(
 
     Args:
         values: Estimates by name.
-        errors: Their standard errors by name.
+        errors: Standard errors by name.
         freedom: Degrees of freedom.
         level: Probability that an interval covers the true value, between 0 and 1.
 
     Returns:
         Lower and upper end by name.
+
+    Raises:
+        ConfigError: If the level is not between 0 and 1.
     """
-    if not 0 < level < 1:
-        raise ConfigError(f"the level of confidence must lie between 0 and 1, got {level!r}")
+    level = check_number("level", level, positive=True)
+    if level >= 1.0:
+        raise ConfigError(f"level must be less than 1, not {level:g}")
     factor = float(scipy_module("stats").t.ppf(0.5 + level / 2, freedom))
     return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in values.items()}
 
@@ -96,10 +101,10 @@ def normal_distributions(
     errors: Mapping[str, float],
     bounds: Mapping[str, tuple[float, float]],
 ) -> dict[str, Normal]:
-    """Make a truncated normal distribution of every estimate.
+    """Return a truncated normal distribution for each estimate.
 
     Raises:
-        ConfigError: If the data did not determine one of them.
+        ConfigError: If the data do not determine an estimate.
     """
     for name, error in errors.items():
         if not np.isfinite(error):

@@ -1,4 +1,4 @@
-"""The equation of motion of a single pendulum, fitted to free swings by linear least squares."""
+"""Fit of a single pendulum's equation of motion to free swings, by linear least squares."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.checks import check_flag, check_number, float_or_nan
 from fmugym.distributions import Normal
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.identification.statistics import (
     confidence_intervals,
     information_inverse,
     newey_west,
     normal_distributions,
 )
-from fmugym.identification.trajectory import is_repeat
+from fmugym.identification.trajectory import float_array, is_repeat
 from fmugym.pool.base import FloatArray
 
 __all__ = ["SwingFit", "fit_swing"]
@@ -27,14 +28,14 @@ Signals = npt.ArrayLike | Sequence[npt.ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class SwingFit:
-    """What ``fit_swing`` found.
+    """The result of ``fit_swing``.
 
     Attributes:
-        values: ``p1`` [1/s], ``p2`` [1/s^2] and, if it was asked for, ``p3`` [rad/s^2].
-        standard_errors: In the units of the values.
-        covariance: Of the values, in their order, shape (k, k).
-        degrees_of_freedom: Samples less values.
-        rms: Of the residuals of the acceleration, in rad/s^2.
+        values: ``p1`` [1/s], ``p2`` [1/s^2] and, with Coulomb friction, ``p3`` [rad/s^2].
+        standard_errors: Standard errors by name, in the units of the values.
+        covariance: Covariance of the values, in their order, shape (k, k).
+        degrees_of_freedom: Number of samples minus number of values.
+        rms: Root mean square of the residuals of the acceleration, in rad/s^2.
         g: Acceleration due to gravity, in m/s^2.
     """
 
@@ -51,7 +52,11 @@ class SwingFit:
         return self.g / self.values["p2"]
 
     def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return lower and upper end by name, the length ``l`` [m] among them."""
+        """Return lower and upper end by name, including the length ``l`` [m].
+
+        Raises:
+            ConfigError: If the level is not between 0 and 1.
+        """
         values = {**self.values, "l": self.l}
         error = self.l / self.values["p2"] * self.standard_errors["p2"]
         errors = {**self.standard_errors, "l": abs(error)}
@@ -61,20 +66,27 @@ class SwingFit:
         """Convert to parameters of the bundled pendulum, a point mass with I = m l^2.
 
         Args:
-            mass: In kg; a free swing says nothing of it.
+            mass: The mass in kg, which a free swing does not determine.
 
         Returns:
             ``m`` [kg], ``l`` [m], ``b`` [N m s/rad] and, if it was fitted, ``c`` [N m].
+
+        Raises:
+            ConfigError: If the mass is not positive and finite.
         """
+        mass = check_number("mass", mass, positive=True)
         inertia = mass * self.l**2
         found = {"m": mass, "l": self.l, "b": self.values["p1"] * inertia}
         return found | ({"c": self.values["p3"] * inertia} if "p3" in self.values else {})
 
     def distributions(self, mass: float) -> dict[str, float | Normal]:
-        """Give the parameters as normal distributions, each for itself; see ``parameters``.
+        """Return the parameters as independent normal distributions; see ``parameters``.
 
-        The standard deviations are the standard errors, propagated to first order; l, b and c
-        are not below 0.
+        The standard deviations are the standard errors, propagated to first order. The
+        distributions of l, b and c begin at 0.
+
+        Raises:
+            ConfigError: If the mass is not positive and finite.
         """
         found = self.parameters(mass)
         names = [name for name in found if name != "m"]
@@ -107,19 +119,19 @@ def fit_swing(
 ) -> SwingFit:
     """Fit a pendulum's equation of motion to free swings.
 
-    The model is ``q_ddot = -p1 q_dot - p2 sin(q)``, where p1 = b / I and p2 = m g r / I; with
-    ``coulomb=True`` it has the further term ``-p3 tanh(q_dot / v_c)``, p3 = c / I. Without it, the
-    Coulomb friction of a plant goes into p1, which comes out too large. Accelerations are central
-    differences of the velocities, which make p2 too small by the fraction (w h)^2 / 6 at the
-    angular frequency w and the sampling interval h: 0.7 % for 10 rad/s at 50 Hz.
+    The model is ``q_ddot = -p1 q_dot - p2 sin(q)``, where p1 = b / I and p2 = m g r / I. With
+    ``coulomb=True`` it has the additional term ``-p3 tanh(q_dot / v_c)``, where p3 = c / I. Without
+    this term, Coulomb friction of the plant makes p1 too large. The accelerations are central
+    differences of the velocities. They make p2 too small by the fraction (w h)^2 / 6 at the angular
+    frequency w and the sampling interval h: 0.7 % for 10 rad/s at 50 Hz.
 
-    Standard errors are those of Newey and West, as differences of a noise are correlated.
+    Differences of noise are correlated, so the standard errors are those of Newey and West.
 
     Args:
-        time: The sampling instants in seconds, shape (n,), the same for all swings; or a list of
-            such, one for each swing; or the sampling interval.
+        time: The sampling instants in seconds, shape (n,), for all swings; or a list of such
+            arrays, one for each swing; or the sampling interval.
         q: Angles in rad, 0 hanging; shape (n,) or (swings, n), or a list of arrays.
-        q_dot: Angular velocities in rad/s, as q.
+        q_dot: Angular velocities in rad/s, in the same form as q.
         coulomb: Whether to fit Coulomb friction.
         v_c: Width of the Coulomb friction in rad/s; see the readme of the pendulum FMU.
         g: Acceleration due to gravity in m/s^2.
@@ -129,9 +141,13 @@ def fit_swing(
         Values, standard errors and confidence intervals.
 
     Raises:
-        ConfigError: If the arrays do not fit together, or the swings do not determine the values.
-        ImportError: From the confidence intervals, if SciPy is not there.
+        ConfigError: If an argument has a wrong type or range, if the arrays do not fit together,
+            or if the swings do not determine the values.
+        ImportError: From the confidence intervals, if SciPy is not installed.
     """
+    coulomb, g = check_flag("coulomb", coulomb), check_number("g", g, positive=True)
+    v_c = check_number("v_c", v_c, positive=True)
+    correlation_time = check_number("correlation_time", correlation_time, 0.0)
     swings = [_regression(*swing, coulomb, v_c) for swing in _swings(time, q, q_dot)]
     regressors = np.concatenate([x for x, _, _ in swings])
     inverse = information_inverse(regressors)
@@ -163,14 +179,13 @@ def _result(
 def _swings(
     time: float | Signals, q: Signals, q_dot: Signals
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Sort the arguments by swing, without stale samples."""
-    angles, velocities = _rows(q), _rows(q_dot)
-    if isinstance(time, int | float):
-        times: list[FloatArray] = [
-            np.arange(len(angle), dtype=np.float64) * time for angle in angles
-        ]
+    """Return time, angles and velocities of each swing, without stale samples."""
+    angles, velocities = _rows("q", q), _rows("q_dot", q_dot)
+    if np.isnan(interval := float_or_nan(time)):
+        times = _rows("time", time)
     else:
-        times = _rows(time)
+        period = check_number("time", interval, positive=True)
+        times = [np.arange(len(angle), dtype=np.float64) * period for angle in angles]
     if len(times) == 1:
         times *= len(angles)
     shapes = [[array.shape for array in arrays] for arrays in (times, angles, velocities)]
@@ -182,21 +197,29 @@ def _swings(
 
 def _fresh(swing: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     time, q, q_dot = swing[:, ~is_repeat(swing[1:])]
-    if len(time) < 3 or not (np.diff(time) > 0).all() or not np.isfinite(swing).all():
-        raise ConfigError("a swing needs three samples, at increasing times, all of them finite")
+    if len(time) < 3 or not (np.diff(time) > 0).all():
+        raise ConfigError("a swing needs at least three samples, at increasing times")
     return time, q, q_dot
 
 
-def _rows(signals: Any) -> list[FloatArray]:
-    """One array for each swing."""
-    several = all(np.ndim(row) == 1 for row in signals)
-    return [np.asarray(row, np.float64) for row in (signals if several else [signals])]
+def _rows(what: str, signals: Any) -> list[FloatArray]:
+    """Return one array for each swing."""
+    try:
+        several = len(signals) > 0 and all(np.ndim(row) == 1 for row in signals)
+        rows = list(signals) if several else [signals]
+    except Exception:  # objects may do anything when numpy looks at them
+        raise ConfigError(f"{what} must be an array or a list, not {shown(signals)}") from None
+    arrays = [float_array(what, row) for row in rows]
+    for array in arrays:
+        if array.ndim != 1 or len(array) < 3:
+            raise ConfigError(f"{what}: a swing needs three samples, not shape {array.shape}")
+    return arrays
 
 
 def _regression(
     time: FloatArray, q: FloatArray, q_dot: FloatArray, coulomb: bool, v_c: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Set up one swing: regressors, accelerations, and the sampling interval in s."""
+    """Return the regressors, the accelerations, and the sampling interval in s of one swing."""
     velocity = q_dot[1:-1]
     columns = [-velocity, -np.sin(q[1:-1])]
     if coulomb:

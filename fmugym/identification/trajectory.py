@@ -4,29 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_mapping, check_number
+from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 
-__all__ = ["Trajectory", "is_repeat"]
+__all__ = ["Trajectory", "common_names", "float_array", "is_repeat"]
 
 LONGEST_REPEAT = 5
-"""Repeats in a row above which a plant is taken for one at rest, not for a stale sample."""
+"""Longer runs of equal samples are a plant at rest, not stale samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What was logged of one experiment, or of a part of it.
+    """The log of one experiment or of a part of it.
 
     Attributes:
-        time: Sampling instants in seconds, increasing, at any distances; shape (n,).
+        time: Sampling instants in seconds, increasing, at any intervals; shape (n,).
         outputs: The measured values by the name of the FMU's output, each of shape (n,).
-        inputs: The inputs by name, each of shape (n,), or a number where one is constant. Each
+        inputs: The inputs by name, each of shape (n,), or a number for a constant input. Each
             value holds until the next sample.
-        label: What the trajectory is called in texts and plots.
+        label: The name of the trajectory in texts and plots.
+
+    Raises:
+        ConfigError: If an array has a wrong shape or is not finite, or the time does not increase.
     """
 
     time: FloatArray
@@ -38,11 +43,12 @@ class Trajectory:
         time = _samples("time", self.time, None)
         if len(time) < 2 or not (np.diff(time) > 0).all():
             raise ConfigError("time must have at least two samples and increase")
-        if not self.outputs:
+        outputs = _signals("outputs", self.outputs, len(time))
+        if not outputs:
             raise ConfigError("a trajectory needs at least one measured output")
-        count = len(time)
-        outputs = {name: _samples(name, values, count) for name, values in self.outputs.items()}
-        inputs = {name: _samples(name, values, count) for name, values in self.inputs.items()}
+        if not isinstance(self.label, str):
+            raise ConfigError(f"label must be a text, not {shown(self.label)}")
+        inputs = _signals("inputs", self.inputs, len(time))
         for key, value in (("time", time), ("outputs", outputs), ("inputs", inputs)):
             object.__setattr__(self, key, value)
 
@@ -50,13 +56,30 @@ class Trajectory:
         return len(self.time)
 
     def select(self, chosen: MaskArray | slice) -> Trajectory:
-        """Return a trajectory of some of the samples, as numpy indexing chooses them."""
-        outputs = {name: values[chosen] for name, values in self.outputs.items()}
-        inputs = {name: values[chosen] for name, values in self.inputs.items()}
-        return Trajectory(self.time[chosen], outputs, inputs, self.label)
+        """Return a trajectory of some of the samples.
+
+        Args:
+            chosen: A mask, a slice or an array of indices, as for numpy.
+
+        Raises:
+            ConfigError: If this is not an index, or chooses fewer than two samples.
+        """
+        try:
+            rows = np.arange(len(self))[chosen]
+        except Exception:  # objects may do anything when numpy looks at them
+            raise ConfigError(f"samples cannot be selected by {shown(chosen)}") from None
+        outputs = {name: values[rows] for name, values in self.outputs.items()}
+        inputs = {name: values[rows] for name, values in self.inputs.items()}
+        return Trajectory(self.time[rows], outputs, inputs, self.label)
 
     def between(self, start: float, end: float) -> Trajectory:
-        """Return the samples with ``start <= time < end``, in seconds."""
+        """Return the samples with ``start <= time < end``, in seconds.
+
+        Raises:
+            ConfigError: If there are fewer than two such samples.
+        """
+        start = check_number("start", start, may_be_infinite=True)
+        end = check_number("end", end, may_be_infinite=True)
         chosen = (self.time >= start) & (self.time < end)
         if chosen.sum() < 2:
             raise ConfigError(
@@ -66,22 +89,25 @@ class Trajectory:
         return self.select(chosen)
 
     def windows(self, length: float) -> list[Trajectory]:
-        """Cut the trajectory into consecutive windows.
+        """Cut the trajectory into consecutive windows, and drop an incomplete one at the end.
 
         Args:
-            length: Of each window in seconds.
+            length: Length of each window in seconds.
 
-        Returns:
-            The windows that are full; the rest at the end is left out.
+        Raises:
+            ConfigError: If a window would have fewer than two samples.
         """
+        length = check_number("length", length, positive=True)
         start, period = self.time[0], (self.time[-1] - self.time[0]) / (len(self) - 1)
+        if length < period:
+            raise ConfigError(f"windows of {length:g} s are shorter than the period {period:g} s")
         count = int((self.time[-1] - start + period) / length + 1e-9)
         return [self.between(start + i * length, start + (i + 1) * length) for i in range(count)]
 
     def without_repeats(self) -> Trajectory:
-        """Leave out stale samples: those whose outputs are all the same as just before.
+        """Drop stale samples, whose outputs all equal those of the sample before.
 
-        More than five repeats in a row are kept, as they tell of a plant at rest.
+        More than five repeats in a row stay, because they show a plant at rest.
         """
         return self.select(~is_repeat(np.stack(list(self.outputs.values()))))
 
@@ -93,8 +119,8 @@ def is_repeat(signals: FloatArray) -> MaskArray:
         signals: Shape (k, n).
 
     Returns:
-        Which samples repeat the one before in all k signals, shape (n,); runs of more than five
-        repeats are no repeats.
+        Whether each sample repeats the one before in all k signals, shape (n,). Runs of more than
+        five repeats do not count.
     """
     same = np.concatenate([[False], (np.diff(signals, axis=1) == 0).all(axis=0)])
     run = np.cumsum(~same) - 1
@@ -103,24 +129,39 @@ def is_repeat(signals: FloatArray) -> MaskArray:
     return found
 
 
-def _samples(name: str, values: npt.ArrayLike, count: int | None) -> FloatArray:
-    """Check one signal and copy it; a number is a constant signal."""
+def float_array(what: str, values: npt.ArrayLike) -> FloatArray:
+    """Return a copy of finite real numbers as an array.
+
+    Args:
+        what: What the numbers are, for the error.
+        values: Numbers of any shape.
+
+    Raises:
+        ConfigError: If there is something other than a finite real number.
+    """
     try:
-        array = np.array(values, np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{name!r} of a trajectory must be numbers") from None
-    if array.ndim == 0 and count is not None:
-        array = np.full(count, array)
-    if array.ndim != 1 or count not in (None, len(array)):
-        wanted = "(n,)" if count is None else f"({count},)"
-        raise ConfigError(f"{name!r} of a trajectory must have the shape {wanted}: {array.shape}")
+        raw = np.asarray(values)
+        if raw.dtype.kind not in "biufO":  # numpy would convert texts and complex numbers
+            raise TypeError
+        array = np.array(raw, np.float64)
+    except Exception:  # objects may do anything when numpy looks at them
+        raise ConfigError(f"{what} must be numbers, not {shown(values)}") from None
     if not np.isfinite(array).all():
-        raise ConfigError(f"{name!r} of a trajectory must be finite")
+        raise ConfigError(f"{what} must be finite")
     return array
 
 
 def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[str]]:
-    """Return the names of the outputs and inputs, which all trajectories must share."""
+    """Return the names of the outputs and inputs, which all trajectories must share.
+
+    Raises:
+        ConfigError: If something is not a trajectory, there is none, or the names differ.
+    """
+    if not isinstance(trajectories, Sequence):
+        raise ConfigError(f"expected a list of trajectories, not {shown(trajectories)}")
+    for other in trajectories:
+        if not isinstance(other, Trajectory):
+            raise ConfigError(f"expected a Trajectory, not {shown(other)}")
     if not trajectories:
         raise ConfigError("expected at least one trajectory")
     outputs, inputs = list(trajectories[0].outputs), list(trajectories[0].inputs)
@@ -128,3 +169,24 @@ def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[st
         if set(other.outputs) != set(outputs) or set(other.inputs) != set(inputs):
             raise ConfigError("all trajectories must have the same outputs and the same inputs")
     return outputs, inputs
+
+
+def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:
+    checked = check_mapping(f"{what} of a trajectory", signals)
+    for name in checked:
+        if not isinstance(name, str):
+            raise ConfigError(f"{what} of a trajectory: {shown(name)} is not a name")
+    return {name: _samples(name, values, count) for name, values in checked.items()}
+
+
+def _samples(name: str, values: npt.ArrayLike, count: int | None) -> FloatArray:
+    """Check and copy one signal; a number is a constant signal."""
+    array = float_array(f"{shown(name)} of a trajectory", values)
+    if array.ndim == 0 and count is not None:
+        array = np.full(count, array)
+    if array.ndim != 1 or count not in (None, len(array)):
+        wanted = "(n,)" if count is None else f"({count},)"
+        raise ConfigError(
+            f"{shown(name)} of a trajectory must have the shape {wanted}, not {array.shape}"
+        )
+    return array

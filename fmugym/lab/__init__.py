@@ -1,6 +1,6 @@
-"""A simulated lab of pendulum cells with the client of the CloudPendulum lab.
+"""A simulated lab of pendulum cells with the client interface of the CloudPendulum lab.
 
-A program written for the lab runs here after one import was changed::
+To run a program for the real lab here, change its import::
 
     from fmugym.lab import CellType, Client
 
@@ -11,17 +11,17 @@ A program written for the lab runs here after one import was changed::
     print(client.get_position(token))
     client.stop_gym(gym_token)
 
-`Lab` makes labs of other kinds: ``Lab("ideal")`` has cells without friction, noise and delay,
-``Lab(clock=ManualClock())`` has a time that moves by hand.
+`Lab` creates labs with other properties: ``Lab("ideal")`` has cells without friction, noise and
+delay, and ``Lab(clock=ManualClock())`` has a clock that the program moves.
 """
 
-from fmugym.clock import Clock, ManualClock, RealClock
 from fmugym.lab.client import Client
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
 from fmugym.lab.errors import LabError
 from fmugym.lab.lab import Lab, current_lab
 from fmugym.lab.presets import HARDWARE, IDEAL, Options
 from fmugym.lab.users import User
+from fmugym.pool.backend.clock import Clock, ManualClock, RealClock
 
 __all__ = [
     "HARDWARE",

@@ -1,6 +1,6 @@
-"""Who uses which cell: tokens, leases and sessions.
+"""Tokens, leases and sessions: who uses which cell.
 
-Nothing here waits or locks; the lab calls it under its lock.
+Nothing here waits or locks. The lab calls it while holding its lock.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from fmugym.lab.sessions import Gym, Session
 
 __all__ = ["Bookings", "new_token"]
 
-_REMEMBERED: Final = 256  # sessions and leases that have ended
+_REMEMBERED: Final = 256  # ended sessions and leases
 
 _Owner = TypeVar("_Owner", Gym, Session)
 
 
 class Bookings:
-    """The leases and sessions of a lab, running and ended.
+    """The running and the ended leases and sessions of a lab.
 
     Args:
         cells: The cells of the lab.
 
     Attributes:
-        cells: The same.
+        cells: The cells of the lab.
     """
 
     def __init__(self, cells: Sequence[Cell]) -> None:
@@ -40,31 +40,31 @@ class Bookings:
         self._in_use: set[Cell] = set()
 
     def get(self, token: str) -> Gym | Session | None:
-        """Return what a token stands for; of the ended ones only the last are remembered."""
-        if not isinstance(token, str):
-            raise LabError(f"a token is a text, not {token!r}")
+        """Return the lease or session of a token, or None; long ended ones are forgotten."""
         return self._live.get(token) or self._ended.get(token)
 
     def find(self, token: str, owner_type: type[_Owner], kind: str) -> _Owner:
-        """Return what a token stands for.
+        """Return the lease or session of a token.
 
         Args:
             token: The token.
-            owner_type: What it must stand for.
-            kind: Its name for errors; "experiment" and "episode" only stand for themselves.
+            owner_type: The class that it must stand for.
+            kind: "gym", "experiment", "episode", or "session" for both of the latter.
 
         Raises:
-            LabError: If it stands for nothing or something else.
+            LabError: If the token is unknown or stands for something else.
         """
         owner = self.get(token)
         if owner is None:
             raise LabError(f"this {kind} token is not valid: it is unknown or has long expired")
         if not isinstance(owner, owner_type) or kind not in (owner.kind, "session"):
-            raise LabError(f"this {kind} token is not valid: it is of a running {owner.kind}")
+            raise LabError(
+                f"this {kind} token is not valid: it is for another purpose ({owner.kind})"
+            )
         return owner
 
     def settle(self, now: float) -> None:
-        """Bring everything to the present, and put aside what has ended.
+        """Bring everything to the present, and remove what has ended.
 
         Args:
             now: The lab's time, in s.
@@ -75,11 +75,14 @@ class Bookings:
                 self._put_aside(owner)
 
     def lease(self, gym: Gym, wanted: Sequence[CellType]) -> bool:
-        """Give a lease its cells if enough are free.
+        """Give a lease its cells and begin it, if enough cells are free.
 
         Args:
-            gym: The lease; it begins with this.
-            wanted: One entry for each cell.
+            gym: The lease.
+            wanted: The type of each cell.
+
+        Returns:
+            Whether the lease began.
         """
         free = [cell for cell in self.cells if cell not in self._leased() | self._in_use]
         cells: list[Cell] = []
@@ -93,7 +96,7 @@ class Bookings:
         return True
 
     def take(self, request: Request, gym: Gym | None) -> Cell | None:
-        """Take a cell for a session, of the lease if there is one; None if there is no free one."""
+        """Take a cell for a session, from the lease if given; None if no cell is free."""
         taken = self._in_use if gym is not None else self._leased() | self._in_use
         cell = next((c for c in self.fitting(request, gym) if c not in taken), None)
         if cell is not None:
@@ -101,21 +104,21 @@ class Bookings:
         return cell
 
     def fitting(self, request: Request, gym: Gym | None) -> list[Cell]:
-        """Return the cells that would do, free or not."""
+        """Return the cells that fit a request, whether free or not."""
         cells, kind, number = (gym or self).cells, request.cell_type, request.cell_id
         return [c for c in cells if c.cell_type is kind and number in (None, c.cell_id)]
 
     def begin(self, session: Session) -> None:
-        """Enter a session on a cell that was taken."""
+        """Add a session on a cell that was taken."""
         self._live[session.token] = session
 
     def give_back(self, cell: Cell) -> None:
-        """Free a cell that was taken but got no session."""
+        """Free a cell that was taken but has no session."""
         self._in_use.discard(cell)
         cell.park()
 
     def end_all(self, reason: str, gym: Gym | None = None) -> None:
-        """End the episodes of a lease, or, without one, everything."""
+        """End the episodes of a lease; without a lease, end everything."""
         for owner in self._live.values():
             if gym is None or (isinstance(owner, Session) and owner.gym is gym):
                 owner.end(reason)
@@ -133,5 +136,5 @@ class Bookings:
 
 
 def new_token() -> str:
-    """Return a decimal number of 19 digits that nobody can guess."""
+    """Return a random decimal number of 19 digits."""
     return str(10**18 + secrets.randbelow(9 * 10**18))

@@ -1,4 +1,4 @@
-"""A cell: an FMU instance, the drive that moves it and the sensors that watch it."""
+"""A cell: an FMU instance with its drive and its sensors."""
 
 from __future__ import annotations
 
@@ -6,66 +6,57 @@ import logging
 import math
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from contextlib import closing
+from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive import FMU
-from fmugym.bundled import bundled_fmu
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_mapping
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.fmi.status import Status
+from fmugym.lab.acting import Acting
 from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance
-from fmugym.lab.drive import Drive
+from fmugym.lab.drive import HOLD_DAMPING, Drive
 from fmugym.lab.errors import LabError
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
 from fmugym.lab.presets import Options
 from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
-from fmugym.pool import Pool, PoolSpec, make_pool
+from fmugym.pool import Pool, PoolSpec
+from fmugym.task.interface import checked_value, start_variable
+from fmugym.trial.opening import make_pool
 
-__all__ = ["Cell", "Fault"]
+__all__ = ["Cell", "checked_parameters"]
 
 logger = logging.getLogger(__name__)
 
-_HOLD_DAMPING: Final = 0.03  # N m s/rad, about critical for the single pendulum
-_HOLD_TIME: Final = 3.0  # s until the held arm rests
+_HOLD_TIME: Final = 3.0  # s until a held arm is at rest
 _AT_REST: Final = 1e-4  # rad/s
-_PULL_STIFFNESS: Final = 0.43  # N m/rad, of position disturbances: that of the start position
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Why a cell came to rest before its time.
-
-    Attributes:
-        time: Time of the session, in s.
-        text: The reason, as clients get it.
-    """
-
-    time: float
-    text: str
 
 
 class Cell:
-    """A simulated cell. Its instance is made at the first start and used again by later ones.
+    """A simulated cell. The first start creates its FMU instance, and later starts reuse it.
 
     Args:
-        cell_id: Its number.
-        cell_type: Its kind.
+        cell_id: The cell's number.
+        cell_type: The cell's type.
         options: What is simulated.
-        rng: For its noise and its own parameters.
+        rng: The random generator of its noise and its friction.
         parameters: Parameters of its FMU that differ from the bundled values.
 
     Attributes:
-        cell_id: Its number.
-        cell_type: Its kind.
-        plant: Its FMU and the names in it.
+        cell_id: The cell's number.
+        cell_type: The cell's type.
+        plant: Its FMU and the names of the variables.
         position: True angles, in rad.
         velocity: True angular velocities, in rad/s.
         torque: Torques of the motors over the last step, in N m.
         drive: The drive of the present session.
         sensors: The sensors.
-        fault: Why it came to rest, or None.
+        fault: Why it came to rest early, in the words that clients get, or None.
     """
 
     def __init__(
@@ -86,7 +77,7 @@ class Cell:
         self._parameters |= parameters
         self._pool: Pool | None = None
         self._is_closed = False
-        self._simulating = threading.Lock()  # a cell gets ready while the others go on
+        self._simulating = threading.Lock()  # one cell may prepare while the lab serves others
         self.sensors = Sensors(options, self.plant.joints, rng)
         self.park()
 
@@ -96,10 +87,10 @@ class Cell:
         self.position, self.velocity = [0.0] * joints, [0.0] * joints
         self.torque = [0.0] * joints
         self.drive = Drive(self._options, [True] * joints)
-        self.fault: Fault | None = None
+        self.fault: str | None = None
         self.recording: Recording | None = None
         self._steps = 0
-        self._disturbances: list[_Acting] = []
+        self._disturbances: list[Acting] = []
 
     def start(
         self,
@@ -112,9 +103,12 @@ class Cell:
 
         Args:
             experiment: The type of experiment.
-            position: The angles asked for, in rad.
-            disturbances: What will disturb the session.
-            recording: Gets the angles and torques.
+            position: The requested angles, in rad.
+            disturbances: The disturbances of the session.
+            recording: Collects the angles and torques.
+
+        Raises:
+            SimulationError: If the FMU refuses its parameters.
         """
         self.park()
         spec = EXPERIMENTS[experiment]
@@ -125,16 +119,16 @@ class Cell:
         self.velocity = [0.0] * self.plant.joints
         self.torque = [0.0] * self.plant.joints
         self.drive = Drive(self._options, spec.driven)
-        self._disturbances = [_Acting(each) for each in disturbances]
+        self._disturbances = [Acting(each) for each in disturbances]
         self.recording = recording
         self.sensors.restart(self.position)
         self._record()
 
     def advance(self, elapsed: float) -> None:
-        """Let the arm move on.
+        """Simulate the arm, in whole steps of the drive.
 
         Args:
-            elapsed: Time since the start, in s; the last whole step before it is the last done.
+            elapsed: Time since the start, in s.
         """
         goal = math.floor(elapsed / self._options.drive_step + 1e-6)
         with self._simulating:
@@ -143,11 +137,11 @@ class Cell:
 
     @property
     def time(self) -> float:
-        """Time of the session that was simulated, in s."""
+        """Simulated time of the session, in s."""
         return self._steps * self._options.drive_step
 
     def close(self) -> None:
-        """Free the instance, for ever; more than one call is fine."""
+        """Free the instance for good; a second call does nothing."""
         with self._simulating:
             self._is_closed = True
             if self._pool is not None:
@@ -173,35 +167,43 @@ class Cell:
         pool = self._open()
         parameters = {name: changes.get(name, self._parameters[name]) for name in self._parameters}
         values = np.array([[*position, *parameters.values()]], float).T
-        pool.reset(self._start_variables, values)
+        _, statuses = pool.reset(self._start_variables, values)
+        if statuses[0] > Status.WARNING:
+            raise SimulationError(f"cell {self.cell_id} cannot start: {pool.failure(0)}")
         self._read(pool)
 
     def _hold(self, position: Sequence[float]) -> None:
-        """Let the arm sag: it is held without compensation of gravity, until it rests."""
+        """Hold the arm without gravity compensation until it is at rest, so that it sags."""
         hold = Drive(self._options, [True] * self.plant.joints)
         hold.position = list(position)
         hold.kp = [self._options.hold_stiffness] * self.plant.joints
-        hold.kd = [_HOLD_DAMPING] * self.plant.joints
+        hold.kd = [HOLD_DAMPING] * self.plant.joints
         for step in range(round(_HOLD_TIME / self._options.drive_step)):
             self._push(hold.evaluate(self.position, self.velocity))
             if step % 100 == 99 and max(map(abs, self.velocity)) < _AT_REST:
                 break
 
     def _step(self) -> None:
-        total = self.torque = self.drive.evaluate(self.position, self.velocity)
-        for each in self._disturbances:
-            total = each.apply(self.time, self.position, self.velocity, total)
-        self._push(total)
+        torque = self.torque = self.drive.evaluate(self.position, self.velocity)
+        self._push(self._disturbed(torque) if self._disturbances else torque)
         self._steps += 1
         self.sensors.observe(self.position, self.velocity, self.torque)
         self._record()
         self._check_limits()
 
+    def _disturbed(self, torque: list[float]) -> list[float]:
+        for each in self._disturbances:
+            try:
+                torque = each.apply(self.time, self.position, self.velocity, torque)
+            except Exception as error:  # a disturbance may be the user's own class
+                self.fault = f"a disturbance failed: {shown(error)}"
+        return torque
+
     def _push(self, torque: Sequence[float]) -> None:
         pool = self._open()
         pool.inputs[:, 0] = torque
         if pool.step_own():
-            self.fault = Fault(self.time, f"the cell failed: {pool.failure(0)}")
+            self.fault = f"the cell failed: {pool.failure(0)}"
         self._read(pool)
 
     def _read(self, pool: Pool) -> None:
@@ -221,7 +223,7 @@ class Cell:
         ):
             for joint, value in enumerate(values):
                 if abs(value) > limit and self.fault is None:
-                    self.fault = Fault(self.time, self._violation(kind, joint, value, limit))
+                    self.fault = self._violation(kind, joint, value, limit)
 
     def _violation(self, kind: str, joint: int, value: float, limit: float) -> str:
         return (
@@ -231,30 +233,26 @@ class Cell:
         )
 
 
-class _Acting:
-    """A disturbance in the course of a session."""
+def checked_parameters(cell_type: CellType, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Check parameters of the FMU that simulates a type of cell.
 
-    def __init__(self, disturbance: Disturbance) -> None:
-        self._disturbance = disturbance
-        self._began: float | None = None
+    Args:
+        cell_type: The type of cell.
+        parameters: Values by name; items of an enumeration may be given by name.
 
-    def apply(
-        self,
-        time: float,
-        position: Sequence[float],
-        velocity: Sequence[float],
-        torque: Sequence[float],
-    ) -> list[float]:
-        """Return the torque of each joint with the disturbance's part, in N m."""
-        disturbance = self._disturbance
-        if self._began is None and disturbance.is_due(time, position):
-            self._began = time
-        if self._began is None or time - self._began >= disturbance.duration:
-            return list(torque)
-        if disturbance.torque is not None:
-            return [own + other for own, other in zip(torque, disturbance.torque, strict=True)]
-        aims = disturbance.position or [0.0] * len(position)
-        return [
-            _PULL_STIFFNESS * (aim - q) - _HOLD_DAMPING * v
-            for aim, q, v in zip(aims, position, velocity, strict=False)
-        ]
+    Returns:
+        The values as numbers.
+
+    Raises:
+        ConfigError: If a parameter does not exist, cannot be set, or has a wrong value.
+    """
+    plant = PLANTS[cell_type]
+    values = check_mapping(f"parameters of {cell_type.name} cells", parameters)
+    checked = {}
+    with closing(FMU(bundled_fmu(plant.model))) as fmu:
+        for name, value in values.items():
+            if name in plant.start_positions:
+                raise ConfigError(f"{name!r} is the start position; use initial_position")
+            variable = start_variable(fmu.description, name, value)
+            checked[name] = checked_value(variable, value)
+    return checked

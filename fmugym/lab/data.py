@@ -1,4 +1,4 @@
-"""What the client takes and gives back."""
+"""Data types of the client's methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["ActuatorInfo", "CellInfo", "CellType", "UserInfo"]
 
 
 class CellType(enum.Enum):
-    """The kinds of cells, by their number of joints."""
+    """The types of cells, by their number of joints."""
 
     SINGLE = "single"
     """A pendulum with one joint."""
@@ -23,8 +23,8 @@ class CellInfo:
     """A cell of the lab.
 
     Attributes:
-        cell_id: Its number, for ``start_experiment(cell_id=...)``.
-        cell_type: Its kind.
+        cell_id: The cell's number, for ``start_experiment(cell_id=...)``.
+        cell_type: The cell's type.
     """
 
     cell_id: int
@@ -33,22 +33,22 @@ class CellInfo:
 
 @dataclass(frozen=True)
 class UserInfo:
-    """What a user may do, and what is left of it.
+    """A user's rights, and how much of them is left.
 
     Attributes:
         user_name: The user's name.
-        number_of_attempts: How many experiments the user may start yet.
+        number_of_attempts: How many more experiments the user may start.
         max_experiment_length: Longest experiment or episode, in s.
-        bucket_size: How many experiments may be started right now.
-        max_bucket_size: How many that are at the most.
-        refil_interval: Time after which a bucket that is not full gets one more, in s; spelt as
-            the lab spells it.
-        valid_from: When the user token begins to be valid.
-        valid_until: When it ceases to be.
+        bucket_size: How many experiments the user may start right now.
+        max_bucket_size: The largest value of ``bucket_size``.
+        refil_interval: Time after which ``bucket_size`` grows by one, in s. The lab spells it
+            this way.
+        valid_from: When the user token becomes valid.
+        valid_until: When the user token expires.
         experiment_types: The types of experiments the user may start.
         max_gym_length: Longest lease of a gym, in s; 0 without gym permission.
-        gym_bucket_size: How many gyms may be started right now.
-        gym_max_bucket_size: How many that are at the most.
+        gym_bucket_size: How many gyms the user may start right now.
+        gym_max_bucket_size: The largest value of ``gym_bucket_size``.
     """
 
     user_name: str
@@ -67,13 +67,13 @@ class UserInfo:
 
 @dataclass(frozen=True)
 class ActuatorInfo:
-    """One actuator of a cell.
+    """An actuator of a cell.
 
     Attributes:
-        name: Which joint it drives.
+        name: The joint that it drives.
         motor: The motor of the real cell.
         drive: The drive of the real cell.
-        torque_limit: Largest torque, in N m; 0 for a joint that the experiment leaves passive.
+        torque_limit: Largest torque, in N m; 0 for a joint that is passive in the experiment.
         velocity_limit: Angular velocity at which the session ends, in rad/s.
         position_limit: Angle from hanging at which the session ends, in rad.
     """

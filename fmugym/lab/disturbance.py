@@ -1,18 +1,20 @@
-"""Disturbances that an experiment brings upon its own cell.
+"""Disturbances that an experiment requests for its own cell.
 
-The names and the arguments of the two timed ones are the lab's. What the state-dependent ones take
-is not public: their arguments are this package's own. So is what a position disturbance does, which
-is to let the drive pull the joints to a position for a while, whatever was commanded.
+The real lab has the same class names, and the timed disturbances have the lab's arguments. The
+arguments of the state-dependent disturbances are not public, so this package defines its own. The
+effect of a position disturbance is not public either: here the drive pulls the joints to a position
+for a while and ignores the program's commands.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Final, Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Final, Protocol
 
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.checks import check_number
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
     "PRESETS",
@@ -24,9 +26,13 @@ __all__ = [
     "resolve",
 ]
 
+_VECTORS: Final = ("torque", "disturbance_position", "trigger_position")
+_LARGEST: Final = 1e6
+_MOST: Final = 1000  # disturbances of a session
+
 
 class Disturbance(Protocol):
-    """What all disturbances have in common; each acts at most once in a session."""
+    """The interface of all disturbances. Each acts at most once in a session."""
 
     @property
     def duration(self) -> float:
@@ -35,16 +41,16 @@ class Disturbance(Protocol):
 
     @property
     def torque(self) -> Sequence[float] | None:
-        """What it adds to the torque of each joint, in N m; None if it pulls to a position."""
+        """The torque that it adds to each joint, in N m; None if it pulls to a position."""
         ...
 
     @property
     def position(self) -> Sequence[float] | None:
-        """Where it pulls the joints, in rad; None if it adds a torque."""
+        """The position to which it pulls the joints, in rad; None if it adds a torque."""
         ...
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
-        """Whether it begins now.
+        """Whether the disturbance begins now.
 
         Args:
             time: Time of the session, in s.
@@ -55,18 +61,24 @@ class Disturbance(Protocol):
 
 @dataclass(frozen=True)
 class TimedTorqueDisturbance:
-    """A torque from outside, at a fixed time.
+    """An external torque at a fixed time.
 
     Args:
-        start_time: When it begins, in s after the session's start.
+        start_time: When it begins, in s after the start of the session.
         duration: How long it lasts, in s.
-        torque: On each joint, in N m.
+        torque: The torque on each joint, in N m.
+
+    Raises:
+        ConfigError: If an argument is not a number, or not finite.
     """
 
     start_time: float
     duration: float
     torque: Sequence[float]
     position = None
+
+    def __post_init__(self) -> None:
+        _check_fields(self)
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
         """See ``Disturbance.is_due``."""
@@ -75,12 +87,15 @@ class TimedTorqueDisturbance:
 
 @dataclass(frozen=True)
 class TimedPositionDisturbance:
-    """A pull to a position, at a fixed time.
+    """A pull to a position at a fixed time.
 
     Args:
-        trigger_time: When it begins, in s after the session's start.
-        disturbance_position: Where it pulls each joint, in rad; None for hanging down.
-        duration: How long it lasts, in s; ours.
+        trigger_time: When it begins, in s after the start of the session.
+        disturbance_position: The target of each joint, in rad; None for hanging down.
+        duration: How long it lasts, in s. The real lab has no such argument.
+
+    Raises:
+        ConfigError: If an argument is not a number, or not finite.
     """
 
     trigger_time: float
@@ -88,9 +103,12 @@ class TimedPositionDisturbance:
     duration: float = 0.5
     torque = None
 
+    def __post_init__(self) -> None:
+        _check_fields(self)
+
     @property
     def position(self) -> Sequence[float]:
-        """Where it pulls the joints, in rad."""
+        """The position to which it pulls the joints, in rad."""
         return self.disturbance_position or (0.0, 0.0)
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
@@ -100,14 +118,17 @@ class TimedPositionDisturbance:
 
 @dataclass(frozen=True)
 class StateDependentTorqueDisturbance:
-    """A torque from outside, when the joints first come near a position.
+    """An external torque that begins when the joints first come near a position.
 
     Args:
-        trigger_position: Of each joint, in rad; turns do not count.
+        trigger_position: Angle of each joint, in rad; full turns do not matter.
         duration: How long it lasts, in s.
-        torque: On each joint, in N m.
-        tolerance: How near each joint must come, in rad.
-        earliest: Before this time it does not begin, in s after the session's start.
+        torque: The torque on each joint, in N m.
+        tolerance: Largest distance of each joint from its angle, in rad.
+        earliest: It does not begin before this time, in s after the start of the session.
+
+    Raises:
+        ConfigError: If an argument is not a number, or not finite.
     """
 
     trigger_position: Sequence[float]
@@ -117,6 +138,9 @@ class StateDependentTorqueDisturbance:
     earliest: float = 0.0
     position = None
 
+    def __post_init__(self) -> None:
+        _check_fields(self)
+
     def is_due(self, time: float, position: Sequence[float]) -> bool:
         """See ``Disturbance.is_due``."""
         near = _is_near(position, self.trigger_position, self.tolerance)
@@ -125,14 +149,17 @@ class StateDependentTorqueDisturbance:
 
 @dataclass(frozen=True)
 class StateDependentPositionDisturbance:
-    """A pull to a position, when the joints first come near another one.
+    """A pull to a position that begins when the joints first come near another position.
 
     Args:
-        trigger_position: Of each joint, in rad; turns do not count.
-        disturbance_position: Where it pulls each joint, in rad; None for hanging down.
+        trigger_position: Angle of each joint, in rad; full turns do not matter.
+        disturbance_position: The target of each joint, in rad; None for hanging down.
         duration: How long it lasts, in s.
-        tolerance: How near each joint must come, in rad.
-        earliest: Before this time it does not begin, in s after the session's start.
+        tolerance: Largest distance of each joint from its angle, in rad.
+        earliest: It does not begin before this time, in s after the start of the session.
+
+    Raises:
+        ConfigError: If an argument is not a number, or not finite.
     """
 
     trigger_position: Sequence[float]
@@ -142,9 +169,12 @@ class StateDependentPositionDisturbance:
     earliest: float = 0.0
     torque = None
 
+    def __post_init__(self) -> None:
+        _check_fields(self)
+
     @property
     def position(self) -> Sequence[float]:
-        """Where it pulls the joints, in rad."""
+        """The position to which it pulls the joints, in rad."""
         return self.disturbance_position or (0.0, 0.0)
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
@@ -158,42 +188,90 @@ def _is_near(position: Sequence[float], goal: Sequence[float], tolerance: float)
     return all(abs(math.remainder(q - aim, math.tau)) <= tolerance for q, aim in pairs)
 
 
+def _check_fields(disturbance: Any) -> None:
+    """Check the arguments of a disturbance, and keep lists as tuples."""
+    for field in fields(disturbance):
+        what = f"{type(disturbance).__name__}: {field.name}"
+        value = getattr(disturbance, field.name)
+        if field.name not in _VECTORS:
+            low = 0.0 if field.name in ("duration", "tolerance") else -_LARGEST
+            checked: Any = check_number(what, value, low, _LARGEST)
+        elif value is None and field.default is None:
+            checked = None
+        else:
+            checked = _vector(what, value)
+        object.__setattr__(disturbance, field.name, checked)
+
+
+def _vector(what: str, entries: Any) -> tuple[float, ...]:
+    try:
+        if isinstance(entries, str | bytes) or len(entries) > _MOST:
+            raise TypeError
+        values = tuple(entries)
+    except Exception:
+        raise ConfigError(f"{what} must be a list of numbers, not {shown(entries)}") from None
+    return tuple(check_number(what, entry, -_LARGEST, _LARGEST) for entry in values)
+
+
 PRESETS: Final[dict[str, tuple[Disturbance, ...]]] = {
     "default_simple_pendulum": (TimedTorqueDisturbance(5.0, 0.1, (0.05,)),)
 }
-"""The lab knows the name; the push of 0.05 N m for 0.1 s after 5 s is this package's own."""
+"""The name is the lab's. The push of 0.05 N m for 0.1 s after 5 s is this package's choice."""
 
 
 def resolve(
     disturbances: str | Disturbance | Iterable[Disturbance] | None, joints: int
 ) -> tuple[Disturbance, ...]:
-    """Look presets up, and check the number of joints.
+    """Look up presets, and check the disturbances.
 
     Args:
         disturbances: The name of a preset, one disturbance, several, or None.
         joints: The number of joints of the cell.
 
     Raises:
-        ConfigError: If a preset is unknown or a list has not one entry for each joint.
+        ConfigError: If a preset does not exist, if something is not a disturbance, or if a list
+            does not have one finite number for each joint.
     """
     if disturbances is None:
         return ()
     if isinstance(disturbances, str):
-        if disturbances not in PRESETS:
-            raise unknown_name("disturbance preset", disturbances, PRESETS)
-        disturbances = PRESETS[disturbances]
-    several = disturbances if isinstance(disturbances, Iterable) else (disturbances,)
-    found = tuple(several)
-    for disturbance in found:
-        _check(disturbance, joints)
+        name = str.__str__(disturbances)
+        if name not in PRESETS:
+            raise unknown_name("disturbance preset", name, PRESETS)
+        disturbances = PRESETS[name]
+    try:
+        found = _several(disturbances)
+        for disturbance in found:
+            _check(disturbance, joints)
+    except ConfigError:
+        raise
+    except Exception as error:  # objects may do anything when they are looked at
+        raise ConfigError(
+            f"disturbances must be a preset, a disturbance or a list: {shown(disturbances)} "
+            f"({type(error).__name__})"
+        ) from None
     return found
 
 
-def _check(disturbance: Disturbance, joints: int) -> None:
-    for name in ("torque", "disturbance_position", "trigger_position"):
-        entries = getattr(disturbance, name, None)
-        if entries is not None and len(entries) != joints:
-            raise ConfigError(
-                f"{type(disturbance).__name__}: {name} has {len(entries)} entries for "
-                f"{joints} joints"
-            )
+def _several(disturbances: Any) -> tuple[Any, ...]:
+    if callable(getattr(disturbances, "is_due", None)):
+        return (disturbances,)
+    if len(disturbances) > _MOST:
+        raise ValueError("too many")
+    return tuple(disturbances)
+
+
+def _check(disturbance: Any, joints: int) -> None:
+    name = type(disturbance).__name__
+    if not callable(getattr(disturbance, "is_due", None)):
+        raise ConfigError(f"{shown(disturbance)} is not a disturbance: it has no method is_due")
+    missing = [a for a in ("duration", "torque", "position") if not hasattr(disturbance, a)]
+    if missing:
+        raise ConfigError(f"{name} is not a disturbance: it has no {missing[0]}")
+    check_number(f"{name}: duration", disturbance.duration, 0.0, _LARGEST)
+    for attribute in _VECTORS:
+        entries = getattr(disturbance, attribute, None)
+        if entries is not None and len(_vector(f"{name}: {attribute}", entries)) != joints:
+            raise ConfigError(f"{name}: {attribute} has {len(entries)} entries for {joints} joints")
+    if disturbance.torque is None and disturbance.position is not None:
+        _vector(f"{name}: position", disturbance.position)

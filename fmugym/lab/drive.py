@@ -1,31 +1,37 @@
-"""The drive of a cell: impedance control of each joint, within the limits of its torque."""
+"""The drive of a cell: impedance control of each joint, with limited torque."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from fmugym.lab.presets import Options
 
-__all__ = ["Drive"]
+__all__ = ["HOLD_DAMPING", "Drive"]
+
+HOLD_DAMPING: Final = 0.03
+"""Damping of the controllers that hold or pull an arm, in N m s/rad; about critical for the single
+pendulum."""
 
 
 class Drive:
-    """The drive's control law, tau = kp (q* - q) + kd (qd* - qd) + tau_ff, for each joint.
+    """The control law tau = kp (q* - q) + kd (qd* - qd) + tau_ff for each joint.
 
-    Hardware evaluates it at 40 kHz, here it is ``Options.drive_step``. Holding a spring's torque
-    over a step would pump energy into the joint (a damping of -kp step / 2), so the angle is taken
-    in the middle of the step, where the present velocity leads to.
+    The hardware evaluates it at 40 kHz; this drive evaluates it once in ``Options.drive_step``.
+    A spring torque that is constant over a step would pump energy into the joint, like a damping
+    of -kp step / 2. The law therefore uses the angle that the present velocity gives for the
+    middle of the step.
 
     Args:
         options: The limits and the step.
-        driven: Which joints have torque.
+        driven: Whether each joint has torque.
 
     Attributes:
         position: q* of each joint, in rad.
         velocity: qd* of each joint, in rad/s.
         torque: tau_ff of each joint, in N m.
-        kp: Of each joint, in N m/rad.
-        kd: Of each joint, in N m s/rad.
+        kp: Stiffness of each joint, in N m/rad.
+        kd: Damping of each joint, in N m s/rad.
     """
 
     def __init__(self, options: Options, driven: Sequence[bool]) -> None:

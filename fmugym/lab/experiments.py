@@ -1,4 +1,4 @@
-"""The types of experiments, and the FMUs that stand for the cells they run on."""
+"""The types of experiments, and the FMUs that simulate the cells."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from fmugym.lab.data import CellType
 
 __all__ = ["EXPERIMENTS", "PLANTS", "Experiment", "Plant"]
 
-_UNLIMITED_TORQUE: Final = 10.0  # N m; the lab's drive limits it, disturbances come on top
-_UNLIMITED_VELOCITY: Final = 1000.0  # rad/s; the lab ends a session long before
+_UNLIMITED_TORQUE: Final = 10.0  # N m; the lab's drive limits the torque, before disturbances
+_UNLIMITED_VELOCITY: Final = 1000.0  # rad/s; the lab ends a session at a lower velocity
 
 
 @dataclass(frozen=True)
 class Plant:
-    """An FMU and the names of what the lab reads and writes, joint by joint.
+    """An FMU and the names of its variables, joint by joint.
 
     Attributes:
         model: The name of the bundled FMU.
@@ -24,9 +24,9 @@ class Plant:
         positions: Outputs, in rad, 0 hanging.
         velocities: Outputs, in rad/s.
         start_positions: Parameters, in rad.
-        parameters: More parameters and their values.
-        coulomb_friction: The parameter that ``Options.coulomb_friction`` sets, if any.
-        joint_names: What the joints are called.
+        parameters: Values of further parameters by name.
+        coulomb_friction: The parameter that ``Options.coulomb_friction`` sets, or None.
+        joint_names: The names of the joints.
     """
 
     model: str
@@ -77,9 +77,9 @@ class Experiment:
     """A type of experiment.
 
     Attributes:
-        cell_type: The kind of cell it needs.
-        driven: Which joints have torque.
-        parameters: Parameters of the plant it changes, and their values.
+        cell_type: The type of cell that it needs.
+        driven: Whether each joint has torque.
+        parameters: Values of the plant's parameters that it changes.
     """
 
     cell_type: CellType

@@ -1,4 +1,4 @@
-"""The way from the client to the cell and back: it takes time, sometimes much of it."""
+"""The delay of requests on their way from the client to the cell and back."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.clock import Clock
 from fmugym.lab.presets import Options
+from fmugym.lab.timekeeper import Timekeeper
 
 __all__ = ["Network"]
 
@@ -17,18 +17,18 @@ _P99: Final = 2.3263478740408408  # the 99th percentile of the standard normal d
 
 
 class Network:
-    """Lets requests take their time.
+    """Delays requests.
 
-    The time is drawn from a log-normal distribution with the median and 99th percentile of the
-    options, and stalls come on top. All of it passes before the request takes effect.
+    Delays have a log-normal distribution with the median and the 99th percentile of the options.
+    Some requests stall in addition. A request takes effect after its whole delay.
 
     Args:
-        options: The times.
-        clock: What requests wait on.
-        rng: What the times are drawn with.
+        options: The distributions of the delays.
+        clock: The clock that requests wait on.
+        rng: The random generator of the delays.
     """
 
-    def __init__(self, options: Options, clock: Clock, rng: np.random.Generator) -> None:
+    def __init__(self, options: Options, clock: Timekeeper, rng: np.random.Generator) -> None:
         self._options, self._clock, self._rng = options, clock, rng
         self._drawing = threading.Lock()
 
@@ -48,7 +48,7 @@ class Network:
     def _draw(self, median: float, p99: float) -> float:
         options = self._options
         with self._drawing:
-            spread = math.log(max(p99 / median, 1.0)) / _P99
+            spread = math.log(p99 / median) / _P99
             duration = median * math.exp(spread * self._rng.standard_normal())
             if self._rng.random() < options.stall_share:
                 duration += self._rng.uniform(options.shortest_stall, options.longest_stall)

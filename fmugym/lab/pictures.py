@@ -1,4 +1,4 @@
-"""Pictures of cells, alone and side by side."""
+"""Pictures of one cell or of several cells side by side."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ from fmugym.rendering.window import Window
 
 __all__ = ["ArmScene", "CellFrame", "CellPicture", "CellScene", "LiveView"]
 
-_THICKNESS: Final = 0.09  # of a link, in lengths of it
+_THICKNESS: Final = 0.09  # of a link, in lengths of the arm
+_SCALE: Final = 0.15  # N m, for arrows where the torque limit is 0 or infinite
 
 _drawing = threading.Lock()
-"""One picture at a time: pygame's fonts are not made for threads."""
+"""Only one thread may draw at a time, as pygame's fonts are not thread-safe."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,10 @@ class CellFrame:
     """One moment of a cell.
 
     Args:
-        position: Angle of each joint, in rad, 0 hanging; the elbow's from the upper link on.
-        torque: Of each motor, in N m, counter-clockwise positive.
-        caption: What is written above.
+        position: Angle of each joint, in rad, 0 hanging; the elbow's is relative to the first
+            link.
+        torque: Torque of each motor, in N m, counter-clockwise positive.
+        caption: The text above the arm.
     """
 
     position: Sequence[float]
@@ -50,10 +52,10 @@ class CellFrame:
 
 @dataclass(frozen=True)
 class ArmScene:
-    """Two links in series and the torques at their joints as curved arrows.
+    """Two links in series, with the torques at their joints as curved arrows.
 
     Args:
-        torque_limit: Torque whose arrow sweeps 150 degrees, in N m.
+        torque_limit: The torque whose arrow sweeps 150 degrees, in N m.
     """
 
     torque_limit: float
@@ -88,8 +90,8 @@ class CellScene:
     """A cell with its caption.
 
     Args:
-        cell_type: The kind of cell.
-        torque_limit: Torque whose arrow sweeps 150 degrees, in N m.
+        cell_type: The type of cell.
+        torque_limit: The torque whose arrow sweeps 150 degrees, in N m.
     """
 
     cell_type: CellType
@@ -111,14 +113,16 @@ class CellPicture:
     """Draws one cell.
 
     Args:
-        cell_id: Its number, for the caption.
-        cell_type: Its kind.
-        torque_limit: Torque whose arrow sweeps 150 degrees, in N m.
+        cell_id: The cell's number, for the caption.
+        cell_type: The cell's type.
+        torque_limit: The torque whose arrow sweeps 150 degrees, in N m; if it is 0 or infinite,
+            0.15 N m takes its place.
     """
 
     def __init__(self, cell_id: int, cell_type: CellType, torque_limit: float) -> None:
         self._cell_id = cell_id
-        self._scene = CellScene(cell_type, torque_limit)
+        scale = torque_limit if 0.0 < torque_limit < math.inf else _SCALE
+        self._scene = CellScene(cell_type, scale)
         self._renderer: Renderer[CellFrame] | None = None
 
     def draw(
@@ -132,7 +136,7 @@ class CellPicture:
 
         Args:
             position: Angle of each joint, in rad.
-            torque: Of each motor, in N m.
+            torque: Torque of each motor, in N m.
             time: Time of the session, in s.
             size: Width and height of the picture, in pixels.
 
@@ -152,8 +156,8 @@ class LiveView:
     """The cells of a lease side by side, as arrays or in a window.
 
     Args:
-        pictures: One of each cell, from left to right.
-        height: Of the picture, in pixels.
+        pictures: The picture of each cell, from left to right.
+        height: Height of the picture, in pixels.
     """
 
     def __init__(self, pictures: Sequence[CellPicture], height: int = 240) -> None:
@@ -163,13 +167,13 @@ class LiveView:
     def draw(
         self, moments: Sequence[tuple[Sequence[float], Sequence[float], float]]
     ) -> npt.NDArray[np.uint8]:
-        """Draw one moment of each cell: angles in rad, torques in N m, time in s."""
+        """Draw the given angles [rad], torques [N m] and time [s] of each cell."""
         size = (self._height, self._height)
         pairs = zip(self._pictures, moments, strict=True)
         return np.concatenate([picture.draw(*moment, size) for picture, moment in pairs], axis=1)
 
     def show(self, picture: npt.NDArray[np.uint8]) -> None:
-        """Show a picture in the window, at most 25 a second."""
+        """Show a picture in the window, at most 25 per second."""
         size = (picture.shape[1], picture.shape[0])
         if self._window is None:
             self._window = Window(size, "fmugym.lab")
@@ -178,6 +182,6 @@ class LiveView:
             self._window.show(surface, 25)
 
     def close(self) -> None:
-        """Close the window; more than one call is fine."""
+        """Close the window; a second call does nothing."""
         if self._window is not None:
             self._window.close()

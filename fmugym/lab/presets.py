@@ -1,4 +1,4 @@
-"""The options of a lab, and the two sets of them that have names."""
+"""The options of a lab, and the two named presets."""
 
 from __future__ import annotations
 
@@ -7,50 +7,67 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.checks import check_flag, check_integer, check_number
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["HARDWARE", "IDEAL", "PRESETS", "Options", "make_options"]
+
+_PAIRS: Final = ("coulomb_friction", "encoder_step", "velocity_noise", "get_time", "set_time")
+_FLAGS: Final = ("saturate_torque", "clamp_setters")
+_SHARES: Final = ("early_sample_share", "stall_share")
+_LIMITS: Final = (
+    *("heartbeat", "torque_limit", "velocity_limit", "position_limit", "peak_torque"),
+    "hold_stiffness",
+)
+"""These options may be infinite."""
+
+_HIGHEST: Final = 1e6
+_LARGEST_SPREAD: Final = 1000.0  # of a 99th percentile, in medians
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a lab simulates; the defaults are those of the preset ``ideal``.
+    """What a lab simulates. The defaults are those of the preset ``ideal``.
 
-    Pairs are for shoulder and elbow; a cell with one joint takes the first. ``docs/lab.md`` names
-    the source of each value.
+    The values of a pair are for shoulder and elbow; a cell with one joint uses the first one.
+    ``docs/lab.md`` names the source of each value.
 
     Attributes:
-        heartbeat: A session ends after this time without any request, in s.
-        session_grace: How much longer than its time a session lasts, in s: a last request that the
-            network or a busy machine delays shall not come too late.
-        homing_time: How long a cell takes to get to its start position, in s.
+        heartbeat: A session ends after this time without a request, in s.
+        session_grace: How much longer than its time a session lasts, in s. The grace lets a last
+            request in that the network or a busy machine delays.
+        homing_time: Time that a cell takes to reach its start position, in s.
         starts_per_window: How many experiments, gyms and episodes a user may start within
             ``start_window``; None for any number.
-        start_window: See there, in s.
+        start_window: Length of this window, in s.
         torque_limit: Largest torque of a drive, in N m.
         velocity_limit: Angular velocity at which a session ends, in rad/s.
         position_limit: Angle from hanging at which a session ends, in rad.
-        saturate_torque: Whether a drive that is to give more than ``torque_limit`` gives that much;
-            otherwise it gives up to ``peak_torque`` and the session ends.
+        saturate_torque: Whether a drive limits its torque to ``torque_limit``. Otherwise it gives
+            up to ``peak_torque``, and a torque beyond ``torque_limit`` ends the session.
         peak_torque: Largest torque of the motor, in N m.
-        clamp_setters: Whether the client clamps what is set to the limits; otherwise it refuses.
-        hold_stiffness: Of the controller that holds the start position, in N m/rad; it knows
-            nothing of gravity, so the arm sags. Infinity for none of it.
-        drive_step: Time from one evaluation of the drive's control law to the next, in s; the FMU
-            does one step in between.
-        coulomb_friction: Lowest and highest Coulomb friction of a single pendulum's joint, in N m;
-            each cell draws its own. The double pendulum has what its own fit says.
-        sample_period: Time between new samples, in s; 0 for a new one with each ``drive_step``.
-        early_sample_share: How many of the samples come after half of ``sample_period``.
+        clamp_setters: Whether the client clamps values to the limits. Otherwise it refuses values
+            beyond them.
+        hold_stiffness: Stiffness of the controller that holds the start position, in N m/rad. It
+            does not compensate gravity, so the arm sags. Infinity holds the exact position.
+        drive_step: Time between two evaluations of the drive's control law, in s. The FMU does one
+            step in this time.
+        coulomb_friction: Lowest and highest Coulomb friction of a single pendulum's joint, in N m.
+            Each cell draws its own value. The double pendulum has the value of its fit.
+        sample_period: Time between new samples, in s; 0 for a new sample every ``drive_step``.
+        early_sample_share: Share of the samples that come after half of ``sample_period``.
         encoder_step: Resolution of the position, in rad.
         velocity_lag: Time constant of the velocity's filter, in s.
         velocity_noise: Standard deviation, in rad/s.
         torque_noise: Standard deviation, in N m.
-        get_time: Median and 99th percentile of the time a getter takes, in s.
-        set_time: The same of all other requests, in s.
-        stall_share: How many requests take much longer, evenly up to ``longest_stall``.
-        shortest_stall: What a stall adds at the least, in s.
-        longest_stall: What it adds at the most, in s.
+        get_time: Median and 99th percentile of the time that a getter takes, in s.
+        set_time: Median and 99th percentile of the time that other requests take, in s.
+        stall_share: Share of requests that stall.
+        shortest_stall: Shortest additional time of a stall, in s.
+        longest_stall: Longest additional time of a stall, in s.
+
+    Raises:
+        ConfigError: If a value has a wrong type or is out of its range.
     """
 
     heartbeat: float = 2.0
@@ -81,16 +98,45 @@ class Options:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            entries = value if isinstance(value, tuple) else (value,)
-            if any(entry is not None and not entry >= 0 for entry in entries):
-                raise ConfigError(f"{field.name} must not be negative, is {value!r}")
-        if not 1e-5 <= self.drive_step <= 2e-3:
-            raise ConfigError(f"drive_step must be 0.01 to 2 ms, is {self.drive_step!r} s")
+            object.__setattr__(self, field.name, _checked(field.name, getattr(self, field.name)))
+        stalls = (self.shortest_stall, self.longest_stall)
+        _require_order("shortest_stall and longest_stall", stalls)
+        for name in ("coulomb_friction", "get_time", "set_time"):
+            _require_order(name, getattr(self, name))
+        for name in ("get_time", "set_time"):
+            median, p99 = getattr(self, name)
+            if p99 > _LARGEST_SPREAD * median > 0.0:
+                raise ConfigError(f"{name}: {p99:g} s is more than {_LARGEST_SPREAD:g} medians")
+
+
+def _checked(name: str, value: Any) -> Any:
+    if name in _PAIRS:
+        return _pair(name, value)
+    if name in _FLAGS:
+        return check_flag(name, value)
+    if name == "starts_per_window":
+        return None if value is None else check_integer(name, value, 0, 10**9)
+    if name == "drive_step":
+        return check_number(name, value, 1e-5, 2e-3)
+    if name in _LIMITS:
+        return check_number(name, value, 0.0, may_be_infinite=True)
+    return check_number(name, value, 0.0, 1.0 if name in _SHARES else _HIGHEST)
+
+
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, tuple | list) or len(value) != 2:
+        raise ConfigError(f"{name} must be a pair of numbers, not {shown(value)}")
+    first, second = (check_number(name, entry, 0.0, _HIGHEST) for entry in value)
+    return first, second
+
+
+def _require_order(name: str, pair: tuple[float, float]) -> None:
+    if pair[0] > pair[1]:
+        raise ConfigError(f"{name}: {pair[0]:g} must not be greater than {pair[1]:g}")
 
 
 IDEAL: Final = Options()
-"""The lab's rules and limits, around cells without friction, noise and delay of their own."""
+"""The lab's rules and limits, with cells without friction, noise and delay of their own."""
 
 HARDWARE: Final = Options(
     homing_time=1.0,
@@ -107,7 +153,7 @@ HARDWARE: Final = Options(
     set_time=(0.00033, 0.00135),
     stall_share=0.002,
 )
-"""As near to the real cells as public measurements tell."""
+"""The real cells, as closely as public measurements allow."""
 
 PRESETS: Final = {"ideal": IDEAL, "hardware": HARDWARE}
 
@@ -116,18 +162,20 @@ def make_options(preset: str | Options, **changes: Any) -> Options:
     """Take a preset and change some of its options.
 
     Args:
-        preset: One of ``PRESETS``, or options of one's own.
+        preset: The name of one of ``PRESETS``, or your own options.
         changes: New values by name.
 
     Raises:
-        ConfigError: If there is no such preset or option, or a value is out of its range.
+        ConfigError: If the preset or an option does not exist, or a value is out of its range.
     """
-    if isinstance(preset, str):
-        if preset not in PRESETS:
-            raise unknown_name("preset", preset, PRESETS)
-        preset = PRESETS[preset]
+    if isinstance(preset, Options):
+        options = preset
+    elif isinstance(preset, str) and (name := str.__str__(preset)) in PRESETS:
+        options = PRESETS[name]
+    else:
+        raise unknown_name("preset", preset, PRESETS)
     known = [field.name for field in dataclasses.fields(Options)]
     for name in changes:
         if name not in known:
             raise unknown_name("option of the lab", name, known)
-    return dataclasses.replace(preset, **changes)
+    return dataclasses.replace(options, **changes)

@@ -1,4 +1,4 @@
-"""Videos of sessions: an MP4 by FFmpeg where imageio-ffmpeg is installed, else a GIF by Pillow."""
+"""Videos of sessions: MP4 if imageio-ffmpeg is installed, otherwise GIF by Pillow."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["FRAME_RATE", "Moment", "Recording", "check_can_record", "write_video
 logger = logging.getLogger(__name__)
 
 FRAME_RATE: Final = 25
-"""Frames a second of the lab's time."""
+"""Frames per second of the lab's time."""
 
-_SIZE: Final = (320, 320)  # codecs want multiples of 16
+_SIZE: Final = (320, 320)  # codecs need multiples of 16
 _FFMPEG: Final = "imageio_ffmpeg"
 _HOW_TO: Final = "install one with: pip install 'fmugym-toolbox[lab]'"
 
@@ -32,11 +32,11 @@ Frame = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Moment:
-    """What a frame shows.
+    """The content of a frame.
 
     Attributes:
         position: Angle of each joint, in rad.
-        torque: Of each motor, in N m.
+        torque: Torque of each motor, in N m.
     """
 
     position: Sequence[float]
@@ -44,10 +44,10 @@ class Moment:
 
 
 class Recording:
-    """The moments of a session, ``FRAME_RATE`` of them a second.
+    """The moments of a session, ``FRAME_RATE`` of them per second.
 
     Attributes:
-        moments: From the session's start on.
+        moments: The moments, beginning with the start of the session.
     """
 
     def __init__(self) -> None:
@@ -59,19 +59,19 @@ class Recording:
         Args:
             time: Time of the session, in s.
             position: Angle of each joint, in rad.
-            torque: Of each motor, in N m.
+            torque: Torque of each motor, in N m.
         """
         if time * FRAME_RATE >= len(self.moments) - 1e-6:
             self.moments.append(Moment(position, torque))
 
     def cut(self, duration: float) -> None:
-        """Keep the frames that begin before the session's end, and at least one."""
+        """Keep the frames that begin within a duration in s, and at least one frame."""
         frames = -(-round(duration * FRAME_RATE * 1e6) // 1_000_000)
         del self.moments[max(1, frames) :]
 
 
 def check_can_record() -> None:
-    """Find out whether a video could be written.
+    """Check that the packages for videos are installed.
 
     Raises:
         LabError: If neither imageio-ffmpeg nor Pillow is installed.
@@ -84,19 +84,21 @@ def write_video(recording: Recording, picture: CellPicture, folder: Path, name: 
     """Draw a recording and write it to a file.
 
     Args:
-        recording: What to draw.
-        picture: How to draw it.
-        folder: Where to; made if it is not there.
-        name: The file's name without its suffix.
+        recording: The moments to draw.
+        picture: Draws the cell.
+        folder: The folder of the file, which must exist.
+        name: The name of the file without its suffix.
 
     Returns:
         The path of the file.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     if importlib.util.find_spec(_FFMPEG):
         try:
             return _write_mp4(_frames(recording, picture), folder / f"{name}.mp4")
-        except (OSError, RuntimeError) as error:  # there is no FFmpeg for this platform
+        except (OSError, RuntimeError) as error:  # for example no FFmpeg for this platform
             logger.warning("no MP4 can be written (%s); writing a GIF", error)
     return _write_gif(_frames(recording, picture), folder / f"{name}.gif")
 

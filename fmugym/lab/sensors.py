@@ -1,4 +1,4 @@
-"""What the drive tells of its joints: late, coarse, noisy, and only every 2 ms anew."""
+"""The sensors of a cell: quantized, filtered, noisy, with a new sample every 2 ms."""
 
 from __future__ import annotations
 
@@ -12,21 +12,19 @@ from fmugym.lab.presets import Options
 
 __all__ = ["Sample", "Sensors"]
 
-_BLOCK = 64  # random numbers drawn at once
+_BLOCK = 64  # rows of random numbers drawn at once, as single draws are slow
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What was measured at one time.
+    """The readings of one moment.
 
     Attributes:
-        time: Time of the session, in s.
-        position: Of each joint, in rad.
-        velocity: Of each joint, in rad/s.
-        torque: Of each motor, in N m.
+        position: Angle of each joint, in rad.
+        velocity: Angular velocity of each joint, in rad/s.
+        torque: Torque of each motor, in N m.
     """
 
-    time: float
     position: list[float]
     velocity: list[float]
     torque: list[float]
@@ -36,12 +34,12 @@ class Sensors:
     """The sensors of one cell.
 
     Args:
-        options: What is wrong with them.
+        options: The imperfections of the sensors.
         joints: The number of joints.
-        rng: Where the noise comes from.
+        rng: The random generator of the noise.
 
     Attributes:
-        sample: The newest sample, which every reading repeats until the next one.
+        sample: The newest sample. Every reading repeats it until the next sample.
     """
 
     def __init__(self, options: Options, joints: int, rng: np.random.Generator) -> None:
@@ -51,10 +49,10 @@ class Sensors:
         lag = options.velocity_lag
         self._gain = 1.0 if lag == 0.0 else -math.expm1(-self._step / lag)
         self._noise: list[list[float]] = []
-        self.sample = Sample(0.0, [0.0] * joints, [0.0] * joints, [0.0] * joints)
+        self.sample = Sample([0.0] * joints, [0.0] * joints, [0.0] * joints)
 
     def restart(self, position: Sequence[float]) -> None:
-        """Begin a session with joints at rest, positions in rad."""
+        """Begin a session with joints at rest, at positions in rad."""
         self._filtered = [0.0] * self._joints
         self._count = 0
         self._take(position, [0.0] * self._joints)
@@ -62,7 +60,7 @@ class Sensors:
     def observe(
         self, position: Sequence[float], velocity: Sequence[float], torque: Sequence[float]
     ) -> None:
-        """Follow the joints over one step of the drive.
+        """Update the filter after one step of the drive, and take a sample if one is due.
 
         Args:
             position: True angles, in rad.
@@ -77,27 +75,23 @@ class Sensors:
 
     def _take(self, position: Sequence[float], torque: Sequence[float]) -> None:
         options, (of_velocity, of_torque, early) = self._options, self._draw()
+        sigmas = options.velocity_noise[: self._joints]
+        velocities = zip(self._filtered, sigmas, of_velocity, strict=True)
         self.sample = Sample(
-            self._count * self._step,
             list(map(_quantized, position, options.encoder_step)),
-            [
-                v + sigma * x
-                for v, sigma, x in zip(
-                    self._filtered, options.velocity_noise, of_velocity, strict=False
-                )
-            ],
+            [v + sigma * x for v, sigma, x in velocities],
             [tau + options.torque_noise * x for tau, x in zip(torque, of_torque, strict=True)],
         )
         is_early = self._period > 1 and early < options.early_sample_share
         self._due = self._count + (self._period // 2 if is_early else self._period)
 
     def _draw(self) -> tuple[list[float], list[float], float]:
-        """Return normal numbers for velocity and torque and an even one from 0 to 1."""
+        """Return normal numbers for velocity and torque, and a uniform one from 0 to 1."""
         n = self._joints
         if not self._noise:
             normal = self._rng.standard_normal((_BLOCK, 2 * n))
-            even = self._rng.random((_BLOCK, 1))
-            self._noise = np.concatenate([normal, even], axis=1).tolist()
+            uniform = self._rng.random((_BLOCK, 1))
+            self._noise = np.concatenate([normal, uniform], axis=1).tolist()
         row = self._noise.pop()
         return row[:n], row[n : 2 * n], row[-1]
 

@@ -1,4 +1,4 @@
-"""Leases, and the sessions that run on their cells."""
+"""Leases, experiments and episodes."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Gym:
 
     Attributes:
         token: The gym token.
-        account: Whose it is.
-        cells: The cells.
-        ends: When it ends by itself, in s of the lab's time.
-        ended: Why it ended, or None.
-        is_stopped: Whether it was stopped by its user.
-        view: Its cells side by side, or None while nobody looks.
+        account: The user's account.
+        cells: The leased cells.
+        ends: When the lease ends, in s of the lab's time.
+        ended: Why it has ended, or None.
+        is_stopped: Whether the user has stopped it.
+        view: The picture of its cells, or None before the first one.
     """
 
     token: str
@@ -38,7 +38,7 @@ class Gym:
     kind: ClassVar[str] = "gym"
 
     def bring_to(self, now: float) -> None:
-        """End the lease if its time is over, in s of the lab's time."""
+        """End the lease if its time is over; ``now`` is the lab's time in s."""
         if self.ended is None and now >= self.ends:
             self.end("its time is over")
 
@@ -50,13 +50,13 @@ class Gym:
                 self.view.close()
 
     def stop(self) -> None:
-        """End the lease for its user; see `Session.stop`."""
+        """End the lease at the user's request; see `Session.stop`."""
         _stop(self)
 
 
 @dataclass(eq=False)
 class Session:
-    """One use of one cell: an experiment, or an episode of a gym.
+    """One use of one cell: an experiment or an episode.
 
     Attributes:
         token: The session or episode token.
@@ -64,14 +64,13 @@ class Session:
         experiment: The type of the experiment.
         began: When it began, in s of the lab's time.
         length: How long it may last, in s.
-        heartbeat: How long there may be no request, in s.
+        heartbeat: Longest time without a request, in s.
         grace: How much longer than `length` it lasts, in s.
-        gym: The lease it belongs to, or None.
-        recording: Of the cell, or None.
-        ended: Why it ended, or None.
-        is_stopped: Whether it was stopped by its user.
-        duration: How long it lasted, in s, once it has ended.
-        log: What happened, one line each.
+        gym: The lease of an episode, or None.
+        recording: The recording of the cell, or None.
+        ended: Why it has ended, or None.
+        is_stopped: Whether the user has stopped it.
+        log: One line for each event.
     """
 
     token: str
@@ -85,7 +84,6 @@ class Session:
     recording: Recording | None
     ended: str | None = None
     is_stopped: bool = False
-    duration: float = 0.0
     log: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -94,7 +92,7 @@ class Session:
 
     @property
     def kind(self) -> str:
-        """What error texts call it."""
+        """The name that error texts use."""
         return "experiment" if self.gym is None else "episode"
 
     def note(self, text: str) -> None:
@@ -103,7 +101,7 @@ class Session:
             self.log.append(f"{self.cell.time:9.4f} s  {text}")
 
     def request(self, now: float) -> None:
-        """Bring the cell to the present for a request, which is a heartbeat.
+        """Bring the cell to the present for a request, which counts as a heartbeat.
 
         Args:
             now: The lab's time, in s.
@@ -117,7 +115,7 @@ class Session:
         self._last_request = now
 
     def bring_to(self, now: float) -> None:
-        """Bring the cell to the present, and end the session if it must not last until then.
+        """Bring the cell to the present, and end the session if it should have ended by then.
 
         Args:
             now: The lab's time, in s.
@@ -127,15 +125,15 @@ class Session:
         deadline, reason = self._deadline()
         self.cell.advance(min(now, deadline) - self.began)
         if self.cell.fault is not None:
-            self._end(self.cell.fault.text)
+            self._end(self.cell.fault)
         elif now >= deadline:
             self.end(reason)
 
     def end(self, reason: str) -> None:
-        """Bring the cell to rest and free it; nothing happens if that was done before.
+        """Bring the cell to rest and free it; does nothing if the session has ended.
 
         Args:
-            reason: What later requests are told.
+            reason: The reason that later requests get.
         """
         self._end(f"the {self.kind} has ended: {reason}")
 
@@ -143,16 +141,16 @@ class Session:
         if self.ended is not None:
             return
         self.note(reason)
-        self.ended, self.duration = reason, self.cell.time
+        self.ended = reason
         if self.recording is not None:
-            self.recording.cut(min(self.duration, self.length))
+            self.recording.cut(min(self.cell.time, self.length))
         self.cell.park()
 
     def stop(self) -> None:
-        """End the session for its user, which is no error if it has ended by itself.
+        """End the session at the user's request, even if it has already ended by itself.
 
         Raises:
-            LabError: If it was stopped before.
+            LabError: If the user has already stopped it.
         """
         _stop(self)
 

@@ -1,35 +1,44 @@
-"""The users of a lab, and what is left of what they may do."""
+"""The users of a lab, and how much of their rights is left."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from datetime import datetime, timedelta
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
 
+from fmugym.checks import check_flag, check_integer, check_number
+from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.lab.data import UserInfo
 from fmugym.lab.errors import LabError
 from fmugym.lab.experiments import EXPERIMENTS
 from fmugym.lab.presets import Options
 
-__all__ = ["Account", "Bucket", "User"]
+__all__ = ["Account", "Accounts", "Bucket", "User"]
+
+_COUNTS: Final = ("number_of_attempts", "max_bucket_size", "gym_max_bucket_size")
 
 
 @dataclass(frozen=True)
 class User:
-    """What a user may do. The numbers of the real lab are not public: these are nominal.
+    """A user's rights. The numbers of the real lab are not public; these are nominal.
 
     Attributes:
         name: The user's name.
         gym: Whether the user may reserve gyms.
         number_of_attempts: How many experiments the user may start in all.
         max_experiment_length: Longest experiment or episode, in s.
-        max_bucket_size: How many experiments may be started in a row.
-        refil_interval: Time until an empty bucket has one more, in s.
+        max_bucket_size: How many experiments the user may start in a row.
+        refil_interval: Time after which an empty bucket has one start again, in s.
         max_gym_length: Longest lease of a gym, in s.
-        gym_max_bucket_size: How many gyms may be reserved in a row.
+        gym_max_bucket_size: How many gyms the user may reserve in a row.
         experiment_types: The types of experiments the user may start.
-        valid_for: How long the token is valid after the lab's opening, in s.
+        valid_for: How long the token is valid after the lab opens, in s.
+
+    Raises:
+        ConfigError: If a value has a wrong type or is out of its range.
     """
 
     name: str = "guest"
@@ -43,12 +52,42 @@ class User:
     experiment_types: tuple[str, ...] = tuple(EXPERIMENTS)
     valid_for: float = 365 * 86400.0
 
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            object.__setattr__(self, field.name, _checked(field.name, getattr(self, field.name)))
+
+
+def _checked(name: str, value: Any) -> Any:
+    what = f"{name} of a user"
+    if name == "gym":
+        return check_flag(what, value)
+    if name == "experiment_types":
+        return _known_types(value)
+    if name in _COUNTS:
+        return check_integer(what, value, 0, 10**9)
+    if name == "refil_interval":
+        return check_number(what, value, 1e-3, 1e9)
+    if name != "name":
+        return check_number(what, value, 0.0, may_be_infinite=True)
+    if not isinstance(value, str):
+        raise ConfigError(f"{what} must be a text, not {shown(value)}")
+    return str.__str__(value)
+
+
+def _known_types(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, tuple | list | set | frozenset):
+        raise ConfigError(f"experiment_types of a user must be a list, not {shown(value)}")
+    for name in value:
+        if not isinstance(name, str) or str.__str__(name) not in EXPERIMENTS:
+            raise unknown_name("experiment type", name, EXPERIMENTS)
+    return tuple(str.__str__(name) for name in value)
+
 
 class Bucket:
-    """A number that each start takes one from and that time fills up again.
+    """A number of starts. Each start takes one; time adds new ones.
 
     Args:
-        size: The number at the beginning and at the most.
+        size: The initial and largest number.
         interval: Time for one more, in s.
         now: The lab's time, in s.
     """
@@ -68,25 +107,25 @@ class Bucket:
         return self._level
 
     def check(self, now: float) -> None:
-        """Refuse if it is empty.
+        """Check that a start is left at a time in s.
 
         Raises:
-            LabError: If it is.
+            LabError: If the bucket is empty.
         """
         if self.level(now) < 1:
             raise too_many_requests(self._since + self._interval - now)
 
     def take(self, now: float) -> None:
-        """Take one."""
+        """Take one at a time in s."""
         self._level = self.level(now) - 1
 
 
 class Account:
-    """What is left of a user's rights.
+    """The rights that a user has left.
 
     Args:
-        user: The rights.
-        options: Tell how many starts there may be in a while.
+        user: The user's rights.
+        options: The limits on starts.
         now: The lab's time, in s.
         date: The date at that time.
     """
@@ -100,7 +139,7 @@ class Account:
         self._starts: deque[float] = deque()
 
     def info(self, now: float) -> UserInfo:
-        """Return what is left at a time in s."""
+        """Return the rights that are left at a time in s."""
         user = self.user
         return UserInfo(
             user_name=user.name,
@@ -110,7 +149,7 @@ class Account:
             max_bucket_size=user.max_bucket_size,
             refil_interval=user.refil_interval,
             valid_from=self._date,
-            valid_until=self._date + timedelta(seconds=user.valid_for),
+            valid_until=_later(self._date, user.valid_for),
             experiment_types=user.experiment_types,
             max_gym_length=user.max_gym_length if user.gym else 0.0,
             gym_bucket_size=self._gym_bucket.level(now) if user.gym else 0,
@@ -118,19 +157,19 @@ class Account:
         )
 
     def check_valid(self, now: float) -> None:
-        """Refuse a user whose time is over.
+        """Check that the token is valid at a time in s.
 
         Raises:
-            LabError: If it is.
+            LabError: If it has expired.
         """
         if now - self._opened > self.user.valid_for:
             raise LabError(f"the token of user {self.user.name!r} has expired")
 
     def take_experiment(self, now: float) -> None:
-        """Take an attempt, from the bucket too.
+        """Count a start of an experiment at a time in s.
 
         Raises:
-            LabError: If none is left, or too many were taken in a while.
+            LabError: If no attempt is left, or the user has started too many in a short time.
         """
         if self._attempts < 1:
             raise LabError(f"user {self.user.name!r} has no attempts left")
@@ -140,10 +179,10 @@ class Account:
         self._attempts -= 1
 
     def take_gym(self, now: float) -> None:
-        """Take a gym from its bucket.
+        """Count a start of a gym at a time in s.
 
         Raises:
-            LabError: If the user may not, or too many were taken in a while.
+            LabError: If the user has no permission, or has started too many in a short time.
         """
         if not self.user.gym:
             raise LabError(f"the token of user {self.user.name!r} has no gym permission")
@@ -152,10 +191,10 @@ class Account:
         self._gym_bucket.take(now)
 
     def take_start(self, now: float) -> None:
-        """Count a start of any kind.
+        """Count a start of any kind at a time in s.
 
         Raises:
-            LabError: If there were too many in a while.
+            LabError: If the user has started too many in a short time.
         """
         limit, window = self._options.starts_per_window, self._options.start_window
         while self._starts and self._starts[0] <= now - window:
@@ -165,6 +204,56 @@ class Account:
         if len(self._starts) >= limit:
             raise too_many_requests(self._starts[0] + window - now if self._starts else window)
         self._starts.append(now)
+
+
+class Accounts:
+    """The accounts of a lab's users.
+
+    Args:
+        users: The users by their tokens; None accepts any token with the rights of ``User()``.
+        options: The limits on starts.
+        now: The lab's time, in s.
+
+    Raises:
+        ConfigError: If the users are not a mapping from texts to ``User``.
+    """
+
+    def __init__(self, users: Mapping[str, User] | None, options: Options, now: float) -> None:
+        self._users = None if users is None else _checked_users(users)
+        self._options, self._opened, self._date = options, now, datetime.now(UTC)
+        self._accounts: dict[str, Account] = {}
+
+    def find(self, user_token: str, now: float) -> Account:
+        """Return the account of a token at a time in s.
+
+        Raises:
+            LabError: If the token is unknown or has expired.
+        """
+        if self._users is not None and user_token not in self._users:
+            raise LabError("unknown user token")
+        if user_token not in self._accounts:
+            user = User() if self._users is None else self._users[user_token]
+            account = Account(user, self._options, self._opened, self._date)
+            self._accounts[user_token] = account
+        self._accounts[user_token].check_valid(now)
+        return self._accounts[user_token]
+
+
+def _checked_users(users: Any) -> dict[str, User]:
+    if not isinstance(users, Mapping):
+        raise ConfigError(f"users must be a dict of users by their tokens, not {shown(users)}")
+    for token, user in users.items():
+        if not isinstance(token, str) or not isinstance(user, User):
+            raise ConfigError(f"users: expected a text and a User, not {shown((token, user))}")
+    return {str.__str__(token): user for token, user in users.items()}
+
+
+def _later(date: datetime, seconds: float) -> datetime:
+    """Return the date some seconds later, or the last date that there is."""
+    try:
+        return date + timedelta(seconds=seconds)
+    except OverflowError:
+        return datetime.max.replace(tzinfo=UTC)
 
 
 def too_many_requests(wait: float) -> LabError:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.model_description import Variable
+from fmugym.archive.description import Variable
+from fmugym.errors import SimulationError
 from fmugym.pool.processors import available_processors
-from fmugym.pool_spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
+from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -26,46 +29,56 @@ FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
-class Pool(Protocol):
+
+class Pool(ABC):
     """N instances of one FMU.
 
     Arrays have variables first, ``(k, N)``, so that a hook's ``x, v = state`` gives one row each.
-    Outputs and statuses that come out are the pool's own arrays, always the same two, which the
-    next call writes again.
+    The pool returns the same two arrays for outputs and statuses each time; the next call
+    overwrites them.
 
-    A status is a ``fmugym.adapters.Status``. What an FMU does wrong is never raised, since it
-    concerns one instance only: its status tells, ``failure`` gives the reason, its outputs stay
-    those before the call, and the next reset mends or replaces it. The same goes for an instance
-    whose inputs are not finite, which is not stepped.
+    A status is a ``fmugym.fmi.status.Status``. A failure of an FMU is never raised, because it
+    concerns one instance only. Its status tells of the failure, and ``failure`` gives the reason.
+    Its outputs stay as they were before the call, and the next reset repairs or replaces the
+    instance. The same holds for an instance whose inputs are not finite: it is not stepped.
+
+    Attributes:
+        num_instances: N.
+        inputs: Shape (k_in, N); the caller writes to it before a step.
+        outputs: Shape (k, N).
+        statuses: Shape (N,).
+        observations: What ``step_own`` fills, shape (N, num_observed).
+        step_own: Does one step with what was written to ``inputs``, and fills ``observations``.
+            Returns how many instances have a status worse than a warning.
     """
 
     num_instances: int
     inputs: FloatArray
-    """Shape (k_in, N), for the caller to write to before a step."""
     outputs: FloatArray
-    """Shape (k, N)."""
     statuses: StatusArray
-    """Shape (N,)."""
     observations: npt.NDArray[np.float32]
-    """What ``step_own`` fills as ``step`` fills its argument, shape (N, num_observed)."""
+    step_own: Callable[[], int]
 
+    @abstractmethod
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """Start instances anew, at the first communication point, warm-up included.
 
         Args:
-            variables: The variables to be set before initialization, P of them; all numeric.
+            variables: The variables to set before initialization, P of them; all numeric.
             values: Their values, shape (P, N); only the columns in the mask are used.
             mask: Which instances to start anew, shape (N,); None for all.
 
         Returns:
-            The outputs, shape (k, N), and the statuses, shape (N,); of instances outside of the
-            mask both are as before.
+            The outputs, shape (k, N), and the statuses, shape (N,). Both are unchanged for
+            instances outside of the mask.
         """
-        ...
 
+    @abstractmethod
     def step(
         self,
         inputs: FloatArray | None = None,
@@ -83,27 +96,19 @@ class Pool(Protocol):
         Returns:
             The outputs, shape (k, N), and the statuses, shape (N,).
         """
-        ...
 
-    def step_own(self) -> int:
-        """Do one step with what was written to ``inputs``, and fill ``observations``.
-
-        Returns:
-            How many of the instances have a status worse than a warning.
-        """
-        ...
-
+    @abstractmethod
     def save(self) -> Any:
         """Copy the FMU states and times of all instances.
 
         Returns:
-            A snapshot for ``restore`` of this very pool, freed when it is no longer referred to.
+            A snapshot for ``restore`` of this very pool. It is freed with its last reference.
 
         Raises:
             SimulationError: If the FMU offers no state, or an instance cannot save it now.
         """
-        ...
 
+    @abstractmethod
     def restore(
         self, snapshot: Any, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
@@ -119,28 +124,84 @@ class Pool(Protocol):
         Raises:
             SimulationError: If the snapshot is another pool's, or an instance was replaced since.
         """
-        ...
 
+    @abstractmethod
     def failure(self, index: int) -> str:
         """Say why an instance's last status was worse than a warning."""
-        ...
 
+    @abstractmethod
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any numeric variables now, shape (len(variables), N).
 
         Raises:
             SimulationError: If an instance refuses.
         """
-        ...
 
+    @abstractmethod
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
-        """What was counted of each instance, by name, each of shape (N,); see ``HEALTH``."""
-        ...
+        """Return the counters of each instance by name, each of shape (N,); see ``HEALTH``."""
 
+    @abstractmethod
     def forget_health(self) -> None:
-        """Begin to count anew."""
-        ...
+        """Set all counters to zero."""
 
+    @abstractmethod
     def close(self) -> None:
-        """Free all instances; more than one call is fine."""
-        ...
+        """Free all instances; calling it again is fine."""
+
+    # Abilities that a pool may have. These defaults are those of a pool without them.
+
+    @property
+    def is_real(self) -> bool:
+        """Whether a step may move something real, so that nothing is to be tried with it."""
+        return False
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """How instances start an episode anew."""
+        return ResetMethod.RESET
+
+    @property
+    def can_play(self) -> bool:
+        """Whether the pool can run compiled hooks in its own pass (``NativePool.prepare_play``)."""
+        return False
+
+    def prepare_play(
+        self,
+        variables: tuple[Variable, ...],
+        programs: Any,
+        actions: tuple[int, int],
+        start_values: FloatArray,
+        draws: Any,
+        episodes: Any,
+    ) -> Callable[..., tuple[int, int]]:
+        """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool cannot; ``can_play`` tells.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+
+    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
+        """Set what the function of ``prepare_play`` draws episodes from.
+
+        Raises:
+            SimulationError: If the pool cannot; ``can_play`` tells.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
+
+    def watched(self, function: Callable[P, R]) -> Callable[P, R]:
+        """Add the memory that a reset function allocates to the growth counter."""
+        return function
+
+    def halt(self) -> None:
+        """Stop at once what goes on without being stepped; the next reset starts it again."""
+        return
+
+    def note_fault(self, index: int) -> None:
+        """Count a fault that the caller found: numbers made of the outputs are not finite."""
+        return
+
+    def info(self) -> dict[str, npt.NDArray[Any]]:
+        """Return what is known of the last step by name, each of shape (N,)."""
+        return {}

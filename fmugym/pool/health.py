@@ -1,4 +1,4 @@
-"""What is counted of each instance of a pool: its work and its faults."""
+"""The counters of a pool: the work and the faults of each instance."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.adapters import Status
-from fmugym.pool.base import PoolSpec
+from fmugym.fmi.status import Status
+from fmugym.pool.base import Pool
+from fmugym.pool.spec import PoolSpec, ResetMethod
 
 __all__ = [
     "HEALTH",
     "HEALTH_COUNTS",
     "Column",
-    "Counted",
+    "CountedPool",
     "HealthArray",
     "fault_rates",
     "no_counts",
@@ -36,14 +37,14 @@ HEALTH: Final = (
     "recyclings",
     "deaths",
 )
-"""The names of the counts, in the order of the columns; ``native/pool.h`` has the same order."""
+"""The names of the counters, in the order of the columns and of ``native/pool.h``."""
 
 HEALTH_COUNTS: Final = len(HEALTH) + 1
-"""Columns of an array of counts; the last one has the retries of the last step."""
+"""The number of columns of an array of counts; the last has the retries of the last step."""
 
 
 class Column:
-    """The indices of the columns."""
+    """The index of each column."""
 
     RESETS, STEPS, DISCARDS, ERRORS, FATALS, NOT_FINITE = range(6)
     RETRIES, REPLACEMENTS, RECYCLINGS, DEATHS, RETRIED = range(6, HEALTH_COUNTS)
@@ -58,12 +59,12 @@ _FAULTS: Final = {
 
 
 def no_counts(num_instances: int) -> HealthArray:
-    """Counts of N instances of which nothing has been counted yet."""
+    """Make the counts of N instances, all zero."""
     return np.zeros((num_instances, HEALTH_COUNTS), np.int64)
 
 
 def note(counts: HealthArray, status: int) -> int:
-    """Count a status of one instance, whose counts these are, if it is a fault; returns it."""
+    """Add a status to the counts of its instance if it is a fault; returns the status."""
     if status > Status.WARNING:
         column = _FAULTS.get(Status(status))
         if column is not None:
@@ -71,17 +72,25 @@ def note(counts: HealthArray, status: int) -> int:
     return status
 
 
-class Counted:
-    """The health of a pool, which has ``_spec`` and ``_counts`` of shape (N, HEALTH_COUNTS)."""
+class CountedPool(Pool):
+    """A pool that counts what its instances do.
+
+    A subclass sets ``_spec``, and ``_counts`` of shape (N, HEALTH_COUNTS).
+    """
 
     _spec: PoolSpec
     _counts: HealthArray
 
+    @property
+    def reset_method(self) -> ResetMethod:
+        """See ``Pool.reset_method``."""
+        return self._spec.reset_method
+
     def _count_steps(self) -> None:
-        """Let the counts have all steps until now."""
+        """Add the steps until now to the counts."""
 
     def _memory_growth(self) -> Any:
-        """In bytes, for each instance or for all."""
+        """How much memory has grown, in bytes: one number for each instance, or one for all."""
         return 0
 
     def health(self) -> dict[str, HealthArray]:
@@ -96,15 +105,19 @@ class Counted:
         self._count_steps()
         self._counts[:] = 0
 
+    def note_fault(self, index: int) -> None:
+        """See ``Pool.note_fault``."""
+        self._counts[index, Column.NOT_FINITE] += 1
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """What is told of each step, of shape (N,): how often it was repeated, if it may be."""
+        """See ``Pool.info``: how often the last step was repeated, if steps may be repeated."""
         if not self._spec.fault_retries:
             return {}
         return {"retries": self._counts[:, Column.RETRIED].copy()}
 
 
 def fault_rates(health: dict[str, HealthArray]) -> npt.NDArray[np.float64]:
-    """The part of the episodes that ended by a fault, of each instance, shape (N,)."""
+    """The share of each instance's episodes that ended with a fault, shape (N,)."""
     kinds: Iterable[str] = ("discards", "errors", "fatals", "not_finite", "deaths")
     faults = sum((health[kind] for kind in kinds), np.zeros_like(health["resets"]))
     rates: npt.NDArray[np.float64] = np.minimum(1.0, faults / np.maximum(1, health["resets"]))

@@ -26,10 +26,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.adapters import Status
-from fmugym.archive import FMU
-from fmugym.errors import FMULoadError, SimulationError
-from fmugym.model_description import Variable
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import LoadableFMU
+from fmugym.errors import FMULoadError, SimulationError, printable
+from fmugym.fmi.status import Status
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -37,8 +37,9 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.health import Counted, HealthArray, no_counts
+from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["NativePool"]
 
@@ -75,7 +76,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(Counted):
+class NativePool(CountedPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -87,7 +88,7 @@ class NativePool(Counted):
             processor that this process may use. Results do not depend on it.
         private_libraries: Whether each instance gets a copy of the FMU's library, and so of its
             global variables, of its own; by default only where the FMU says that it can be
-            instantiated only once per process. See ``fmugym.pool.isolation``.
+            instantiated only once per process. See ``fmugym.trial.shared_globals``.
         first_index: What messages number the first instance.
         counts: Where to count what is in ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
 
@@ -104,7 +105,7 @@ class NativePool(Counted):
 
     def __init__(
         self,
-        fmu: FMU,
+        fmu: LoadableFMU,
         spec: PoolSpec,
         num_instances: int,
         log: logging.Logger,
@@ -141,6 +142,7 @@ class NativePool(Counted):
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
+        method = spec.reset_method
         paths = [fmu.prepare_library()]
         folder = fmu.extract()
         if private_libraries:
@@ -165,6 +167,9 @@ class NativePool(Counted):
                     "substeps": spec.substeps,
                     "warm_up_steps": spec.warm_up_steps,
                     "retries": spec.fault_retries,
+                    "restores": method == ResetMethod.RESTORE,
+                    "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
+                    "reloads": method == ResetMethod.LIBRARY,
                 },
                 variables={
                     "inputs": self._access(spec.inputs),
@@ -199,6 +204,11 @@ class NativePool(Counted):
             self._accesses[variables] = access
         return access
 
+    @property
+    def can_play(self) -> bool:
+        """See ``Pool.can_play``."""
+        return True
+
     # The contract of Pool.
 
     def reset(
@@ -225,6 +235,8 @@ class NativePool(Counted):
         if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
             name = self._fmu.description.model_name
             raise SimulationError(f"{name} cannot get and set its state")
+        if self._watch is not None:
+            self._watch.has_snapshots = True
         snapshot = self._open_pool().save()
         if isinstance(snapshot, int):
             raise SimulationError(self.failure(snapshot))
@@ -254,7 +266,7 @@ class NativePool(Counted):
             variables = self._spec.inputs if "inputs" in doing else self._spec.outputs
             return f"{doing}: {_not_finite(variables, values)}"
         text = self._sentence(index, doing, status, time, string)
-        text += f"; the FMU said: {said}" if said else ""
+        text += f"; the FMU said: {printable(said)}" if said else ""
         return f"the warm-up failed: {text}" if in_warm_up else text
 
     def _sentence(self, index: int, doing: str, status: int, time: float, string: int) -> str:
@@ -449,7 +461,7 @@ class NativePool(Counted):
 
 
 class PlayProgram(Protocol):
-    """See ``fmugym.vector.trace.Program``."""
+    """See ``fmugym.vector.hooks.program.Program``."""
 
     @property
     def code(self) -> npt.NDArray[np.uint16]:
@@ -480,12 +492,14 @@ class _Receiver:
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         number = self._first_index + index
-        self._log.log(level, "%s_%d: [%s] %s", self._model, number, category, message)
+        texts = printable(category), printable(message)
+        self._log.log(level, "%s_%d: [%s] %s", self._model, number, *texts)
 
 
 def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
     pairs = zip(variables, np.frombuffer(values).tolist(), strict=True)
-    return ", ".join(f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+    bad = (f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+    return printable(", ".join(bad))
 
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:
@@ -526,6 +540,6 @@ def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
     return paths
 
 
-def _close(pool: _native.Pool, fmu: FMU) -> None:
+def _close(pool: _native.Pool, fmu: LoadableFMU) -> None:
     pool.close()
     fmu.close()

@@ -1,9 +1,8 @@
-"""Pictures of environments: a renderer, an anti-aliased canvas and the scenes drawn on it.
+"""Pictures of environments: a renderer, an anti-aliased canvas and scenes.
 
-A `Renderer` turns the frames of a scene into a window (`render_mode="human"`) or into arrays
-(`render_mode="rgb_array"`, which needs no display). The scenes of the bundled models are
-`CartPoleScene` and `PendulumScene`; a scene for another FMU is any object that follows the
-protocol `Scene`:
+A `Renderer` draws the frames of a scene into a window (`render_mode="human"`) or into arrays
+(`render_mode="rgb_array"`, which needs no display). The bundled models have the scenes
+`CartPoleScene` and `PendulumScene`. For another FMU, write a class with the protocol `Scene`:
 
     class TankScene:
         world = World(left=-1.0, bottom=0.0, right=1.0, top=2.0)  # m

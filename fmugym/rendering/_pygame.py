@@ -1,7 +1,7 @@
-"""pygame, imported without its greeting and without the warnings of its own imports.
+"""Import of pygame without its greeting and without the warnings of its own imports.
 
-The modules of this package take pygame from here. The greeting is switched off by an environment
-variable that is set only during the import, so that a user's other programs are not affected.
+The modules of this package import pygame from here. An environment variable switches the greeting
+off. It is set during the import only, so that it does not affect other programs.
 """
 
 import os
@@ -14,7 +14,7 @@ try:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import pygame
-        import pygame.pkgdata  # imports the deprecated pkg_resources where it is installed
+        import pygame.pkgdata  # imports the deprecated pkg_resources if it is installed
 finally:
     if _before is None:
         del os.environ[_GREETING]

@@ -1,28 +1,51 @@
 """An anti-aliased drawing surface in world coordinates."""
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_integer, check_number
+from fmugym.errors import ConfigError, shown
 from fmugym.rendering._pygame import pygame
 
 Color: TypeAlias = tuple[int, int, int]
 Point: TypeAlias = tuple[float, float]
 _Points: TypeAlias = NDArray[np.float64]
 
-_ARC_STEP: Final = math.radians(2.0)  # a chord is then within 0.1 pixel of its arc up to 600 pixels
+_ARC_STEP: Final = math.radians(2.0)  # keeps chords within 0.1 pixel up to a radius of 600 pixels
 _HEAD_LENGTH: Final = 2.6  # of an arrow, in shaft thicknesses
-_HEAD_HALF_WIDTH: Final = 1.55  # likewise
+_HEAD_HALF_WIDTH: Final = 1.55  # of an arrow, in shaft thicknesses
+_MOST_PIXELS: Final = 2**28  # of the supersampled picture, about 1 GB
+
+_CallT = TypeVar("_CallT", bound=Callable[..., Any])
+
+
+def _drawing(method: _CallT) -> _CallT:
+    """Name the method in errors about its arguments."""
+
+    @functools.wraps(method)
+    def draw(self: "Canvas", *arguments: Any, **options: Any) -> Any:
+        try:
+            return method(self, *arguments, **options)
+        except ConfigError:
+            raise
+        except Exception as error:  # objects may do anything when they are converted
+            what = shown((*arguments, options))
+            raise ConfigError(
+                f"Canvas.{method.__name__} cannot draw {what}: {shown(error)}"
+            ) from error
+
+    return cast(_CallT, draw)
 
 
 @dataclass(frozen=True)
 class World:
-    """The part of the world that a picture is sure to show, y pointing up.
+    """The part of the world that a picture shows at least; y points up.
 
     Args:
         left: Smallest x, in the unit of the scene, usually m.
@@ -40,6 +63,8 @@ class World:
     top: float
 
     def __post_init__(self) -> None:
+        for name in ("left", "bottom", "right", "top"):
+            object.__setattr__(self, name, check_number(f"bounds: {name}", getattr(self, name)))
         spans = (self.right - self.left, self.top - self.bottom)
         if not all(math.isfinite(span) and span > 0.0 for span in spans):
             raise ConfigError(f"bounds must be finite, with left < right, bottom < top: {self}")
@@ -48,19 +73,25 @@ class World:
 class Canvas:
     """Draws filled shapes at a multiple of the picture's size and scales them down smoothly.
 
-    The world is fitted into the picture with one scale for both axes, and centred. A shape with
-    a coordinate that is not finite is left out; one outside of the picture is clipped.
+    The world is centred in the picture, with the same scale for both axes. The canvas omits
+    shapes with coordinates that are not finite, and clips shapes outside the picture.
 
     Args:
         size: Width and height of the picture, in pixels.
         world: The part of the world to show.
         supersampling: Drawn pixels per pixel of the picture, along each axis. A power of two
-            keeps colours exact: pygame's weights for other factors do not sum to one.
+            keeps colours exact; for other factors, pygame's weights do not sum to one.
+
+    Raises:
+        ConfigError: If an argument has a wrong type or is out of its range. The methods raise it
+            for arguments that cannot be drawn.
     """
 
     def __init__(self, size: tuple[int, int], world: World, supersampling: int = 4) -> None:
-        width, height = size
-        self.size = size
+        if not isinstance(world, World):
+            raise ConfigError(f"expected a World, not {shown(world)}")
+        supersampling = check_integer("supersampling", supersampling, 1, 16)
+        width, height = self.size = size = checked_size(size, supersampling)
         self._supersampling = supersampling
         self._drawn = pygame.Surface((width * supersampling, height * supersampling), 0, 32)
         self._picture = pygame.Surface(size, 0, 32)
@@ -75,21 +106,27 @@ class Canvas:
             0.5 * height + self._scale * 0.5 * (world.bottom + world.top),
         )
 
+    @_drawing
     def clear(self, color: Color) -> None:
         """Fill the picture with one colour."""
         self._drawn.fill(color)
 
+    @_drawing
     def polygon(self, points: ArrayLike, color: Color) -> None:
         """Fill a polygon.
 
         Args:
-            points: Corners in world coordinates, shape (corners, 2), at least three.
+            points: Three or more corners in world coordinates, shape (corners, 2).
             color: Colour of the inside.
         """
-        pixels = self._pixels(np.asarray(points, dtype=np.float64))
+        corners = np.asarray(points, dtype=np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 2:
+            raise ConfigError(f"points must have the shape (corners, 2), not {corners.shape}")
+        pixels = self._pixels(corners)
         if pixels is not None:
             pygame.draw.polygon(self._drawn, color, pixels)
 
+    @_drawing
     def rectangle(
         self, center: Point, width: float, height: float, color: Color, radius: float = 0.0
     ) -> None:
@@ -107,14 +144,17 @@ class Canvas:
         ]
         self.polygon(np.concatenate(corners), color)
 
+    @_drawing
     def circle(self, center: Point, radius: float, color: Color) -> None:
         """Fill a circle."""
         self.polygon(_arc(center, radius, 0.0, math.tau), color)
 
+    @_drawing
     def ring(self, center: Point, radius: float, thickness: float, color: Color) -> None:
-        """Draw a circle's line, `thickness` wide and centred on `radius`."""
+        """Draw a circular line of a thickness, with its middle at `radius`."""
         self.polygon(_band(center, radius, thickness, 0.0, math.tau), color)
 
+    @_drawing
     def sector(
         self, center: Point, radius: float, start: float, sweep: float, color: Color
     ) -> None:
@@ -129,6 +169,7 @@ class Canvas:
         """
         self.polygon(np.concatenate([[center], _arc(center, radius, start, sweep)]), color)
 
+    @_drawing
     def line(self, start: Point, end: Point, thickness: float, color: Color) -> None:
         """Draw a straight line with round ends."""
         angle = math.atan2(end[1] - start[1], end[0] - start[0])
@@ -138,8 +179,9 @@ class Canvas:
         ]
         self.polygon(np.concatenate(ends), color)
 
+    @_drawing
     def arrow(self, start: Point, end: Point, thickness: float, color: Color) -> None:
-        """Draw a straight arrow whose tip is at `end`; one without length is not drawn.
+        """Draw a straight arrow with its tip at `end`, unless its length is 0.
 
         Args:
             start: Middle of the blunt end, in world coordinates.
@@ -156,6 +198,7 @@ class Canvas:
         outline = _arrow_outline(length, thickness)
         self.polygon(np.asarray(start) + outline @ np.array([along, across]), color)
 
+    @_drawing
     def arc_arrow(
         self,
         center: Point,
@@ -165,13 +208,13 @@ class Canvas:
         thickness: float,
         color: Color,
     ) -> None:
-        """Draw an arrow along a circle; one without sweep is not drawn.
+        """Draw an arrow along a circle, unless its sweep is 0.
 
         Args:
             center: Centre of the circle, in world coordinates.
             radius: Radius of the middle of the shaft, in world units.
             start: Angle of the blunt end from the x axis, counter-clockwise, in rad.
-            sweep: Angle from there to the tip, counter-clockwise positive, in rad; at most a turn.
+            sweep: Angle from there to the tip, counter-clockwise positive, in rad, within a turn.
             thickness: Thickness of the shaft, in world units; a short arrow is thinner.
             color: Colour of the arrow.
         """
@@ -184,37 +227,39 @@ class Canvas:
         angles, radii = start + outline[:, 0], outline[:, 1:]
         self.polygon(np.asarray(center) + radii * _directions(angles), color)
 
+    @_drawing
     def text(
         self, position: Point, text: str, size: int, color: Color, anchor: str = "center"
     ) -> None:
-        """Write one line of text at a place in the world.
+        """Write one line of text at a position in the world.
 
         Args:
-            position: Where the anchor goes, in world coordinates.
+            position: The position of the anchor, in world coordinates.
             text: The text.
             size: Height of the font, in pixels of the picture.
             color: Colour of the text.
-            anchor: Which point of the text is placed: "center", "midtop", "topleft", and so on,
-                as the attributes of a `pygame.Rect`.
+            anchor: The point of the text at the position: "center", "midtop", "topleft" or
+                another attribute of a `pygame.Rect`.
         """
         pixels = self._pixels(np.array([position]))
         if pixels is not None:
             self._write((pixels[0][0], pixels[0][1]), text, size, color, anchor)
 
+    @_drawing
     def caption(
         self, pixel: tuple[int, int], text: str, size: int, color: Color, anchor: str = "topleft"
     ) -> None:
-        """Write one line of text at a pixel, counted from the upper left corner; see `text`."""
+        """Write one line of text at a pixel from the upper left corner; see `text`."""
         x, y = pixel[0] * self._supersampling, pixel[1] * self._supersampling
         self._write((x, y), text, size, color, anchor)
 
     def picture(self) -> pygame.Surface:
-        """Return the picture drawn since `clear`; the surface is used again by the next call."""
+        """Return the picture; the next call overwrites the surface."""
         pygame.transform.smoothscale(self._drawn, self.size, self._picture)
         return self._picture
 
     def _pixels(self, points: _Points) -> list[list[int]] | None:
-        """Return drawn pixels, kept near the picture, or None if a coordinate is not finite."""
+        """Return pixels in or near the picture, or None if a coordinate is not finite."""
         if not np.isfinite(points).all():
             return None
         pixels = np.asarray(self._origin) + points * (self._scale, -self._scale)
@@ -231,7 +276,7 @@ class Canvas:
     def _label(self, text: str, size: int, color: Color) -> pygame.Surface:
         try:
             return self._font(size).render(text, True, color)
-        except pygame.error:  # another package has called pygame.quit(), which ends all fonts
+        except pygame.error:  # pygame.quit() in another package closes all fonts
             self._fonts.clear()
             return self._font(size).render(text, True, color)
 
@@ -240,6 +285,24 @@ class Canvas:
             pygame.font.init()
             self._fonts[size] = pygame.font.Font(None, size)
         return self._fonts[size]
+
+
+def checked_size(size: Any, supersampling: int = 4) -> tuple[int, int]:
+    """Return the size of a picture.
+
+    Args:
+        size: Width and height, in pixels.
+        supersampling: Drawn pixels per pixel, along each axis.
+
+    Raises:
+        ConfigError: If the size is not a pair of positive integers, or is too large.
+    """
+    if not isinstance(size, tuple | list) or len(size) != 2:
+        raise ConfigError(f"size must be a width and a height, not {shown(size)}")
+    width, height = (check_integer("width and height", side, 1, 2**15) for side in size)
+    if width * height * supersampling**2 > _MOST_PIXELS:
+        raise ConfigError(f"a picture of {width} x {height} pixels is too large")
+    return width, height
 
 
 def direction(angle: float) -> Point:
@@ -262,7 +325,7 @@ def _arc(center: Point, radius: float, start: float, sweep: float) -> _Points:
 
 
 def _band(center: Point, radius: float, thickness: float, start: float, sweep: float) -> _Points:
-    """Return the outline of an arc of some thickness."""
+    """Return the outline of an arc with a thickness."""
     outer = _arc(center, radius + 0.5 * thickness, start, sweep)
     inner = _arc(center, radius - 0.5 * thickness, start + sweep, -sweep)
     return np.concatenate([outer, inner])

@@ -1,28 +1,43 @@
-"""The figures of a step, written in a row that starts in the corner of a picture."""
+"""The figures of a step, in a row at the top of a picture."""
 
 from dataclasses import dataclass
+from numbers import Real
+from typing import Final
 
+from fmugym.checks import float_or_nan
+from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas
 
-_NONE = "\N{EN DASH}"
+_NONE: Final = "\N{EN DASH}"
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """The figures written from the upper left corner of a picture: names, and values below.
+    """Figures in the upper left corner of a picture: names, and values below them.
 
     Args:
         time: Time of the episode, in s.
-        action: The action as text, with its unit, such as "+10.0 N"; "" before the first step.
+        action: The action as text with its unit, such as "+10.0 N"; "" before the first step.
         reward: Reward of the last step; None before the first step.
         episode_return: Sum of the rewards of the episode; None before the first step.
+
+    Raises:
+        ConfigError: If an argument has a wrong type.
     """
 
     time: float
     action: str = ""
     reward: float | None = None
     episode_return: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.action, str):
+            raise ConfigError(f"the action of an overlay must be a text: {shown(self.action)}")
+        for name in ("time", "reward", "episode_return"):
+            value = getattr(self, name)
+            if not isinstance(value, Real) and (value is not None or name == "time"):
+                raise ConfigError(f"{name} of an overlay must be a number, not {shown(value)}")
 
     def draw(self, canvas: Canvas) -> None:
         """Write the figures, in a size that follows the width of the picture."""
@@ -42,7 +57,8 @@ class Overlay:
 
 
 def _number(value: float | None) -> str:
-    """Return two decimals, or a power of ten where those would not fit."""
+    """Return two decimals, or a power of ten for a number too long for its column."""
     if value is None:
         return _NONE
-    return f"{value:.3e}" if abs(value) >= 1e7 else f"{value:.2f}"
+    number = float_or_nan(value)
+    return f"{number:.3e}" if abs(number) >= 1e7 else f"{number:.2f}"

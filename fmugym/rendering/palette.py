@@ -1,4 +1,4 @@
-"""The colours of the bundled scenes, as red, green and blue from 0 to 255."""
+"""Colours of the bundled scenes, as red, green and blue from 0 to 255."""
 
 from typing import Final
 

@@ -1,14 +1,15 @@
-"""The renderer: frames of a scene in, pictures in a window or in arrays out."""
+"""The renderer: draws the frames of a scene into a window or into arrays."""
 
 from typing import Final, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_number, check_text
+from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering._pygame import pygame
-from fmugym.rendering.canvas import Canvas, World
+from fmugym.rendering.canvas import Canvas, World, checked_size
 from fmugym.rendering.overlay import Overlay
 from fmugym.rendering.window import Window
 
@@ -19,37 +20,37 @@ _RENDER_MODES: Final = ("human", "rgb_array")
 
 
 class Scene(Protocol[FrameT_contra]):
-    """What a picture shows: the part of the world in view, and how a frame is drawn.
+    """The content of a picture: the visible part of the world, and how to draw a frame.
 
-    A frame is whatever the scene needs to know of one moment, best a frozen dataclass. Values may
-    be NaN or far out of view: the canvas leaves out or clips such shapes.
+    A frame describes one moment. It may be any object; a frozen dataclass works well. Values may
+    be NaN or far out of view, because the canvas omits or clips such shapes.
     """
 
     @property
     def world(self) -> World:
-        """The part of the world that is sure to be in the picture."""
+        """The part of the world that every picture shows."""
         ...
 
     def draw(self, canvas: Canvas, frame: FrameT_contra) -> None:
-        """Draw a frame on a canvas that was cleared before."""
+        """Draw a frame on a cleared canvas."""
         ...
 
 
 class Renderer(Generic[FrameT]):
-    """Draws the frames of a scene, in a window or in arrays.
+    """Draws the frames of a scene into a window or into arrays.
 
-    Nothing is allocated or opened before the first frame. Arrays need no display. A window that
-    the user closes stays closed: that is said once in the log, and further frames do nothing.
+    The first frame allocates the memory and opens the window. Arrays need no display. A window
+    that the user closes stays closed: the log says so once, and further frames do nothing.
 
     Args:
-        scene: What to draw.
+        scene: The scene to draw.
         size: Width and height of the picture, in pixels.
-        fps: Largest number of frames a second in a window; usually one over the time step.
+        fps: Largest number of frames per second in a window; usually 1 / time step.
         render_mode: "human" for a window, "rgb_array" for arrays.
         title: Title of the window.
 
     Raises:
-        ConfigError: If the render mode is neither of the two.
+        ConfigError: If an argument has a wrong type or is out of its range.
     """
 
     def __init__(
@@ -60,13 +61,15 @@ class Renderer(Generic[FrameT]):
         render_mode: str = "rgb_array",
         title: str = "fmugym",
     ) -> None:
-        if render_mode not in _RENDER_MODES:
-            raise ConfigError(f"render_mode must be one of {_RENDER_MODES}, not {render_mode!r}")
+        self.render_mode = check_text("render_mode", render_mode)
+        if self.render_mode not in _RENDER_MODES:
+            raise ConfigError(f"render_mode must be one of {_RENDER_MODES}: {shown(render_mode)}")
+        if not callable(getattr(scene, "draw", None)) or not hasattr(scene, "world"):
+            raise ConfigError(f"a scene needs a method draw and a world: {shown(scene)}")
         self.scene = scene
-        self.size = size
-        self.fps = fps
-        self.render_mode = render_mode
-        self.title = title
+        self.size = checked_size(size)
+        self.fps = check_number("fps", fps, positive=True, may_be_infinite=True)
+        self.title = check_text("title", title)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
 
@@ -75,11 +78,17 @@ class Renderer(Generic[FrameT]):
 
         Args:
             frame: The moment to draw.
-            overlay: Figures for the corner of the picture.
+            overlay: Figures at the top of the picture.
 
         Returns:
             A new array of shape (height, width, 3) in the mode "rgb_array", otherwise None.
+
+        Raises:
+            ConfigError: If a window needs a display and there is none, or if the frame or the
+                overlay has a wrong type.
         """
+        if overlay is not None and not isinstance(overlay, Overlay):
+            raise ConfigError(f"expected an Overlay or None, not {shown(overlay)}")
         if self.render_mode == "rgb_array":
             return _to_array(self._draw(frame, overlay))
         if self._window is None:
@@ -89,9 +98,9 @@ class Renderer(Generic[FrameT]):
         return None
 
     def close(self) -> None:
-        """Close the window, if this renderer is the last to use it; a second call does nothing.
+        """Close the window if no other renderer uses it; a second call does nothing.
 
-        A window that was closed is not opened again; arrays are still made.
+        The window does not open again. Arrays remain available.
         """
         self._canvas = None
         if self._window is not None:
@@ -101,7 +110,7 @@ class Renderer(Generic[FrameT]):
         if self._canvas is None:
             self._canvas = Canvas(self.size, self.scene.world)
         self._canvas.clear(palette.BACKGROUND)
-        with np.errstate(all="ignore"):  # a state far out of range may overflow on its way
+        with np.errstate(all="ignore"):  # a state far out of range may overflow
             self.scene.draw(self._canvas, frame)
         if overlay is not None:
             overlay.draw(self._canvas)

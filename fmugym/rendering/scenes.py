@@ -1,15 +1,16 @@
-"""The scenes of the bundled models: the cart-pole and the pendulum."""
+"""Scenes of the bundled models: the cart-pole and the pendulum."""
 
 import math
 from dataclasses import dataclass
 from typing import Final
 
-from fmugym.errors import ConfigError
+from fmugym.checks import check_number
+from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas, Point, World, direction
 
-_LARGEST_FORCE: Final = 1.6  # longest force arrow, in lengths of the one of `force_scale`
-_LARGEST_SWEEP: Final = math.radians(150.0)  # of the torque arrow, at the torque limit
+_LARGEST_FORCE: Final = 1.6  # of the drawn force, as a multiple of `force_scale`
+_LARGEST_SWEEP: Final = math.radians(150.0)  # of the torque arrow at the torque limit
 
 _TORQUE_RADIUS: Final = 0.5  # of the torque arrow, in rods
 _HALF_ROD: Final = 0.045  # half the thickness of the rod, in rods
@@ -45,14 +46,14 @@ class PendulumFrame:
 
 @dataclass(frozen=True)
 class CartPoleScene:
-    """A cart on a track between two limits, its pole, and the force as an arrow.
+    """A cart with its pole on a track between two limits, and the force as an arrow.
 
     Args:
         x_threshold: Distance of each limit from the middle of the track, in m.
         pole_length: Length of the pole from axle to tip, in m.
-        angle_threshold: Largest angle of the pole from upright, in rad, shown as a shade behind
-            the pole; None if there is none, and the pole may hang below the track.
-        force_scale: Force whose arrow is a fifth of `x_threshold` long, in N.
+        angle_threshold: Largest angle of the pole from upright, in rad, drawn as a shade behind
+            the pole. None for no limit, with room for the pole below the track.
+        force_scale: The force whose arrow is a fifth of `x_threshold` long, in N.
 
     Raises:
         ConfigError: If a length, angle or force is not positive and finite.
@@ -64,15 +65,15 @@ class CartPoleScene:
     force_scale: float = 10.0
 
     def __post_init__(self) -> None:
-        _require_positive("x_threshold", self.x_threshold)
-        _require_positive("pole_length", self.pole_length)
-        _require_positive("force_scale", self.force_scale)
+        check_number("x_threshold", self.x_threshold, positive=True)
+        check_number("pole_length", self.pole_length, positive=True)
+        check_number("force_scale", self.force_scale, positive=True)
         if self.angle_threshold is not None:
-            _require_positive("angle_threshold", self.angle_threshold)
+            check_number("angle_threshold", self.angle_threshold, positive=True)
 
     @property
     def world(self) -> World:
-        """The track, the pole at its highest and lowest, and room above for the figures."""
+        """The track, the reach of the pole, and space for the figures at the top."""
         reach = 1.15 * self.pole_length
         top = self._axle_height + reach + 0.3 * self.x_threshold
         bottom = -0.2 * self.x_threshold
@@ -81,8 +82,12 @@ class CartPoleScene:
         return World(-1.32 * self.x_threshold, bottom, 1.32 * self.x_threshold, top)
 
     def draw(self, canvas: Canvas, frame: CartPoleFrame) -> None:
-        """Draw the track, the cart, its pole and the force on it."""
-        x, angle, force = float(frame.x), float(frame.angle), float(frame.force)
+        """Draw the track, the cart, its pole and the force on it.
+
+        Raises:
+            ConfigError: If the frame lacks a number.
+        """
+        x, angle, force = _numbers(frame, "x", "angle", "force")
         axle = (x, self._axle_height)
         self._draw_angle_limit(canvas, axle)
         self._draw_track(canvas)
@@ -92,7 +97,7 @@ class CartPoleScene:
 
     @property
     def _unit(self) -> float:
-        """Length that the cart's measures are multiples of, in m."""
+        """The length that scales the cart, in m."""
         return self.x_threshold / 22.0
 
     @property
@@ -145,14 +150,14 @@ class CartPoleScene:
 
 @dataclass(frozen=True)
 class PendulumScene:
-    """A rod with a bob turning around a pivot, and the torque as a curved arrow.
+    """A rod with a bob that turns around a pivot, and the torque as a curved arrow.
 
-    The rod has length 1 in the picture, whatever it is in the model. The arrow starts at the rod
-    and bends the way the torque pushes it.
+    The rod has length 1 in the picture, regardless of its length in the model. The arrow starts at
+    the rod and points in the direction of the torque.
 
     Args:
-        torque_limit: Torque whose arrow sweeps 150 degrees, in N m; the arrow of a larger torque
-            is no longer.
+        torque_limit: The torque whose arrow sweeps 150 degrees, in N m. Arrows of larger torques
+            have the same length.
 
     Raises:
         ConfigError: If the torque limit is not positive and finite.
@@ -161,16 +166,20 @@ class PendulumScene:
     torque_limit: float
 
     def __post_init__(self) -> None:
-        _require_positive("torque_limit", self.torque_limit)
+        check_number("torque_limit", self.torque_limit, positive=True)
 
     @property
     def world(self) -> World:
-        """The circle of the bob, and room above for the figures."""
+        """The circle of the bob, and space for the figures at the top."""
         return World(-1.5, -1.4, 1.5, 1.75)
 
     def draw(self, canvas: Canvas, frame: PendulumFrame) -> None:
-        """Draw the circle of the bob, the torque, the rod and its pivot."""
-        angle, torque = float(frame.angle), float(frame.torque)
+        """Draw the circle of the bob, the torque, the rod and its pivot.
+
+        Raises:
+            ConfigError: If the frame lacks a number.
+        """
+        angle, torque = _numbers(frame, "angle", "torque")
         self._draw_circle(canvas)
         self._draw_torque(canvas, angle, torque)
         self._draw_rod(canvas, angle)
@@ -195,6 +204,10 @@ class PendulumScene:
         canvas.circle((0.0, 0.0), 0.05, palette.BACKGROUND)
 
 
-def _require_positive(name: str, value: float) -> None:
-    if not 0.0 < value < math.inf:
-        raise ConfigError(f"{name} must be positive and finite, not {value!r}")
+def _numbers(frame: object, *names: str) -> list[float]:
+    """Return numbers of a frame, which may be NaN or infinite."""
+    try:
+        return [float(getattr(frame, name)) for name in names]
+    except Exception:  # a frame may be any object
+        wanted = ", ".join(names)
+        raise ConfigError(f"a frame needs the numbers {wanted}: {shown(frame)}") from None

@@ -1,4 +1,4 @@
-"""One instance of a pool, in the form of a pool of one."""
+"""One instance of a pool, as a pool of one."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.adapters import Status
-from fmugym.model_description import Variable
+from fmugym.archive.description import Variable
+from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["PoolColumn"]
 
 
-class PoolColumn:
-    """See ``Pool``; steps and resets leave the other instances alone.
+class PoolColumn(Pool):
+    """See ``Pool``. Steps and resets do not touch the other instances.
 
     Args:
         pool: The pool of N instances.
@@ -93,11 +94,28 @@ class PoolColumn:
         """See ``Pool.forget_health``; the counts are those of all."""
         self._pool.forget_health()
 
+    @property
+    def is_real(self) -> bool:
+        """See ``Pool.is_real``."""
+        return self._pool.is_real
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """See ``Pool.reset_method``."""
+        return self._pool.reset_method
+
+    def halt(self) -> None:
+        """See ``Pool.halt``; the other instances stop, too."""
+        self._pool.halt()
+
+    def note_fault(self, index: int) -> None:
+        """See ``Pool.note_fault``."""
+        self._pool.note_fault(self._index)
+
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """What the pool tells of each step; see ``fmugym.env.pool_info``."""
-        pool: Any = self._pool
-        told = pool.info() if hasattr(pool, "info") else {}
-        return {name: row[self._index : self._index + 1] for name, row in told.items()}
+        """See ``Pool.info``."""
+        column = slice(self._index, self._index + 1)
+        return {name: row[column] for name, row in self._pool.info().items()}
 
     def close(self) -> None:
-        """The pool is the vector environment's to close."""
+        """Do nothing: the vector environment closes the pool."""

@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import pickle
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.config import checked_value
-from fmugym.env import FMUEnv, request_pool
-from fmugym.errors import ConfigError, SimulationError, unknown_name
-from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.vector.batch import BatchEngine, Engine, StepResult
-from fmugym.vector.compiled import CompiledEngine, find_programs
-from fmugym.vector.per_env import PerEnvEngine
-from fmugym.vector.probe import CURE, find_difference
-from fmugym.vector.views import column
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.task.interface import checked_value
+from fmugym.task.opening import request_pool
+from fmugym.vector.arguments import (
+    UnknownAttributeError,
+    autoreset_mode_of,
+    checked_hooks,
+    checked_mask,
+    checked_num_envs,
+    checked_options,
+    checked_pool_options,
+    checked_seeds,
+    checked_step_limit,
+)
+from fmugym.vector.calls import TOGETHER, attribute, require_settable
+from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.engines.compiled import CompiledEngine, find_programs
+from fmugym.vector.engines.per_env import PerEnvEngine
+from fmugym.vector.hooks.check import CURE, find_difference
+from fmugym.vector.infos import merged, observations_of, restricted
 
-__all__ = ["FMUVectorEnv", "attribute", "vectorized"]
-
-HOOKS = ("auto", "compiled", "array", "per_env")
-POOL_OPTIONS = ("threads", "private_libraries", "isolation", "workers", "call_timeout")
+__all__ = ["FMUVectorEnv"]
 
 logger = logging.getLogger(__name__)
 
@@ -33,30 +46,45 @@ logger = logging.getLogger(__name__)
 class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     """N environments of one class, whose FMU instances step in one call.
 
-    Environment i started with ``reset(seed=s)`` gives, step by step and episode after episode,
-    what a single environment started with ``reset(seed=s + i)`` gives.
+    Seeded with ``s``, environment i reproduces a single environment seeded with ``s + i``, step by
+    step and episode after episode.
+
+    A copy, or what is loaded from a pickle, is a new vector environment of the same arguments.
 
     Args:
-        make_env: Returns one environment, the prototype; wrappers are refused.
+        make_env: A function without arguments, or a class, that returns one environment, the
+            prototype; wrappers are refused. Pickles carry it with them.
         num_envs: N.
         max_episode_steps: Truncates episodes; ``gymnasium.make_vec`` passes the spec's.
-        autoreset_mode: What follows the end of an episode: ``NEXT_STEP`` (its next step starts an
+        autoreset_mode: What follows the end of an episode: ``NEXT_STEP`` (the next step starts an
             episode instead), ``SAME_STEP`` (the same step does; the last observation and info are
             ``infos["final_obs"]`` and ``["final_info"]``) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
-        hooks: ``"auto"`` takes the fastest of three ways in which the hooks give what they give in
-            a single environment: compiled for the native pool where they are plain arithmetic, on
-            arrays, or one environment at a time. ``"compiled"``, ``"array"`` and ``"per_env"`` ask
-            for one of them; where it is not possible, that is an error.
-        pool_options: Passed to ``fmugym.pool.make_pool``: ``backend``, ``threads``,
+        hooks: The way of calling hooks. ``"auto"`` takes the fastest mode that gives correct
+            results. ``"compiled"`` has hooks that are plain arithmetic run by the native pool,
+            ``"array"`` calls them once for all environments, ``"per_env"`` one environment at a
+            time; each is an error where it is not possible.
+        pool_options: Passed to ``fmugym.trial.opening.make_pool``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
+    Attributes:
+        autoreset_mode: What follows the end of an episode; ``metadata`` has it, too.
+
     Raises:
-        ConfigError: If an argument does not fit, or with ``hooks="array"`` if a hook does not
-            work on arrays.
+        ConfigError: If an argument does not fit, or the hooks cannot be called as asked for. For an
+            unknown argument it is a ``TypeError``, too.
+        FMULoadError: If the FMU cannot be used on this machine.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012  (as in FMUEnv)
+
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> FMUVectorEnv:
+        """Keep the arguments for copies."""
+        env = super().__new__(cls)
+        env._arguments = args, kwargs
+        return env
 
     def __init__(
         self,
@@ -68,14 +96,22 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         hooks: str = "auto",
         **pool_options: Any,
     ) -> None:
-        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ConfigError(f"num_envs must be a positive integer, got {num_envs!r}")
-        if hooks not in HOOKS:
-            raise unknown_name("way of calling hooks", hooks, HOOKS)
-        self.num_envs = num_envs
-        self._mode = _autoreset_mode(autoreset_mode)
-        with request_pool(num_envs, **pool_options):
-            self._prototype = _checked_prototype(make_env())
+        if not callable(make_env):
+            raise ConfigError(
+                f"make_env must be a class or a function without arguments, got {shown(make_env)}"
+            )
+        self.num_envs = checked_num_envs(num_envs)
+        self.autoreset_mode = autoreset_mode_of(autoreset_mode)
+        way, limit = checked_hooks(hooks), checked_step_limit(max_episode_steps)
+        options = checked_pool_options(pool_options, self.num_envs)
+        try:
+            with request_pool(self.num_envs, **options):
+                self._prototype = _checked_prototype(make_env())
+            self._set_up_or_close(way, limit)
+        except MemoryError:
+            raise ConfigError(f"there is not enough memory for num_envs = {num_envs}") from None
+
+    def _set_up_or_close(self, hooks: str, max_episode_steps: int | None) -> None:
         try:
             self._set_up(hooks, max_episode_steps)
         except BaseException:
@@ -84,7 +120,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _set_up(self, hooks: str, max_episode_steps: int | None) -> None:
         env, count = self._prototype, self.num_envs
-        self.metadata = {**env.metadata, "autoreset_mode": self._mode}
+        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = env.render_mode
         self.single_action_space = env.action_space
         self.single_observation_space = env.observation_space
@@ -92,7 +128,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(env.observation_space, count)
         self._started = False
         self._engine = self._make_engine(hooks, max_episode_steps)
-        env._open_pool("a vector environment").forget_health()  # of the trials of hooks
+        env._open_pool("a vector environment").forget_health()  # that of the hook check
 
     def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:
         env, count = self._prototype, self.num_envs
@@ -111,11 +147,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if difference is None:
             return True
         name = type(self._prototype).__name__
-        text = f"{name}: {difference}, so that its hooks cannot be called on arrays. {CURE}"
+        text = f"{name}: {difference}, so its hooks cannot be called on arrays. {CURE}"
         if hooks != "auto":
             raise ConfigError(text)
-        logger.warning("%s; until then they are called one environment at a time, slower", text)
+        logger.warning("%s. Until then they are called one environment at a time: slower", text)
         return False
+
+    # Episodes and steps.
 
     def reset(
         self,
@@ -127,20 +165,22 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             seed: Environment i is seeded with ``seed + i``, or with ``seed[i]`` of a list.
-            options: As for a single environment, and ``"reset_mask"``, a Boolean array of the
-                environments to be reset; the others go on.
+            options: As for a single environment, and ``"reset_mask"``, a Boolean array of shape
+                (N,): which environments to reset. The others go on.
 
         Returns:
             The observations of all environments, and the infos.
 
         Raises:
             ConfigError: If seeds or options do not fit.
-            SimulationError: If an FMU cannot be initialized, or the environment is closed.
+            SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
-        self._require_open("reset")
-        remaining = dict(options or {})
-        mask = self._checked_mask(remaining.pop("reset_mask", None))
-        seeds = self._seeds(seed)
+        self._open_pool("reset")
+        remaining = checked_options(options)
+        mask = checked_mask(remaining.pop("reset_mask", None), self.num_envs)
+        if not self._started and not mask.all():
+            raise ConfigError("the first reset must be of all environments")
+        seeds = checked_seeds(seed, self.num_envs)
         try:
             observations, infos = self._engine.reset(mask, seeds, remaining)
         except BaseException:
@@ -149,54 +189,31 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = True
         return observations, infos
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + index for index in range(self.num_envs)]
-        if not isinstance(seed, Iterable):
-            raise ConfigError(f"seed must be an integer or a list of them, got {seed!r}")
-        seeds = [None if one is None else int(one) for one in seed]
-        if len(seeds) != self.num_envs:
-            raise ConfigError(f"there are {len(seeds)} seeds, expected {self.num_envs}")
-        return seeds
-
-    def _checked_mask(self, mask: Any) -> MaskArray:
-        if mask is None:
-            return np.ones(self.num_envs, np.bool_)
-        array = np.asarray(mask)
-        if array.shape != (self.num_envs,) or array.dtype != np.bool_ or not array.any():
-            raise ConfigError(
-                f"options['reset_mask'] must be a Boolean array of shape ({self.num_envs},) with "
-                f"at least one True, got {mask!r}"
-            )
-        if not self._started and not array.all():
-            raise ConfigError("the first reset must be of all environments")
-        return array.copy()
-
     def step(self, actions: Any) -> StepResult:
         """Step all environments.
 
         Args:
-            actions: A batch of actions, environments first.
+            actions: A batch of actions, environments first. All are checked, also those of
+                environments that this step resets, unless the class has its own ``step``.
 
         Returns:
-            Observations, rewards (float64), terminated, truncated, infos; all new arrays.
+            Observations, rewards (float64), terminated, truncated, infos; all are new arrays. A
+            reward that is not finite is a fault, as an FMU that fails.
 
         Raises:
-            ConfigError: If the actions do not fit.
+            ConfigError: If the actions do not fit, or a hook returns what cannot be used.
             SimulationError: Before the first reset, after ``close``, in mode ``DISABLED`` after an
-                end, and, with ``on_fault="raise"``, if an FMU fails.
+                end, and, with ``on_fault="raise"``, after a fault.
         """
         engine = self._engine
         if not self._started or self.closed:
             self._refuse_step()
-        if engine.any_ended and self._mode is AutoresetMode.DISABLED:
+        if engine.any_ended and self.autoreset_mode is AutoresetMode.DISABLED:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
-            if engine.any_ended and self._mode is AutoresetMode.SAME_STEP:
+            if engine.any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment
             self._prototype._halt()
@@ -204,237 +221,212 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return result
 
     def _refuse_step(self) -> None:
-        self._require_open("step")
+        self._open_pool("step")
         raise SimulationError("step was called before the first reset")
 
-    def _require_open(self, method: str) -> None:
+    def _open_pool(self, method: str) -> Pool:
         if self.closed:
             raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
+        return self._prototype._open_pool(method)
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Reset in the step that ended the episodes, as the mode ``SAME_STEP`` wants it."""
-        last = _objects(result.observations, ended)
+        last = observations_of(result.observations, ended)
         observations, infos = self._engine.reset(ended, [None] * self.num_envs, {})
-        final_info = _restricted(result.infos, ended)
-        merged = _merged(_restricted(result.infos, ~ended), infos)
-        merged |= {"final_obs": last, "_final_obs": ended.copy()}
-        merged |= {"final_info": final_info, "_final_info": ended.copy()}
-        return result._replace(observations=observations, infos=merged)
-
-    def _singles(self) -> list[FMUEnv]:
-        if isinstance(self._engine, PerEnvEngine):
-            return self._engine.envs
-        return [column(self._prototype, index) for index in range(self.num_envs)]
+        final_info = restricted(result.infos, ended)
+        infos = merged(restricted(result.infos, ~ended), infos)
+        infos |= {"final_obs": last, "_final_obs": ended.copy()}
+        infos |= {"final_info": final_info, "_final_info": ended.copy()}
+        return result._replace(observations=observations, infos=infos)
 
     def render(self) -> tuple[Any, ...] | None:
-        """The pictures of all environments, or None without a render mode."""
-        self._require_open("render")
+        """Draw all environments.
+
+        Returns:
+            Their pictures, or None without a render mode.
+
+        Raises:
+            SimulationError: Before the first reset, and after ``close``.
+        """
+        self._open_pool("render")
         if self.render_mode is None:
             return None
         if not self._started:
             raise SimulationError("render was called before the first reset")
         pictures = []
-        for env in self._singles():
+        for index in range(self.num_envs):
+            env = self._engine.single(index)
             if env._renderer is None:
                 env._renderer = self._prototype._renderer
             pictures.append(env.render())
             self._prototype._renderer = env._renderer
         return tuple(pictures)
 
+    # Single environments.
+
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute, or else a parameter of the FMU, of each environment.
+        """Read an attribute, or else a parameter of the FMU, of each environment.
 
         Compiled steps do not keep ``action``, ``done`` and what hooks read of the step before.
+
+        Raises:
+            ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
+            SimulationError: After ``close``.
         """
-        return tuple(attribute(env, name) for env in self._singles())
+        return tuple(self._get_attr(name, range(self.num_envs)))
+
+    def _get_attr(self, name: str, indices: Sequence[int]) -> list[Any]:
+        """Read an attribute or a parameter of some environments."""
+        self._open_pool("get_attr")
+        return [attribute(self._engine.single(index), name) for index in indices]
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.
 
         Args:
-            name: An attribute that hooks read, or the name of a parameter; that takes effect with
-                the next episode.
-            values: A list or array of one value for each environment, or one value for all.
+            name: An attribute that hooks read, or the name of a parameter; a parameter takes effect
+                with the next episode.
+            values: A list or array of one value for each environment, or one value for all. Unless
+                hooks are called one environment at a time, values that differ must be numbers.
 
         Raises:
-            ConfigError: If there is nothing of this name, the number of values is wrong, or they do
-                not fit.
+            ConfigError: If there is nothing of this name, every environment keeps it itself, the
+                number of values is wrong, or they do not fit.
+            SimulationError: After ``close``.
         """
-        if _is_one_each(values) and len(values) != self.num_envs:
-            raise ConfigError(
-                f"there are {len(values)} values of {name!r}, expected {self.num_envs}"
-            )
+        self._open_pool("set_attr")
+        by_index = self._by_index(name, values)
         if self._is_parameter(name):
-            self._engine.set_parameter(name, self._parameter_values(name, values))
+            self._set_parameter(name, [by_index[index] for index in range(self.num_envs)])
         else:
-            self._require_attribute(name)
-            self._set_attribute(name, values)
+            self._set_attribute(name, by_index)
 
-    def _is_parameter(self, name: str) -> bool:
+    def _by_index(self, name: str, values: Any) -> dict[int, Any]:
+        """The values by the number of the environment."""
+        is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
+        if not is_row and not issubclass(type(values), list | tuple):
+            return dict.fromkeys(range(self.num_envs), values)
+        try:
+            each = list(values)
+        except Exception:  # a list of the caller's whose methods fail
+            raise ConfigError(f"{shown(values)} are no values of {shown(name)}") from None
+        if len(each) != self.num_envs:
+            raise ConfigError(
+                f"there are {len(each)} values of {shown(name)}, expected {self.num_envs}"
+            )
+        return dict(enumerate(each))
+
+    def _is_parameter(self, name: Any) -> bool:
+        if not isinstance(name, str):
+            raise ConfigError(f"the name of an attribute must be text, got {shown(name)}")
         env = self._prototype
         return not hasattr(env, name) and name in env.fmu.description.variables
 
-    def _parameter_values(self, name: str, values: Any) -> FloatArray:
-        start_values = np.broadcast_to(np.asarray(values, object), self.num_envs).tolist()
-        self._prototype._plan_episode({name: start_values[0]})
+    def _set_parameter(self, name: str, values: Sequence[Any]) -> None:
+        """Set a parameter of all environments, from their next episodes on."""
+        self._prototype._plan_episode({name: values[0]})  # it refuses what cannot be set
         variable = self._prototype.fmu.variable(name)
-        return np.array([checked_value(variable, value) for value in start_values])
+        numbers: FloatArray = np.array([checked_value(variable, value) for value in values])
+        self._engine.set_parameter(name, numbers)
 
-    def _require_attribute(self, name: str) -> None:
-        """Refuse to make an attribute that no hook can know of: its name is misspelt."""
-        engine = self._engine
-        env = engine.envs[0] if isinstance(engine, PerEnvEngine) else self._prototype
-        if not hasattr(env, name):
+    def _set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """Set an attribute of some environments."""
+        env = self._engine.single(0)
+        if not hasattr(env, name):  # no hook can know of it: the name is misspelt
             public = [known for known in dir(env) if not known.startswith("_")]
             names = public + list(env.fmu.description.variables)
-            raise unknown_name("attribute or parameter", name, names)
+            raise UnknownAttributeError(str(unknown_name("attribute or parameter", name, names)))
+        require_settable(name)
+        self._engine.set_attribute(name, values)
 
-    def _set_attribute(self, name: str, values: Any) -> None:
-        """Set or make an attribute, of one value for each environment or one for all."""
-        each = _is_one_each(values)
-        if isinstance(self._engine, PerEnvEngine):
-            for index, env in enumerate(self._engine.envs):
-                setattr(env, name, values[index] if each else values)
-            return
-        values = _row_of(name, values) if each else values
-        prototype = self._prototype
-        attributes = {n: v for n, v in prototype._per_env_attributes.items() if n != name}
-        setattr(prototype, name, values)
-        prototype._per_env_attributes = {**attributes, name: values} if each else attributes
-        self._engine.note_attributes()
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
+        return tuple(self._engine.seed_of(index) for index in range(self.num_envs))
 
     @property
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
-        """What was counted of each environment's FMU, arrays of shape (N,); see ``FMUEnv``."""
-        return self._prototype._open_pool("health").health()
+        """The counters of each environment's FMU, arrays of shape (N,); see ``FMUEnv``.
+
+        Raises:
+            SimulationError: After ``close``.
+        """
+        return self._open_pool("health").health()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of each environment, or get an attribute."""
-        attributes = self.get_attr(name)
-        return tuple(a(*args, **kwargs) if callable(a) else a for a in attributes)
+        """Call a method of each environment, or read an attribute.
+
+        Numbers that the method assigns to attributes and to episode variables take effect.
+
+        Raises:
+            ConfigError: If there is nothing of this name, the method cannot be called for single
+                environments, or it changes what they cannot have each for itself.
+            SimulationError: After ``close``.
+        """
+        return tuple(self._call(name, range(self.num_envs), args, kwargs))
+
+    def _call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        args: Sequence[Any],
+        kwargs: Mapping[str, Any],
+    ) -> list[Any]:
+        """Call a method of some environments."""
+        self._open_pool("call")
+        if isinstance(name, str) and name in TOGETHER:
+            raise ConfigError(f"{name!r} cannot be called on single environments of many")
+        if isinstance(name, str) and name == "render":
+            pictures = self.render() or [None] * self.num_envs
+            return [pictures[index] for index in indices]
+        return self._engine.call(name, indices, args, kwargs)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool."""
-        self._prototype.close()
+        if hasattr(self, "_prototype"):  # the constructor may have failed before
+            self._prototype.close()
+
+    # Copies.
+
+    def __copy__(self) -> FMUVectorEnv:
+        return _rebuilt(type(self), self._arguments, self.spec)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> FMUVectorEnv:
+        arguments = copy.deepcopy(self._arguments, memo)
+        return _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
+
+    def __reduce__(self) -> tuple[Callable[..., FMUVectorEnv], tuple[bytes]]:
+        construction: Any = type(self), self._arguments, self.spec
+        try:
+            return _unpickled, (pickle.dumps(CloudpickleWrapper(construction)),)
+        except Exception as error:  # the arguments are the user's
+            raise ConfigError(
+                f"this {type(self).__name__} cannot be pickled: {error}. Give it a make_env that "
+                "can: a class, a function of a module, or a functools.partial of one of them"
+            ) from None
 
     def __repr__(self) -> str:
         return f"FMUVectorEnv({type(self._prototype).__name__}, num_envs={self.num_envs})"
 
 
-def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEnv]:
-    """Make the vector entry point of a class.
-
-    Args:
-        env_class: The class, or ``"module:Class"``; its arguments are those of the entry point
-            that are not ``FMUVectorEnv``'s.
-
-    Returns:
-        A function that makes a ``FMUVectorEnv`` of it.
-    """
-
-    def make(
-        num_envs: int = 1,
-        max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        hooks: str = "auto",
-        backend: Any = "auto",
-        **kwargs: Any,
-    ) -> FMUVectorEnv:
-        """Make a vector environment; see ``FMUVectorEnv``."""
-        pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
-        creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class
-        if not isinstance(backend, str):  # no name of a pool: the class knows what to do with it
-            kwargs["backend"], backend = backend, "auto"
-        return FMUVectorEnv(
-            lambda: creator(**kwargs),
-            num_envs,
-            max_episode_steps=max_episode_steps,
-            autoreset_mode=autoreset_mode,
-            hooks=hooks,
-            backend=backend,
-            **pool_options,
-        )
-
-    return make
-
-
-def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    by_name = {m.name.lower(): m for m in AutoresetMode}
-    if isinstance(mode, AutoresetMode):
-        return mode
-    name = str(mode).lower().replace("-", "_")
-    if name not in by_name:
-        raise unknown_name("autoreset mode", mode, by_name)
-    return by_name[name]
-
-
-def _checked_prototype(env: Any) -> FMUEnv:
-    if not isinstance(env, FMUEnv):
-        raise ConfigError(
-            f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
-        )
+def _rebuilt(
+    cls: type[FMUVectorEnv], arguments: tuple[tuple[Any, ...], dict[str, Any]], spec: Any
+) -> FMUVectorEnv:
+    args, kwargs = arguments
+    env = cls(*args, **kwargs)
+    env.spec = spec
     return env
 
 
-def _is_one_each(values: Any) -> bool:
-    return isinstance(values, list | tuple) or np.ndim(values) > 0
+def _unpickled(construction: bytes) -> FMUVectorEnv:
+    return _rebuilt(*pickle.loads(construction).fn)
 
 
-def attribute(env: FMUEnv, name: str) -> Any:
-    """An attribute of an environment, or else a parameter of its episode.
-
-    Raises:
-        AttributeError: If there is none of this name.
-    """
-    if not hasattr(env, name) and name in env.parameters:
-        return env.parameters[name]
-    return getattr(env, name)
-
-
-def _row_of(name: str, values: Any) -> npt.NDArray[Any]:
-    row = np.array(values)
-    if row.ndim != 1:
-        raise ConfigError(f"{name!r} can hold one number for each environment, got {values!r}")
-    return row
-
-
-def _objects(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:
-    """One observation for each environment in the mask, None for the others."""
-    objects = np.full(len(mask), None, dtype=object)
-    for index in np.flatnonzero(mask).tolist():
-        objects[index] = _one(observations, index)
-    return objects
-
-
-def _one(observations: Any, index: int) -> Any:
-    if isinstance(observations, Mapping):
-        return {name: _one(value, index) for name, value in observations.items()}
-    return observations[index].copy()
-
-
-def _restricted(infos: dict[str, Any], mask: MaskArray) -> dict[str, Any]:
-    """The infos of some of the environments."""
-    result = {}
-    for name, value in infos.items():
-        if name.startswith("_") and name[1:] in infos and (value & mask).any():
-            inner = infos[name[1:]]
-            result[name] = value & mask
-            result[name[1:]] = _restricted(inner, mask) if isinstance(inner, dict) else inner.copy()
-    return result
-
-
-def _merged(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
-    """Infos of different environments, in one."""
-    result = dict(first)
-    for name, value in second.items():
-        if name not in result:
-            result[name] = value
-        elif isinstance(value, dict):
-            result[name] = _merged(result[name], value)
-        elif name.startswith("_") and name[1:] in second:
-            result[name] = result[name] | value
-        else:
-            mask = second[f"_{name}"]
-            result[name] = result[name].copy()
-            result[name][mask] = value[mask]
-    return result
+def _checked_prototype(env: Any) -> FMUEnv:
+    if isinstance(env, FMUEnv):
+        return env
+    with contextlib.suppress(Exception):  # it is the user's
+        env.close()
+    raise ConfigError(
+        f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
+    )

@@ -1,4 +1,4 @@
-"""The random streams of N environments, each that of a single environment of its own."""
+"""The random streams of N environments, each that of a single environment."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from fmugym.episode import EpisodePlan
 from fmugym.pool.base import FloatArray
+from fmugym.task.episode import EpisodePlan
 
 __all__ = ["EpisodeStreams"]
 
@@ -24,17 +24,17 @@ _LONGEST_BLOCK = 32
 class EpisodeStreams:
     """Draws the episodes of N environments from N generators.
 
-    Environment i started with seed s draws what a single environment with seed s + i draws,
-    episode after episode. Where all distributions are uniform, which takes one number of the
-    stream each, several episodes are drawn ahead in one call; the stream is taken back where
-    something else is to be drawn from it.
+    Seeded with s, environment i draws what a single environment seeded with s + i draws, episode
+    after episode. If all distributions are uniform, each takes one number of the stream. Several
+    episodes are then drawn ahead in one call. When a reset wants other draws, the stream goes back
+    to the place that the episodes have reached.
 
     Args:
         num_envs: N.
         plan: The draws of an episode, without overrides.
 
     Attributes:
-        num_draws: Numbers of the stream that an episode takes, None where they are not uniform.
+        num_draws: How many numbers of the stream an episode takes; None if some are not uniform.
         block: Uniform numbers drawn ahead, shape (N, episodes, draws).
         used: How many episodes of its block an environment has used, shape (N,).
         version: Goes up whenever an environment gets another generator.
@@ -42,6 +42,7 @@ class EpisodeStreams:
 
     def __init__(self, num_envs: int, plan: EpisodePlan) -> None:
         self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._seeds = [0] * num_envs
         self.version = 0
         self.num_draws = plan.num_uniform
         self._draws = plan.num_uniform or 0
@@ -52,7 +53,7 @@ class EpisodeStreams:
         self.used = np.full(num_envs, self._length)
 
     def generator(self, index: int) -> np.random.Generator:
-        """The generator of one environment, at the place that the episodes have reached."""
+        """The generator of an environment, at the place that its episodes have reached."""
         generator = self._generators[index] or self._unseeded(index)
         ahead = int(self._length - self.used[index]) * self._draws
         if ahead:
@@ -64,13 +65,19 @@ class EpisodeStreams:
         return self._renew(index, None)
 
     def _renew(self, index: int, seed: int | None) -> np.random.Generator:
-        generator, _ = seeding.np_random(seed)
+        generator, self._seeds[index] = seeding.np_random(seed)
         self._generators[index] = generator
         self.version += 1
         return generator
 
+    def seed_of(self, index: int) -> int:
+        """The seed that an environment's generator was made with."""
+        if self._generators[index] is None:
+            self._unseeded(index)
+        return self._seeds[index]
+
     def bit_generators(self) -> list[np.random.BitGenerator]:
-        """What the generators take their numbers from, of all environments."""
+        """The bit generators of all environments."""
         generators = enumerate(self._generators)
         return [(known or self._unseeded(index)).bit_generator for index, known in generators]
 
@@ -94,7 +101,7 @@ class EpisodeStreams:
         return fractions
 
     def _refill(self, indices: npt.NDArray[np.intp]) -> None:
-        """Draw ahead for some environments whose blocks are used up."""
+        """Draw ahead for environments whose blocks are used up."""
         generators, rows = self._generators, self._rows
         for index in indices.tolist():
             (generators[index] or self._unseeded(index)).random(out=rows[index])
@@ -102,7 +109,7 @@ class EpisodeStreams:
 
 
 def _take_back(bits: Any, count: int) -> None:
-    """Go back in a stream, but keep the half of a number that an integer draw left over."""
+    """Go back in a stream, but keep the half number that an integer draw has left."""
     before = bits.state
     bits.advance(-count)
     if before["has_uint32"]:

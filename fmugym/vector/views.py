@@ -1,42 +1,42 @@
-"""Two views of a prototype: as N environments at once, and as one of them."""
+"""Views of a prototype, as N environments at once or as one of them, and copies of it."""
 
 from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Mapping
 from types import MappingProxyType, MethodType
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive import FMU
-from fmugym.config import EnvConfig, Interface
+from fmugym.archive.fmu import FMU
+from fmugym.config import EnvConfig
 from fmugym.env import FMUEnv
-from fmugym.episode import EpisodePlan
 from fmugym.pool import PoolSpec
-from fmugym.values import EpisodeVariables, NamedValues
+from fmugym.task.episode import EpisodePlan
+from fmugym.task.interface import Interface
+from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.vector.column import PoolColumn
 
-__all__ = ["batched", "column", "copied_attributes", "envs_first", "light_copy", "take"]
+__all__ = ["batched", "column", "copied_attributes", "differs", "light_copy", "take"]
 
 _SHARED_TYPES = (
     *(bool, int, float, complex, str, bytes, type(None), np.generic),
     *(MappingProxyType, logging.Logger, spaces.Space),
     *(FMU, EnvConfig, Interface, PoolSpec, EpisodePlan, NamedValues),
 )
-"""Types of attributes that do not change, and of what is too costly to be copied."""
+"""Types of attributes that do not change, or are too costly to copy."""
 
 _SHARED_NAMES = frozenset(
     {"_constructor_arguments", "metadata", "_start_inputs", "_no_action", "_pool"}
-    | {"_input_row", "_output_row", "_observation_row"}
+    | {"_input_row", "_output_row", "_observation_row", "_renderer"}
 )
-"""Attributes of ``FMUEnv`` that hooks have no business with."""
+"""Attributes of ``FMUEnv`` that hooks do not read."""
 
 
 def light_copy(env: FMUEnv) -> FMUEnv:
-    """Copy an environment without loading the FMU again: all attributes are shared."""
+    """Copy an environment without loading the FMU again; the copy shares all attributes."""
     copied = type(env).__new__(type(env))
     copied.__dict__.update(env.__dict__)
     for name, value in env.__dict__.items():
@@ -47,7 +47,7 @@ def light_copy(env: FMUEnv) -> FMUEnv:
 
 
 def copied_attributes(env: FMUEnv) -> dict[str, Any]:
-    """Copies of the attributes that hooks might change, one by one, by name."""
+    """Copy the attributes that hooks might change; returns the copies by name."""
     memo = {id(env): env, id(env.spec): env.spec}
     return {
         name: _copied(value, memo)
@@ -65,12 +65,12 @@ def _may_change(value: Any) -> bool:
 def _copied(value: Any, memo: dict[int, Any]) -> Any:
     try:
         return copy.deepcopy(value, memo.copy())
-    except Exception:  # an attribute of the user's that cannot be copied is shared
+    except Exception:  # it is the user's, and cannot be copied: share it
         return value
 
 
 def batched(env: FMUEnv, count: int) -> None:
-    """Let what hooks read of an environment be arrays of a batch, all zero."""
+    """Replace what hooks read of an environment by arrays of a batch, all zero."""
     outputs = np.zeros((len(env.out), count))
     env._values = outputs
     env.state = outputs[: env._output_count]
@@ -88,7 +88,7 @@ def batched(env: FMUEnv, count: int) -> None:
 
 
 def column(env: FMUEnv, index: int) -> FMUEnv:
-    """Environment number ``index`` of a batch as a single one, for calling its hooks only."""
+    """View environment ``index`` of a batch as a single one, to read it and call its methods."""
     single = light_copy(env)
     if env._pool is not None:
         single._pool = PoolColumn(env._pool, index)
@@ -111,20 +111,32 @@ def column(env: FMUEnv, index: int) -> FMUEnv:
 
 
 def take(values: Any, index: int) -> Any:
-    """One environment's part of an array whose last axis is that of the environments."""
+    """Take one environment's part of an array that has the environments in its last axis."""
     part = np.asarray(values)[..., index]
     return part.item() if part.ndim == 0 and part.dtype.kind == "f" else part[()]
 
 
-def envs_first(values: Any, space: spaces.Space[Any] | None = None) -> Any:
-    """Turn arrays (or dicts of them) of a batch, envs last, into new ones with envs first.
+def differs(before: Any, after: Any) -> bool:
+    """Whether a value was changed, as far as values of its type can be compared; NaNs are equal."""
+    if before is after:
+        return False
+    if type(before) is not type(after):
+        return True
+    try:
+        return _differ(before, after)
+    except Exception:  # the values are the user's, and so is how they compare
+        return False
 
-    Args:
-        values: The arrays.
-        space: That of a single environment, whose types the new ones have; None for any types.
-    """
-    if isinstance(values, Mapping):
-        inner = space if isinstance(space, spaces.Dict) else {}
-        return {name: envs_first(value, inner.get(name)) for name, value in values.items()}
-    dtype = None if space is None else space.dtype
-    return np.array(np.moveaxis(np.asarray(values), -1, 0), dtype, order="C")
+
+def _differ(before: Any, after: Any) -> bool:
+    if isinstance(before, np.random.Generator):
+        return bool(before.bit_generator.state != after.bit_generator.state)
+    if isinstance(before, np.ndarray):
+        return not np.array_equal(before, after, equal_nan=before.dtype.kind in "fc")
+    if isinstance(before, list | tuple):
+        return len(before) != len(after) or any(map(differs, before, after))
+    if isinstance(before, dict):
+        return before.keys() != after.keys() or any(differs(before[k], after[k]) for k in before)
+    if not isinstance(before, bool | int | float | complex | str | np.generic):
+        return False
+    return bool(before != after) and not bool(before != before and after != after)

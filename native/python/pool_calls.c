@@ -283,5 +283,6 @@ PyObject *py_costs(PyObject *object, PyObject *unused) {
 PyObject *py_uses_states(PyObject *object, PyObject *unused) {
     PyPool *self = (PyPool *)object;
     (void)unused;
-    return PyBool_FromLong(self->pool.settings.can_save && !atomic_get(&self->pool.trial.refuted));
+    return PyBool_FromLong(self->pool.settings.restores &&
+                           !atomic_get(&self->pool.states_too_large));
 }

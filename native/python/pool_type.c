@@ -160,6 +160,7 @@ typedef struct {
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
+    int restores, rebuilds, reloads;
     long long substeps, warm_up_steps, retries;
 } Arguments;
 
@@ -186,11 +187,12 @@ static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
-                            "substeps",   "warm_up_steps", "retries",   NULL};
+                            "substeps",   "warm_up_steps", "retries",   "restores",
+                            "rebuilds",   "reloads",       NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLL:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLppp:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
-                       &a->retries);
+                       &a->retries, &a->restores, &a->rebuilds, &a->reloads);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -320,6 +322,9 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->substeps = a->substeps;
     s->warm_up_steps = a->warm_up_steps;
     s->retries = s->can_save ? a->retries : 0;
+    s->restores = s->can_save && a->restores;
+    s->rebuilds = a->rebuilds;
+    s->reloads = a->reloads;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
     s->num_observed = (size_t)a->num_observed;

@@ -1,4 +1,5 @@
-/* Variables and constants of the cart-pole. The order of the Reals is their value reference. */
+/* Variables and constants of the cart-pole.
+ * The position of a Real in the list is its value reference. */
 
 #ifndef CONFIG_H
 #define CONFIG_H
@@ -9,9 +10,9 @@
 #define TOKEN_FMI2 "{aa23bbe0-b1da-43cf-9a66-77de622fbc1f}"
 #define TOKEN_FMI3 "{30eb7979-8b48-49c1-b153-c19cd64462fd}"
 
-/* Angles named phi count from the upright pole, positive towards +x; those named theta count from
- * the positive x-axis, counter-clockwise. The accelerations must come last, in the order of
- * the states. */
+/* Angles named phi count from the upright pole, positive towards +x. Angles named theta count from
+ * the positive x-axis, counter-clockwise. The accelerations must come last, in the order of the
+ * states. */
 #define MODEL_REALS(REAL)                            \
     REAL(time, CALCULATED, 0.0)                      \
     REAL(x, CALCULATED, 0.0)                         \
@@ -45,7 +46,7 @@
 
 enum { CYLINDER_WITH_POINT_MASS = 1, UNIFORM_ROD = 2 };
 
-/* What follows from the parameters alone. */
+/* Values that depend on parameters only. */
 typedef struct {
     double pole_mass;       /* kg */
     double total_mass;      /* kg, cart and pole */

@@ -1,7 +1,7 @@
-/* Equations of the cart-pole; README.md names their sources.
+/* Equations of the cart-pole. README.md names their sources.
  *
- * The order of the floating-point operations is that of Gymnasium's CartPole-v1: under a balancing
- * policy the cart-pole is unstable and the smallest difference in rounding grows. */
+ * The floating-point operations have the order of Gymnasium's CartPole-v1. A balanced cart-pole is
+ * unstable, so that the smallest difference in rounding would grow. */
 
 #include <math.h>
 
@@ -12,7 +12,7 @@ static const double PI = 3.14159265358979323846;
 /* The pole of the default pole_type: a wooden cylinder with a small body at its end. */
 static const double CYLINDER_DENSITY = 900.0; /* kg/m^3 */
 static const double CYLINDER_RADIUS = 0.025;  /* m */
-static const double BODY_INERTIA = 0.001;     /* kg m^2, of the point mass about its own centre */
+static const double BODY_INERTIA = 0.001;     /* kg m^2, of the body about its own centre */
 
 static void set_uniform_rod(const Reals *r, Constants *k) {
     k->pole_mass = r->m_pole;

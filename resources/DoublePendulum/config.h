@@ -1,4 +1,5 @@
-/* Variables and constants of the double pendulum. The order of the Reals is their value reference. */
+/* Variables and constants of the double pendulum.
+ * The position of a Real in the list is its value reference. */
 
 #ifndef CONFIG_H
 #define CONFIG_H
@@ -8,8 +9,9 @@
 #define TOKEN_FMI2 "{0b7c1c8e-0a52-4a39-9d7e-6a4f1c6d2f53}"
 #define TOKEN_FMI3 "{c41f6ad3-3c07-4a0b-8a55-2be0f9d4b6e8}"
 
-/* The angle q1 of the shoulder is 0 hanging, q2 of the elbow is relative to the shoulder's link;
- * both count counter-clockwise. Accelerations must come last, in the order of the states. */
+/* The shoulder's angle q1 is 0 when the arm hangs. The elbow's angle q2 is relative to the first
+ * link. Both are positive counter-clockwise. The accelerations must come last, in the order of the
+ * states. */
 #define MODEL_REALS(REAL)                            \
     REAL(time, CALCULATED, 0.0)                      \
     REAL(q1, CALCULATED, 0.0)                        \
@@ -47,7 +49,7 @@
 #define FIRST_STATE VR_q1
 #define NUMBER_OF_STATES 4
 
-/* What follows from the parameters alone. */
+/* Values that depend on parameters only. */
 typedef struct {
     double least_determinant; /* kg^2 m^4, of the inertia matrix, over all angles */
 } Constants;

@@ -1,4 +1,4 @@
-/* Equations of the double pendulum; README.md names their sources. */
+/* Equations of the double pendulum. README.md names their sources. */
 
 #include <math.h>
 
@@ -9,7 +9,7 @@ typedef struct {
     double m11, m12, m22;
 } Inertia;
 
-/* Unlike fmin and fmax, comparisons let a NaN through, which makes the step be discarded. */
+/* Unlike fmin and fmax, comparisons pass a NaN on, so that the step is discarded. */
 static double clip(double value, double limit) {
     return value > limit ? limit : value < -limit ? -limit : value;
 }
@@ -37,7 +37,7 @@ static double friction_slope(double b, double cf, double v_c, double velocity) {
     return b + cf * (1.0 - slip * slip) / v_c;
 }
 
-/* The determinant is concave in cos(q2), so that it is least where the arm is straight or folded. */
+/* The determinant is concave in cos(q2), so it is least where the arm is straight or folded. */
 const char *model_constants(const Reals *r, const int32_t *, Constants *k) {
     k->least_determinant =
         fmin(determinant(inertia_at(r, 1.0)), determinant(inertia_at(r, -1.0)));
@@ -98,7 +98,7 @@ void model_tangent(const Reals *r, const Constants *, Reals *d) {
     const double d_gravity1 = r->P4 * cos(r->q1) * d->q1 + d_gravity2;
     const double d_tau1 = fabs(r->tau1) > r->tau_max1 ? 0.0 : d->tau1;
     const double d_tau2 = fabs(r->tau2) > r->tau_max2 ? 0.0 : d->tau2;
-    const double d_inertia = -coriolis * d->q2; /* of m12, and half of that of m11 */
+    const double d_inertia = -coriolis * d->q2; /* of m12; the one of m11 is twice as large */
     const double d_f1 = d_tau1 + d_coriolis * (2.0 * v1 * v2 + v2 * v2) +
                         2.0 * coriolis * (v2 * d->q1_dot + (v1 + v2) * d->q2_dot) - d_gravity1 -
                         friction_slope(r->b1, r->cf1, r->v_c, v1) * d->q1_dot;

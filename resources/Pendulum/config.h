@@ -1,4 +1,5 @@
-/* Variables and constants of the pendulum. The order of the Reals is their value reference. */
+/* Variables and constants of the pendulum.
+ * The position of a Real in the list is its value reference. */
 
 #ifndef CONFIG_H
 #define CONFIG_H
@@ -9,8 +10,8 @@
 #define TOKEN_FMI2 "{4fa4f759-3814-4d94-b527-5a8486343db5}"
 #define TOKEN_FMI3 "{31777366-07b4-41cc-946c-e36470f426ed}"
 
-/* The angle theta is 0 upright, q is 0 hanging; both count counter-clockwise. Accelerations must
- * come last, in the order of the states. */
+/* The angle theta is 0 upright, the angle q is 0 hanging. Both are positive counter-clockwise. The
+ * accelerations must come last, in the order of the states. */
 #define MODEL_REALS(REAL)                            \
     REAL(time, CALCULATED, 0.0)                      \
     REAL(theta, CALCULATED, 0.0)                     \
@@ -43,7 +44,7 @@
 
 enum { POINT_MASS = 1, UNIFORM_ROD = 2 };
 
-/* What follows from the parameters alone. */
+/* Values that depend on parameters only. */
 typedef struct {
     double gravity_gain; /* 1/s^2, theta_ddot per sin(theta) */
     double torque_gain;  /* 1/(kg m^2), theta_ddot per torque */

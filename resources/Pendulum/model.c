@@ -1,7 +1,7 @@
-/* Equations of the pendulum; README.md names their sources.
+/* Equations of the pendulum. README.md names their sources.
  *
- * The order of the floating-point operations is that of Gymnasium's Pendulum-v1, so that with its
- * parameters the trajectories are the same bit for bit. */
+ * The floating-point operations have the order of Gymnasium's Pendulum-v1, so that its parameters
+ * give the same trajectories bit for bit. */
 
 #include <math.h>
 
@@ -9,7 +9,7 @@
 
 static const double PI = 3.14159265358979323846;
 
-/* Unlike fmin and fmax, comparisons let a NaN through, which makes the step be discarded. */
+/* Unlike fmin and fmax, comparisons pass a NaN on, so that the step is discarded. */
 static double clip(double value, double limit) {
     return value > limit ? limit : value < -limit ? -limit : value;
 }

@@ -1,11 +1,14 @@
-/* The functions of FMI 1.0 for co-simulation; their names have the model identifier as a prefix. */
+/* The functions of FMI 1.0 for co-simulation. The model identifier is the prefix of each name. */
 
 #include <stddef.h>
 #include <stdlib.h>
 
 #include "fmi1Functions.h"
 
+#include "instance.h"
+#include "log.h"
 #include "simulation.h"
+#include "values.h"
 
 #if defined _WIN32
 #define EXPORT __declspec(dllexport)
@@ -95,7 +98,7 @@ void NAME(fmiFreeSlaveInstance)(fmi1Component c) {
 
 /* Initialization, termination and reset */
 
-/* FMI 1.0 initializes in one call. If that fails, the instance stays as it was before. */
+/* FMI 1.0 initializes in one call. If the call fails, the instance returns to its earlier phase. */
 fmi1Status NAME(fmiInitializeSlave)(fmi1Component c, fmi1Real start_time,
                                     fmi1Boolean stop_time_defined, fmi1Real stop_time) {
     Instance *instance = c;
@@ -183,7 +186,7 @@ fmi1Status NAME(fmiCancelStep)(fmi1Component c) {
     return (fmi1Status)not_supported(c, __func__);
 }
 
-/* Status. Steps are never pending, so only the outcome of the last one can be asked for. */
+/* Status. Steps are never pending, so only the outcome of the last one can be queried. */
 
 fmi1Status NAME(fmiGetStatus)(fmi1Component c, const fmi1StatusKind kind, fmi1Status *value) {
     const Instance *instance = c;

@@ -2,7 +2,11 @@
 
 #include "fmi2Functions.h"
 
+#include "instance.h"
+#include "log.h"
 #include "simulation.h"
+#include "state.h"
+#include "values.h"
 
 typedef struct {
     Instance instance;
@@ -185,7 +189,7 @@ fmi2Status fmi2CancelStep(fmi2Component c) {
     return (fmi2Status)not_supported(c, __func__);
 }
 
-/* Status. Steps are never pending, so only the outcome of the last one can be asked for. */
+/* Status. Steps are never pending, so only the outcome of the last one can be queried. */
 
 fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value) {
     const Instance *instance = c;

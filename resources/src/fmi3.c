@@ -1,9 +1,13 @@
-/* The functions of FMI 3.0 for co-simulation. Those of other interface types, of clocks, and of
- * capabilities that the model description does not declare only say so. */
+/* The functions of FMI 3.0 for co-simulation. Functions for other interface types, for clocks and
+ * for undeclared capabilities only report that they are not supported. */
 
 #include "fmi3Functions.h"
 
+#include "instance.h"
+#include "log.h"
 #include "simulation.h"
+#include "state.h"
+#include "values.h"
 
 typedef struct {
     Instance instance;
@@ -48,7 +52,7 @@ static Instance *create(const char *function, fmi3String name, fmi3String token,
     return instance;
 }
 
-/* Destroys an instance that cannot be what the importer asks for. */
+/* Destroys an instance that cannot do what the importer asks for. */
 static fmi3Instance refuse(Instance *instance, const char *function, const char *reason) {
     if (instance != NULL) {
         report(instance, STATUS_ERROR, function, "%s", reason);
@@ -98,7 +102,7 @@ void fmi3FreeInstance(fmi3Instance c) {
 
 /* Initialization, termination and reset */
 
-/* Sets up the experiment too; if the times are no time span, the phase stays as it was. */
+/* Also sets up the experiment. If the times are not a time span, the phase does not change. */
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean, fmi3Float64,
                                        fmi3Float64 start_time, fmi3Boolean stop_time_defined,
                                        fmi3Float64 stop_time) {
@@ -121,7 +125,7 @@ fmi3Status fmi3Reset(fmi3Instance c) {
 
 /* Variables */
 
-/* Arrays would make these numbers differ, but all variables are scalars. */
+/* All variables are scalars, so there are as many values as value references. */
 static Status check_sizes(const Instance *instance, const char *function, size_t references,
                           size_t values) {
     if (instance == NULL) {

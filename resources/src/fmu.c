@@ -1,10 +1,11 @@
-/* All sources of an FMU as one, so that the compiler sees through the calls between them. */
+/* All sources of an FMU in one translation unit, so that the compiler can inline across them. */
 
 #include "model.c"
 
+#include "log.c"
 #include "instance.c"
-#include "simulation.c"
 #include "solvers.c"
+#include "simulation.c"
 #include "state.c"
 #include "values.c"
 

@@ -1,8 +1,8 @@
 /* What a model provides to the FMI functions: its variables (config.h) and its equations (model.c).
  *
- * Models are second-order systems: the states are contiguous Reals that come in pairs of a position
- * and its velocity, and the last Reals are the accelerations, one per pair. Every model has the
- * Reals "time" and "max_step" and the enumeration "solver"; its Constants are doubles only. */
+ * Models are second-order systems. The states are contiguous Reals in pairs of a position and its
+ * velocity; the last Reals are the accelerations, one for each pair. Every model has the Reals
+ * "time" and "max_step" and the enumeration "solver". All members of Constants are doubles. */
 
 #ifndef MODEL_H
 #define MODEL_H
@@ -31,23 +31,24 @@ typedef union {
     double values[NUMBER_OF_REALS];
 } Reals;
 
-/* Computes the constants; returns NULL, or what is wrong with the parameters. */
+/* Computes the constants. Returns NULL, or a text that says what is wrong with the parameters. */
 const char *model_constants(const Reals *r, const int32_t *enumerations, Constants *k);
 
 /* Sets the states from the start values. */
 void model_initial_state(Reals *r);
 
-/* Computes the derivatives of the given state, which need not be the one in r. */
+/* Computes the derivatives of a state, which may differ from the one in r. */
 void model_derivatives(const Reals *r, const Constants *k, const double *state,
                        double *derivative);
 
-/* Applies the limits of the state, after each internal step. */
+/* Applies the limits of the state. The solvers call it after each internal step. */
 void model_limit_state(const Reals *r, double *state);
 
 /* Computes the outputs that are not states. */
 void model_outputs(Reals *r);
 
-/* Differentiates outputs and accelerations in the direction d, given in its states and inputs. */
+/* Differentiates outputs and accelerations in a direction. The states and inputs of d hold the
+ * direction; the results go to the other members of d. */
 void model_tangent(const Reals *r, const Constants *k, Reals *d);
 
 #endif

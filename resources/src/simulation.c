@@ -1,13 +1,14 @@
-/* The state machine and the communication step. */
+/* The state machine, initialization and the communication step. */
 
 #include "simulation.h"
 
 #include <float.h>
 #include <math.h>
 
+#include "log.h"
 #include "solvers.h"
 
-/* Above this number of internal steps a communication step size is taken for a mistake. */
+/* A communication step that needs more internal steps than this is taken for a mistake. */
 static const double MAX_INTERNAL_STEPS = 1e8;
 
 static const char *name_of(int32_t phase) {
@@ -45,7 +46,7 @@ Status set_up_experiment(Instance *instance, const char *function, double start_
     }
     if (!isfinite(start_time) || (stop_time_defined && !(stop_time >= start_time))) {
         return report(instance, STATUS_ERROR, function,
-                      "start time %g and stop time %g are not a time span", start_time, stop_time);
+                      "the start time %g and the stop time %g must be a time span", start_time, stop_time);
     }
     instance->simulation.reals.time = start_time;
     instance->simulation.stop_time = stop_time_defined ? stop_time : INFINITY;
@@ -63,7 +64,7 @@ Status enter_initialization(Instance *instance, const char *function) {
 }
 
 static bool all_finite(const double *values, int number) {
-    int64_t bad = 0; /* as wide as the values, for the compiler's sake */
+    int64_t bad = 0; /* as wide as the values, which lets the compiler vectorize */
 
     for (int i = 0; i < number; i++) {
         bad |= !(fabs(values[i]) <= DBL_MAX);
@@ -106,7 +107,6 @@ Status exit_initialization(Instance *instance, const char *function) {
     return status;
 }
 
-/* Brings all calculated variables up to date. */
 Status refresh(Instance *instance, const char *function) {
     Simulation *s = &instance->simulation;
     double derivative[NUMBER_OF_STATES];
@@ -128,7 +128,7 @@ Status refresh(Instance *instance, const char *function) {
 static Status check_step(const Instance *instance, const char *function, double time,
                          double step) {
     const Simulation *s = &instance->simulation;
-    /* Communication points are rounded: start + n * step here, a sum of steps there. */
+    /* Rounding differs: some importers compute start + n * step, others add up steps. */
     const double tolerance = 1e-9 * (1.0 + fabs(s->reals.time));
 
     if (!(step >= 0.0 && step <= DBL_MAX)) {
@@ -153,7 +153,7 @@ static Status check_step(const Instance *instance, const char *function, double 
     return STATUS_OK;
 }
 
-/* A step that is a multiple of max_step but for rounding needs no additional internal step. */
+/* Rounding alone must not add an internal step where the step is a multiple of max_step. */
 static int32_t number_of_internal_steps(double step, double max_step) {
     return step <= max_step ? 1 : (int32_t)fmax(1.0, ceil(step / max_step - 1e-9));
 }

@@ -1,6 +1,6 @@
 #include "solvers.h"
 
-/* What is too large to be a part of every step, of which the smallest are the ones that count. */
+/* Keeps large methods out of the loop of the explicit Euler method, whose speed matters most. */
 #define APART [[gnu::noinline]]
 
 static void step_explicit_euler(const Reals *r, const Constants *k, double step, double *state) {
@@ -12,7 +12,7 @@ static void step_explicit_euler(const Reals *r, const Constants *k, double step,
     }
 }
 
-/* Velocities first, then positions from the new, limited velocities. */
+/* Advances the velocities first, then the positions with the new, limited velocities. */
 APART static void step_semi_implicit_euler(const Reals *r, const Constants *k, double step,
                                            double *state) {
     double derivative[NUMBER_OF_STATES];

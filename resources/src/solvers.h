@@ -7,7 +7,7 @@
 
 enum { EXPLICIT_EULER = 1, SEMI_IMPLICIT_EULER = 2, RK4 = 3 };
 
-/* Advances the state by a number of equal steps; the inputs in r stay constant. */
+/* Advances the state by a number of equal steps. The inputs in r stay constant. */
 void integrate(const Reals *r, const Constants *k, int32_t solver, double step, int32_t number,
                double *state);
 

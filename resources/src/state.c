@@ -1,9 +1,12 @@
-/* FMU states: copies of the simulation, and their serialized form, the FMU's token and a copy. */
+/* An FMU state is a copy of the simulation. Its serialized form is the FMU's token and the copy. */
+
+#include "state.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "simulation.h"
+#include "instance.h"
+#include "log.h"
 
 enum { TOKEN_SIZE = 40, SERIALIZED_SIZE = TOKEN_SIZE + sizeof(Simulation) };
 
@@ -20,16 +23,16 @@ static Status store(const Instance *instance, const char *function, const void *
 }
 
 Status get_state(const Instance *instance, const char *function, void **state) {
-    const Status status = check_phase(instance, function, ANY_PHASE);
-    return status == STATUS_OK ? store(instance, function, &instance->simulation, state) : status;
+    return instance == NULL ? STATUS_ERROR
+                            : store(instance, function, &instance->simulation, state);
 }
 
 static Status check_state(const Instance *instance, const char *function, const void *state) {
-    const Status status = check_phase(instance, function, ANY_PHASE);
-    if (status == STATUS_OK && state == NULL) {
-        return report(instance, STATUS_ERROR, function, "the FMU state is NULL");
+    if (instance == NULL) {
+        return STATUS_ERROR;
     }
-    return status;
+    return state == NULL ? report(instance, STATUS_ERROR, function, "the FMU state is NULL")
+                         : STATUS_OK;
 }
 
 Status set_state(Instance *instance, const char *function, const void *state) {
@@ -40,21 +43,23 @@ Status set_state(Instance *instance, const char *function, const void *state) {
     return status;
 }
 
-Status free_state(const Instance *instance, const char *function, void **state) {
-    const Status status = check_phase(instance, function, ANY_PHASE);
-    if (status == STATUS_OK && state != NULL) {
+Status free_state(const Instance *instance, const char *, void **state) {
+    if (instance == NULL) {
+        return STATUS_ERROR;
+    }
+    if (state != NULL) {
         free(*state);
         *state = NULL;
     }
-    return status;
+    return STATUS_OK;
 }
 
-Status serialized_size(const Instance *instance, const char *function, size_t *size) {
-    const Status status = check_phase(instance, function, ANY_PHASE);
-    if (status == STATUS_OK) {
-        *size = SERIALIZED_SIZE;
+Status serialized_size(const Instance *instance, const char *, size_t *size) {
+    if (instance == NULL) {
+        return STATUS_ERROR;
     }
-    return status;
+    *size = SERIALIZED_SIZE;
+    return STATUS_OK;
 }
 
 Status serialize_state(const Instance *instance, const char *function, const void *state,
@@ -75,9 +80,8 @@ Status serialize_state(const Instance *instance, const char *function, const voi
 
 Status deserialize_state(const Instance *instance, const char *function, const void *bytes,
                          size_t size, void **state) {
-    const Status status = check_phase(instance, function, ANY_PHASE);
-    if (status != STATUS_OK) {
-        return status;
+    if (instance == NULL) {
+        return STATUS_ERROR;
     }
     if (size < SERIALIZED_SIZE || memcmp(bytes, model_token, strlen(model_token)) != 0) {
         return report(instance, STATUS_ERROR, function,

@@ -1,9 +1,12 @@
 /* Access to variables and to partial derivatives. */
 
+#include "values.h"
+
+#include "log.h"
 #include "simulation.h"
 
-/* The phases in which variables of a kind may be set. What may be set after initialization and
- * changes the constants has TUNES. FMI 1.0 has no tunable parameters. */
+/* The phases in which variables of a kind may be set. TUNES marks variables that may be set after
+ * initialization and change the constants. FMI 1.0 has no tunable parameters. */
 enum {
     BEFORE_STEPS = PHASE_INSTANTIATED | PHASE_EXPERIMENT_SET_UP | PHASE_INITIALIZATION,
     TUNES = 32,
@@ -25,7 +28,7 @@ static const uint8_t real_settable[] = {MODEL_REALS(REAL_SETTABLE)};
 static const uint8_t enumeration_settable[] = {MODEL_ENUMERATIONS(ENUMERATION_SETTABLE)};
 static const int32_t enumeration_items[] = {MODEL_ENUMERATIONS(ENUMERATION_ITEMS)};
 
-/* By value reference: the enumerations follow the Reals. */
+/* Names by value reference: the enumerations follow the Reals. */
 static const char *const names[] = {MODEL_REALS(REAL_NAME) MODEL_ENUMERATIONS(ENUMERATION_NAME)};
 
 static Status unknown_reference(const Instance *instance, const char *function,
@@ -47,7 +50,7 @@ static Status not_settable(const Instance *instance, const char *function, uint3
                                                                    : " after initialization");
 }
 
-/* Gets values of which some are unknown or calculated on demand. */
+/* Gets values where a reference may be unknown or calculated on demand. */
 RARE static Status get_any_reals(Instance *instance, const char *function,
                                  const uint32_t references[], size_t number, double values[]) {
     for (size_t i = 0; i < number; i++) {
@@ -82,13 +85,13 @@ Status get_reals(Instance *instance, const char *function, const uint32_t refere
 
 static void assign(Reals *reals, const uint32_t references[], size_t number,
                    const double values[]) {
-#pragma clang loop unroll(disable) /* mostly it is one value */
+#pragma clang loop unroll(disable) /* there is usually one value */
     for (size_t i = 0; i < number; i++) {
         reals->values[references[i]] = values[i];
     }
 }
 
-/* Sets tunable parameters, and values that come with them. */
+/* Sets tunable parameters, and the values set in the same call. */
 static Status tune(Instance *instance, const char *function, const uint32_t references[],
                    size_t number, const double values[]) {
     Simulation *s = &instance->simulation;
@@ -104,7 +107,7 @@ static Status tune(Instance *instance, const char *function, const uint32_t refe
     return STATUS_OK;
 }
 
-/* Sets values of which one at least is tunable, or must not be set. */
+/* Sets values where at least one is tunable or must not be set. */
 RARE static Status set_any_reals(Instance *instance, const char *function,
                                  const uint32_t references[], size_t number,
                                  const double values[]) {
@@ -208,7 +211,7 @@ static Status check_all(const Instance *instance, const char *function,
                         bool (*is_allowed)(uint32_t), const char *what) {
     for (size_t i = 0; i < number; i++) {
         if (!is_allowed(references[i])) {
-            return report(instance, STATUS_ERROR, function, "value reference %u is no %s",
+            return report(instance, STATUS_ERROR, function, "value reference %u is not %s",
                           (unsigned)references[i], what);
         }
     }
@@ -221,10 +224,10 @@ Status directional_derivative(Instance *instance, const char *function, const ui
     Reals direction = {.values = {0.0}};
 
     if (check_phase(instance, function, READABLE) != STATUS_OK ||
-        check_all(instance, function, knowns, number_of_knowns, is_known, "state or input") !=
+        check_all(instance, function, knowns, number_of_knowns, is_known, "a state or an input") !=
             STATUS_OK ||
         check_all(instance, function, unknowns, number_of_unknowns, is_unknown,
-                  "output or derivative") != STATUS_OK ||
+                  "an output or a derivative") != STATUS_OK ||
         refresh(instance, function) != STATUS_OK) {
         return STATUS_ERROR;
     }

@@ -15,7 +15,8 @@
 #include <xmmintrin.h>
 #endif
 
-enum { LEAKED_BYTES = 4 << 20, PAGE = 4096, LINES = 20000, MESSAGES = 200, DESCRIPTORS = 200 };
+enum { LEAKED_BYTES = 4 << 20, PAGE = 4096, LINES = 20000, MESSAGES = 200, DESCRIPTORS = 200,
+       SECONDS = 30 };
 
 struct Animal {
     double values[VARIABLES];
@@ -106,9 +107,25 @@ static void leak(void) {
     }
 }
 
+/* The new process keeps open what this one has open. */
+static void fork_sleeper(void) {
+    if (fork() == 0) {
+        sleep(SECONDS);
+        _exit(0);
+    }
+}
+
 /* Faults that end the process or never return. */
 static void die(int fault) {
     switch (fault) {
+    case FORK_AND_CRASH:
+        fork_sleeper();
+        write_to_null();
+        break;
+    case FORK_AND_LOOP:
+        fork_sleeper();
+        hang(false);
+        break;
     case SEGV:
         write_to_null();
         break;
@@ -191,6 +208,12 @@ static int misbehave(Animal *me, int fault) {
         break;
     case LEAK:
         leak();
+        break;
+    case FORK:
+        fork_sleeper();
+        break;
+    case FORK_A_TWIN:
+        fork();
         break;
     default:
         break;

@@ -50,7 +50,11 @@ enum fault {
     CHANGE_DIRECTORY,
     CHANGE_ENVIRONMENT,
     LEAK,
-    DO_NOTHING
+    DO_NOTHING,
+    FORK,
+    FORK_AND_CRASH,
+    FORK_AND_LOOP,
+    FORK_A_TWIN
 };
 
 enum status { OK, WARNING, DISCARD, ERROR };

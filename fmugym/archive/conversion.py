@@ -1,0 +1,234 @@
+"""Making a ``ModelDescription`` of what FMPy has read, and of the XML where FMPy leaves gaps."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any, Final
+
+from fmpy.validation import validate_model_description
+
+from fmugym.archive.description import Capabilities, ModelDescription, Variable
+from fmugym.errors import FMULoadError
+
+__all__ = ["convert"]
+
+_EXPERIMENT: Final = ("startTime", "stopTime", "tolerance", "stepSize")
+_POSITIVE: Final = {"tolerance", "stepSize", "fixedInternalStepSize"}
+_IDENTIFIER: Final = re.compile(r"[^/\\:]{1,200}")
+_REFERENCES: Final = range(2**32)
+_ITEMS: Final = range(-(2**63), 2**63)
+
+
+def convert(source: Any, root: Any) -> ModelDescription:
+    """Make a model description.
+
+    Args:
+        source: What FMPy has read.
+        root: The root of the XML.
+
+    Raises:
+        FMULoadError: If the FMU has no co-simulation interface, or a value that cannot be used.
+        Exception: FMPy's objects may lack anything in a malformed file.
+    """
+    co_simulation = source.coSimulation
+    if co_simulation is None:
+        raise FMULoadError(
+            f"{source.modelName} has no co-simulation interface; "
+            "export the model for co-simulation (model exchange is not supported)"
+        )
+    experiment = source.defaultExperiment
+    _read_unsigned_limits(source, root)
+    variables = {v.name: _convert_variable(v) for v in source.modelVariables}
+    return ModelDescription(
+        fmi_version=source.fmiVersion,
+        model_name=source.modelName or "",
+        model_identifier=_identifier(source, co_simulation.modelIdentifier),
+        instantiation_token=source.guid or "",
+        interfaces=_interfaces(source),
+        description=source.description or "",
+        generation_tool=source.generationTool or "",
+        start_time=_time(experiment, "startTime") or 0.0,
+        stop_time=_time(experiment, "stopTime"),
+        tolerance=_time(experiment, "tolerance"),
+        step_size=_time(experiment, "stepSize"),
+        fixed_internal_step_size=_time(co_simulation, "fixedInternalStepSize"),
+        capabilities=_capabilities(source, root),
+        variables=variables,
+        state_derivatives=_state_derivatives(source),
+        findings=_findings(source),
+    )
+
+
+def _state_derivatives(source: Any) -> dict[str, str]:
+    """Read the derivatives in ModelStructure, but for those that do not name their states."""
+    derivatives = [unknown.variable for unknown in source.derivatives]
+    return {d.derivative.name: d.name for d in derivatives if d.derivative and not d.shape}
+
+
+def _interfaces(source: Any) -> tuple[str, ...]:
+    offered = {
+        "co-simulation": source.coSimulation,
+        "model exchange": source.modelExchange,
+        "scheduled execution": source.scheduledExecution,
+    }
+    return tuple(name for name, interface in offered.items() if interface is not None)
+
+
+def _identifier(source: Any, name: str | None) -> str:
+    """The model identifier becomes a file name: a path here would load any library.
+
+    The functions of FMI 1.0 begin with it, so that it must be a C identifier there.
+    """
+    file_name = name is not None and name.isprintable() and _IDENTIFIER.fullmatch(name)
+    if name is None or not file_name or name in {".", ".."}:
+        raise FMULoadError(f"the modelIdentifier is {name!r}, expected the name of a file")
+    if source.fmiVersion == "1.0" and not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII):
+        raise FMULoadError(
+            f"the modelIdentifier is {name!r}, expected a C identifier: the names of the functions "
+            "of FMI 1.0 begin with it"
+        )
+    return name
+
+
+def _time(source: Any, attribute: str) -> float | None:
+    """Read a time or the tolerance; None if it is not given or cannot be used."""
+    text = getattr(source, attribute, None)
+    if text is None:
+        return None
+    value = float(text)
+    usable = math.isfinite(value) and (value > 0 or attribute not in _POSITIVE)
+    return value if usable else None
+
+
+def _capabilities(source: Any, root: Any) -> Capabilities:
+    interface = source.coSimulation
+    if source.fmiVersion == "1.0":
+        return _fmi1_capabilities(root)
+    return Capabilities(
+        interface.canHandleVariableCommunicationStepSize,
+        interface.canGetAndSetFMUstate,
+        interface.canSerializeFMUstate,
+        _provides_directional_derivatives(root),
+        interface.canBeInstantiatedOnlyOncePerProcess,
+        interface.needsExecutionTool,
+    )
+
+
+def _provides_directional_derivatives(root: Any) -> bool:
+    """Read the flag. FMI 3.0 spells it in the plural, which FMPy does not read."""
+    attributes = root.find("CoSimulation").attrib
+    names = ("providesDirectionalDerivative", "providesDirectionalDerivatives")
+    return any(attributes.get(name) in {"true", "1"} for name in names)
+
+
+def _fmi1_capabilities(root: Any) -> Capabilities:
+    """Read the flags of FMI 1.0, which FMPy leaves out. FMI 1.0 has no FMU state."""
+    flags = root.find("Implementation/*/Capabilities")
+    attributes = {} if flags is None else flags.attrib
+
+    def flag(name: str) -> bool:
+        return attributes.get(name) in {"true", "1"}
+
+    return Capabilities(
+        can_handle_variable_communication_step_size=flag("canHandleVariableCommunicationStepSize"),
+        can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
+        needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
+    )
+
+
+def _read_unsigned_limits(source: Any, root: Any) -> None:
+    """Read min and max of unsigned integers, which FMPy leaves out."""
+    elements = {element.get("name"): element for element in root.find("ModelVariables")}
+    for variable in source.modelVariables:
+        if variable.type.startswith("UInt"):
+            element = elements[variable.name]
+            variable.min, variable.max = element.get("min"), element.get("max")
+
+
+def _convert_variable(source: Any) -> Variable:
+    _check_reference(source)
+    return Variable(
+        name=source.name,
+        type=source.type,
+        value_reference=int(source.valueReference),
+        causality=source.causality,
+        variability=source.variability,
+        initial=_initial(source),
+        start=source.start,
+        unit=_inherited(source, "unit", str),
+        minimum=_bound(source, "min", -math.inf),
+        maximum=_bound(source, "max", math.inf),
+        nominal=_nominal(source),
+        description=source.description or "",
+        items=_items(source),
+        shape=tuple(source.shape or ()),
+    )
+
+
+def _check_reference(source: Any) -> None:
+    if int(source.valueReference) not in _REFERENCES:
+        raise FMULoadError(
+            f"variable {source.name!r} has the value reference {source.valueReference}, expected "
+            f"0 to {_REFERENCES[-1]}"
+        )
+
+
+def _initial(source: Any) -> str | None:
+    """Read ``initial``. FMI 1.0 has none: there a start attribute means that it may be set."""
+    if source.initial is None:
+        return None if source.start is None else "exact"
+    return str(source.initial)
+
+
+def _inherited(source: Any, attribute: str, convert: Callable[[str], Any]) -> Any:
+    """Take an attribute from the variable, or else from its declared type."""
+    value = getattr(source, attribute)
+    if value is None and source.declaredType is not None:
+        value = getattr(source.declaredType, attribute)
+    return None if value is None else convert(value)
+
+
+def _bound(source: Any, attribute: str, default: float) -> float:
+    value = _inherited(source, attribute, float)
+    return default if value is None or math.isnan(value) else float(value)
+
+
+def _nominal(source: Any) -> float | None:
+    value = _inherited(source, "nominal", float)
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _items(source: Any) -> tuple[tuple[str, int], ...]:
+    declared = source.declaredType
+    items = () if declared is None else tuple((str(i.name), int(i.value)) for i in declared.items)
+    for name, value in items:
+        if value not in _ITEMS:
+            raise FMULoadError(
+                f"item {name!r} of the enumeration {declared.name!r} is {value}, expected an "
+                "integer of 64 bits"
+            )
+    return items
+
+
+def _findings(source: Any) -> tuple[str, ...]:
+    experiment = _unused_times(source.defaultExperiment, _EXPERIMENT)
+    internal = _unused_times(source.coSimulation, ("fixedInternalStepSize",))
+    return experiment + internal + _broken_rules(source)
+
+
+def _unused_times(source: Any, attributes: tuple[str, ...]) -> tuple[str, ...]:
+    given = {name: getattr(source, name, None) for name in attributes}
+    return tuple(
+        f"{name} is {text}, which cannot be used"
+        for name, text in given.items()
+        if text is not None and _time(source, name) is None
+    )
+
+
+def _broken_rules(source: Any) -> tuple[str, ...]:
+    try:
+        return tuple(validate_model_description(source))
+    except Exception as error:  # the validation itself stumbles over some invalid files
+        return (f"the model description could not be validated: {error}",)

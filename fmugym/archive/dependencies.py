@@ -1,0 +1,127 @@
+"""The shared libraries that an FMU needs, looked for before the FMU is loaded."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from fmugym.archive.elf import opened
+from fmugym.archive.loader import ask
+from fmugym.errors import FMULoadError
+
+__all__ = ["libraries_of", "load_globally", "missing_libraries", "stray_libraries"]
+
+
+class _Needed(NamedTuple):
+    """A library that another one needs.
+
+    Attributes:
+        name: Its name.
+        path: Where it is among the files of the FMU, or None.
+        found: Whether the loader finds it there.
+    """
+
+    name: str
+    path: Path | None
+    found: bool
+
+
+def missing_libraries(
+    library: Path, provided: Iterable[str] = (), ask: Callable[[Sequence[str]], list[str]] = ask
+) -> list[str]:
+    """Find the shared libraries that a library needs and the system's loader would not find.
+
+    The search is the loader's own: libraries that are loaded already, the library's search path
+    (``$ORIGIN`` is its folder), and, by asking the loader, ``LD_LIBRARY_PATH``, the cache of
+    ldconfig and the system's folders. Libraries beside the FMU's own count as found, since
+    ``stray_libraries`` are loaded before. What the libraries need that the FMU brings along is
+    looked for too. Nothing of the FMU is loaded.
+
+    Args:
+        library: The library, extracted.
+        provided: Paths or names of libraries that will be loaded before.
+        ask: Asks the loader; see ``fmugym.archive.loader``.
+
+    Returns:
+        Their names. Empty on systems other than Linux, where the loader has to report them.
+
+    Raises:
+        FMULoadError: If a library that the FMU brings along is cut short.
+    """
+    if sys.platform != "linux":
+        return []
+    known = set(_names_of(provided))
+    absent = ask([n.name for n in _needed(library) if n.path is None and n.name not in known])
+    return list(dict.fromkeys(name for name in absent if name not in known))
+
+
+def stray_libraries(library: Path) -> list[Path]:
+    """Find libraries that an FMU brings along in a folder where the loader does not look.
+
+    Args:
+        library: The FMU's library, extracted.
+
+    Returns:
+        Their paths, in the order in which they are to be loaded before the FMU's library. Empty on
+        systems other than Linux.
+    """
+    if sys.platform != "linux":
+        return []
+    stray = [needed for needed in _needed(library) if needed.path and not needed.found]
+    return [needed.path for needed in reversed(stray) if needed.path and ask([needed.name])]
+
+
+def libraries_of(library: Path) -> list[Path]:
+    """The library, and those that it needs and finds among the files of its FMU."""
+    return [library, *(needed.path for needed in _needed(library) if needed.path)]
+
+
+def _needed(library: Path) -> Iterator[_Needed]:
+    """Each library that is needed, once."""
+    seen: set[str] = set()
+    todo: list[tuple[Path, list[Path]]] = [(library, [])]
+    while todo:
+        path, inherited = todo.pop()
+        with opened(path) as elf:
+            names, folders = elf.needed, elf.search_path(path.parent) + inherited
+        for name in names:
+            if name in seen:
+                continue
+            seen.add(name)
+            found = _file_in(folders, name)
+            there = found or _file_in([library.parent], name)
+            if there is not None:
+                todo.append((there, folders))
+            yield _Needed(name, there, found is not None)
+
+
+def _file_in(folders: Iterable[Path], name: str) -> Path | None:
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
+def _names_of(libraries: Iterable[str]) -> Iterator[str]:
+    """The names by which the loader knows libraries that are given by name or path."""
+    for library in libraries:
+        yield os.path.basename(library)
+        if os.path.isfile(library):
+            with opened(Path(library)) as elf:
+                yield elf.soname or ""
+
+
+def load_globally(path: str) -> None:
+    """Load a library so that its symbols and its name serve the libraries loaded after it.
+
+    Args:
+        path: An absolute path, or a name that the system's loader finds.
+
+    Raises:
+        FMULoadError: If it cannot be loaded.
+    """
+    try:
+        ctypes.CDLL(path, mode=getattr(os, "RTLD_GLOBAL", ctypes.DEFAULT_MODE))
+    except OSError as error:
+        raise FMULoadError(f"the library {path!r} cannot be loaded: {error}") from None

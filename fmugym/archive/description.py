@@ -1,0 +1,177 @@
+"""What an FMU says of itself, in one form for the three FMI versions.
+
+These types hold the rules for which variable may be set when. ``fmugym.archive.reading`` makes them
+from an FMU's XML.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import fmpy
+
+from fmugym.errors import ConfigError, unknown_name
+
+__all__ = ["Capabilities", "ModelDescription", "Variable"]
+
+_KINDS = {
+    "Real": "real",
+    "Float32": "real",
+    "Float64": "real",
+    "Boolean": "boolean",
+    "Enumeration": "enumeration",
+    "String": "string",
+    "Binary": "binary",
+    "Clock": "clock",
+}
+_INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
+
+
+@dataclass(frozen=True, eq=False)
+class Variable:
+    """One variable of the model description, in the terms of the FMI standard.
+
+    Attributes:
+        type: The standard's own name: ``Real``, ``Float64``, ``Int32``, ...
+        start: The start value as the XML has it.
+        minimum, maximum: Infinite where neither the variable nor its declared type gives a number.
+        nominal: None where neither the variable nor its declared type gives a finite number.
+        items: Names and values of an enumeration.
+        shape: The shape of an array (FMI 3.0); () for a scalar.
+    """
+
+    name: str
+    type: str
+    value_reference: int
+    causality: str
+    variability: str
+    initial: str | None
+    start: str | None = None
+    unit: str | None = None
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    nominal: float | None = None
+    description: str = ""
+    items: tuple[tuple[str, int], ...] = ()
+    shape: tuple[int, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """One of real, integer, boolean, enumeration, string, binary and clock."""
+        return _KINDS.get(self.type, "integer")
+
+    @property
+    def numeric(self) -> bool:
+        """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration."""
+        return self.kind in {"real", "integer", "boolean", "enumeration"} and not self.shape
+
+    @property
+    def settable_at_start(self) -> bool:
+        """Whether a value may be set between instantiation and initialization."""
+        if self.variability == "constant":
+            return False
+        return self.causality == "input" or self.initial in {"exact", "approx"}
+
+    @property
+    def settable_in_step(self) -> bool:
+        """Whether a value may be set between two steps."""
+        tunable = self.causality == "parameter" and self.variability == "tunable"
+        return self.causality == "input" or tunable
+
+    @property
+    def start_number(self) -> float:
+        """The start value of a numeric variable; 0 if the FMU gives none.
+
+        Raises:
+            ConfigError: If it is not a finite number.
+        """
+        text = "0" if self.start is None else self.start
+        try:
+            number = float({"true": "1", "false": "0"}.get(text, text))
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise ConfigError(
+                f"the start value of {self.name!r} is {text!r}, expected a finite number"
+            )
+        return number
+
+    @property
+    def integer_limits(self) -> tuple[int, int]:
+        """The range of the C type of an integer or enumeration."""
+        if self.type.startswith("UInt"):
+            return 0, 2 ** int(self.type[4:]) - 1
+        bits = _INTEGER_BITS[self.type]
+        return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """The capability flags of a co-simulation FMU, by their FMI 3.0 names in Python's spelling."""
+
+    can_handle_variable_communication_step_size: bool = False
+    can_get_and_set_fmu_state: bool = False
+    can_serialize_fmu_state: bool = False
+    provides_directional_derivatives: bool = False
+    can_be_instantiated_only_once_per_process: bool = False
+    needs_execution_tool: bool = False
+
+
+@dataclass(frozen=True)
+class ModelDescription:
+    """The part of a model description that an environment needs.
+
+    Attributes:
+        model_identifier, capabilities: Those of co-simulation.
+        interfaces: The interface types that the FMU offers.
+        start_time, stop_time, step_size, fixed_internal_step_size: In seconds; None where the FMU
+            gives no usable value.
+        tolerance: Of the default experiment; None where the FMU gives no usable value.
+        variables: The variables by name, in the order of the XML.
+        state_derivatives: For each scalar continuous state that the FMU declares, the name of its
+            derivative.
+        findings: Rules of the standard that the file breaks, as texts.
+    """
+
+    fmi_version: str
+    model_name: str
+    model_identifier: str
+    instantiation_token: str
+    interfaces: tuple[str, ...]
+    description: str
+    generation_tool: str
+    start_time: float
+    stop_time: float | None
+    tolerance: float | None
+    step_size: float | None
+    fixed_internal_step_size: float | None
+    capabilities: Capabilities
+    variables: Mapping[str, Variable]
+    state_derivatives: Mapping[str, str]
+    findings: tuple[str, ...]
+
+    @cached_property
+    def fmi_major_version(self) -> int:
+        """1, 2 or 3."""
+        return int(self.fmi_version.split(".")[0])
+
+    @property
+    def platform(self) -> str:
+        """The folder under ``binaries/`` for this machine; FMI 3.0 has other names for them."""
+        return str(fmpy.platform_tuple if self.fmi_major_version == 3 else fmpy.platform)
+
+    def variable(self, name: str) -> Variable:
+        """Look a variable up by its name.
+
+        Raises:
+            ConfigError: If there is no such variable; the message suggests the nearest name.
+        """
+        try:
+            return self.variables[name]
+        except Exception:  # a KeyError; or something that is no key at all
+            raise unknown_name(
+                f"variable of {self.model_name}", name, list(self.variables)
+            ) from None

@@ -1,0 +1,380 @@
+"""An FMU file: it is opened once, checked, extracted to its own folder and cleaned up.
+
+Reading the description never executes the FMU. Loading it (``fmugym.fmi``, ``fmugym.pool``) does:
+an FMU is native code that runs with all the rights of the process.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import fmpy
+
+from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.executable import check_library
+from fmugym.archive.loader import ask_in_a_child
+from fmugym.archive.packages import describe_missing
+from fmugym.archive.reading import read_model_description
+from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
+from fmugym.archive.temporary import make_folder, remove_folder
+from fmugym.checks import check_path
+from fmugym.errors import ConfigError, FMULoadError, printable, shown
+
+__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_PROBE_TIMEOUT: Final = 60.0
+"""Seconds that the trial of an unknown FMU may take, including the start of its process."""
+
+_NEVER_NEEDED: Final = {"documentation", "sources"}
+_MOST_FINDINGS: Final = 20
+"""Findings that the log repeats; ``FMU.findings`` has all."""
+
+
+class LoadableFMU(ABC):
+    """What a pool needs in order to load an FMU.
+
+    Args:
+        path: The ``.fmu`` file.
+        description: The model description.
+        preload: Shared libraries to load before the FMU's: absolute paths, or bare names.
+    """
+
+    def __init__(self, path: Path, description: ModelDescription, preload: tuple[str, ...]) -> None:
+        self.path = path
+        self.description = description
+        self.preload = preload
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.path)!r})"
+
+    @property
+    def platform(self) -> str:
+        """The folder under ``binaries/`` that this machine needs."""
+        return self.description.platform
+
+    @property
+    def library(self) -> str:
+        """The place of the library for this machine, relative to the folder of ``extract``."""
+        file_name = self.description.model_identifier + fmpy.sharedLibraryExtension
+        return f"binaries/{self.platform}/{file_name}"
+
+    @abstractmethod
+    def extract(self) -> Path:
+        """Return the folder that holds the extracted archive."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Remove what ``extract`` has made; more than one call is fine."""
+
+    def prepare_library(self) -> Path:
+        """Make the FMU's library ready to be loaded into this process.
+
+        Loads the libraries of ``preload`` and those that the FMU brings along where the loader
+        does not look, and finds out which others are missing.
+
+        Returns:
+            The path of the library, in the folder of ``extract``.
+
+        Raises:
+            FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
+                are missing.
+        """
+        library = self.extract() / self.library
+        for path in self.preload:
+            load_globally(path)
+        missing = missing_libraries(library)
+        if missing:
+            raise FMULoadError(describe_missing(self.path.name, missing))
+        for stray in stray_libraries(library):
+            load_globally(str(stray))
+        return library
+
+
+class ExtractedFMU(LoadableFMU):
+    """An FMU in a folder that somebody else owns, and that stays when this object is closed.
+
+    Args:
+        path: The ``.fmu`` file.
+        description: The model description.
+        preload: See ``LoadableFMU``.
+        folder: The folder.
+    """
+
+    def __init__(
+        self, path: Path, description: ModelDescription, preload: tuple[str, ...], folder: Path
+    ) -> None:
+        super().__init__(path, description, preload)
+        self._folder = folder
+
+    def extract(self) -> Path:
+        """Return the folder."""
+        return self._folder
+
+    def close(self) -> None:
+        """Leave the folder alone."""
+
+
+class FMU(LoadableFMU):
+    """An FMU archive and the temporary folder it is extracted to.
+
+    Args:
+        path: The ``.fmu`` file.
+        limits: What is too large to be opened; by default ``ArchiveLimits()``.
+        preload: Shared libraries to load before the FMU's, which may need them: paths, or names
+            that the system's loader finds.
+        probe_timeout: Seconds that the first load and step of an unknown FMU may take in a process
+            of its own; None to do without. See ``fmugym.trial``.
+
+    Attributes:
+        path: The file's absolute path.
+        description: The model description.
+        findings: What breaks rules of the standard in the archive and in the model description,
+            as texts.
+        limits, preload, probe_timeout: As given; ``preload`` a tuple with absolute paths.
+
+    Raises:
+        ConfigError: If an argument does not fit.
+        FMULoadError: If the file is missing, not a sound FMU archive, or offers no co-simulation.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        limits: ArchiveLimits | None = None,
+        preload: Sequence[str | os.PathLike[str]] = (),
+        probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT,
+    ) -> None:
+        file = check_path("the path of an FMU", path).absolute()
+        self.limits = ArchiveLimits() if limits is None else limits
+        if not isinstance(self.limits, ArchiveLimits):
+            raise ConfigError(f"limits must be ArchiveLimits, got {shown(limits)}")
+        _check_probe_timeout(probe_timeout)
+        self.probe_timeout = probe_timeout
+        libraries = _absolute(preload)
+        self._archive = SafeZip(file, self.limits)
+        super().__init__(file, read_model_description(self._archive, self.limits), libraries)
+        self._library_place, note = _find_library(list(self._archive.files), self.library)
+        self.findings = (*self._archive.notes, *note, *self.description.findings)
+        self._folder: Path | None = None
+        self._remove_folder: weakref.finalize[..., FMU] | None = None
+        self._log_findings()
+
+    def _log_findings(self) -> None:
+        if self.findings:
+            logger.info(
+                "%s: %d findings in the FMU: %s",
+                printable(self.path.name),
+                len(self.findings),
+                printable("; ".join(self.findings[:_MOST_FINDINGS])),
+            )
+
+    @classmethod
+    def of(cls, source: FMU | str | os.PathLike[str]) -> FMU:
+        """Open an FMU by its path, or open a second one with the arguments of the first."""
+        if not isinstance(source, FMU):
+            return cls(source)
+        return cls(
+            source.path,
+            limits=source.limits,
+            preload=source.preload,
+            probe_timeout=source.probe_timeout,
+        )
+
+    def variable(self, name: str) -> Variable:
+        """Look a variable up by name; see ``ModelDescription.variable``."""
+        return self.description.variable(name)
+
+    @cached_property
+    def platforms(self) -> tuple[str, ...]:
+        """The folders under ``binaries/``, which name the platforms the FMU was built for."""
+        parts = [place.split("/") for place in self._archive.files]
+        return tuple(sorted({p[1] for p in parts if len(p) > 2 and p[0] == "binaries"}))
+
+    @property
+    def runs_here(self) -> bool:
+        """Whether nothing is known that would keep the FMU from being loaded on this machine."""
+        return not self.obstacles
+
+    @cached_property
+    def obstacles(self) -> tuple[str, ...]:
+        """What keeps the FMU from being loaded on this machine, as texts with the cure.
+
+        There is no library for this platform or processor, or it needs shared libraries that are
+        missing here. Nothing of the FMU is loaded.
+        """
+        try:
+            self._check_library()
+            missing = self.missing_libraries
+        except FMULoadError as error:
+            return (str(error),)
+        return (printable(describe_missing(self.path.name, missing)),) if missing else ()
+
+    @cached_property
+    def missing_libraries(self) -> tuple[str, ...]:
+        """The shared libraries that the FMU needs and this system does not have.
+
+        Empty where there is no library for this platform, and on systems other than Linux.
+
+        Raises:
+            FMULoadError: If a library of the FMU is damaged.
+        """
+        if self._library_place is None:
+            return ()
+        if self._folder is not None:
+            return self._missing_in(self._folder)
+        folder = make_folder()
+        try:
+            self._extract_to(folder, only="binaries")
+            return self._missing_in(folder)
+        finally:
+            remove_folder(folder, os.getpid())
+
+    def _missing_in(self, folder: Path) -> tuple[str, ...]:
+        return tuple(missing_libraries(folder / self.library, self.preload, ask_in_a_child))
+
+    def extract(self) -> Path:
+        """Extract what this machine needs, once, into a temporary folder.
+
+        The folder is removed by ``close``, with this object, or at the end of the interpreter.
+
+        Returns:
+            The folder.
+
+        Raises:
+            FMULoadError: If there is no library for this platform or the archive is damaged.
+        """
+        if self._folder is not None:
+            return self._folder
+        self._check_library()
+        folder = make_folder()
+        self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
+        try:
+            self._extract_to(folder)
+        except BaseException:
+            self.close()
+            raise
+        self._folder = folder
+        return folder
+
+    def _check_library(self) -> None:
+        """Look at the library inside the archive: nothing is written if it cannot be loaded."""
+        place = self._library_place
+        if place is None:
+            raise FMULoadError(self._no_library())
+        with self._archive.open(place) as file:
+            size = self._archive.files[place].file_size
+            check_library(file, size, f"{self.path.name}: {place}")
+
+    def _no_library(self) -> str:
+        """Say which library is missing, and what there is instead."""
+        folder, _, name = self.library.rpartition("/")
+        there = [p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), folder)]
+        if there:
+            return (
+                f"{self.path.name} has {len(there)} libraries for this platform in {folder} "
+                f"({', '.join(there)}), but none is named {name}; give the right one that name"
+            )
+        return (
+            f"{self.path.name} has no library for this platform ({self.library}); it was built "
+            f"for: {', '.join(self.platforms) or 'no platform at all'}"
+        )
+
+    def _extract_to(self, folder: Path, only: str = "") -> None:
+        """Extract the files that are needed, or those of one folder of them."""
+        files = {p: self._target(p) for p in self._archive.files if self._needed(p, only)}
+        folders = [self._target(p) for p in self._archive.folders if self._needed(p, only)]
+        self._archive.extract(folder, files, [*folders, "resources"])  # tools pass its path always
+
+    def _needed(self, place: str, only: str) -> bool:
+        first, _, rest = place.partition("/")
+        if only and first != only:
+            return False
+        if first == "binaries":
+            return rest.partition("/")[0].casefold() == self.platform.casefold() and "/" in rest
+        return first not in _NEVER_NEEDED
+
+    def _target(self, place: str) -> str:
+        """Where a file is extracted to: the library gets its standard name."""
+        if place == self._library_place:
+            return self.library
+        first, _, rest = place.partition("/")
+        if first == "binaries":
+            return f"binaries/{self.platform}/{rest.partition('/')[2]}"
+        return place
+
+    def close(self) -> None:
+        """Remove the temporary folder; more than one call is fine."""
+        self._folder = None
+        if self._remove_folder is not None:
+            self._remove_folder()
+
+
+def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:
+    """Find the library for this platform, which some tools give another name.
+
+    Args:
+        places: The places of all files.
+        wanted: The place of the library by the standard.
+
+    Returns:
+        Its place, or None; and a note if that is not the place by the standard.
+    """
+    if wanted in places:
+        return wanted, []
+    folder = wanted.rpartition("/")[0]
+    there = _libraries_in(places, folder)
+    same = [place for place in there if place.casefold() == wanted.casefold()]
+    candidates = same or there
+    if len(candidates) != 1:
+        return None, []
+    return candidates[0], [f"the library is {candidates[0]!r}, expected {wanted!r}; it is used"]
+
+
+def _libraries_in(places: Sequence[str], folder: str) -> list[str]:
+    """The libraries right in a folder, whose name may differ in case."""
+    suffix = fmpy.sharedLibraryExtension.casefold()
+    return [
+        place
+        for place in places
+        if place.rpartition("/")[0].casefold() == folder.casefold()
+        and place.casefold().endswith(suffix)
+    ]
+
+
+def _check_probe_timeout(timeout: float | None) -> None:
+    number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
+    if timeout is not None and not (number and 0 < timeout < math.inf):
+        raise ConfigError(
+            f"probe_timeout must be positive and finite, or None, got {shown(timeout)}"
+        )
+
+
+def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
+    """A bare name is left to the system's loader."""
+    try:
+        paths = [] if isinstance(libraries, str) else [_file_name(one) for one in libraries]
+    except Exception:  # a TypeError; or an object whose own methods fail
+        paths = []
+    if not paths and not (isinstance(libraries, list | tuple) and len(libraries) == 0):
+        raise ConfigError(f"preload must be a list of paths, got {shown(libraries)}")
+    return tuple(os.path.abspath(path) if os.path.dirname(path) else path for path in paths)
+
+
+def _file_name(path: str | os.PathLike[str]) -> str:
+    """The text of a path that a file can have."""
+    encoded = os.fsencode(path)
+    if b"\0" in encoded:
+        raise ValueError
+    return os.fsdecode(encoded)

@@ -1,0 +1,173 @@
+"""Reading ``modelDescription.xml`` in bounded memory and time, whatever the file holds.
+
+Nothing is parsed before its size, its encoding and the amount of its markup are known: a short file
+can unpack to gigabytes, and each element takes a quarter of a kilobyte once it is parsed.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from typing import Any, Final
+
+import fmpy
+from lxml import etree
+
+from fmugym.archive.conversion import convert
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, over_limit
+from fmugym.errors import FMULoadError
+
+__all__ = ["read_model_description"]
+
+_XML: Final = "modelDescription.xml"
+_MARKUP_PER_VARIABLE: Final = 25
+"""Elements and attributes that a file may have for each of ``max_variables``."""
+
+_UTF_8_MARK: Final = b"\xef\xbb\xbf"
+_BYTE_ORDER_MARKS: Final = {
+    _UTF_8_MARK: "utf-8",
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+    b"<\0": "utf-16-le",
+    b"\0<": "utf-16-be",
+}
+_DECLARATION: Final = re.compile(rb"\A(<\?xml\s[^>]*\?>)?")
+_ENCODING: Final = re.compile(rb"""<\?xml[^>]*?\bencoding\s*=\s*["']([^"'>]*)["']""")
+_DEPENDENCIES: Final = re.compile(rb"""\sdependencies(Kind)?\s*=\s*("[^"]*"|'[^']*')""")
+_ENCODINGS: Final = re.compile(r"utf-?8|(us-)?ascii|iso-?8859-\d+|(windows-|cp)125\d", re.I)
+"""Encodings in which neither ``<`` nor ``=`` can hide. FMI 2.0 and 3.0 ask for UTF-8."""
+
+
+def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDescription:
+    """Read the model description of an FMU. Nothing of the FMU is executed or extracted.
+
+    FMUs may break rules of the standard, as many do: what FMPy's validation finds is kept in
+    ``findings``.
+
+    Args:
+        archive: The FMU.
+        limits: What is too large to be read.
+
+    Returns:
+        The model description.
+
+    Raises:
+        FMULoadError: If the XML is missing, too large, unreadable or not that of a co-simulation
+            FMU.
+    """
+    name = archive.path.name
+    content = _read_xml(archive, limits.max_xml_bytes)
+    _check_markup(name, content, limits.max_variables)
+    content = _without_dependencies(content)
+    root = _parse(name, content)
+    _check_root(name, root, limits.max_variables)
+    try:
+        return convert(_parse_with_fmpy(content), root)
+    except FMULoadError as error:
+        raise FMULoadError(f"{name}: {error}") from None
+    except Exception as error:  # FMPy leaks a dozen types of exceptions for malformed files
+        raise FMULoadError(
+            f"{name}: {_XML} cannot be understood: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _read_xml(archive: SafeZip, limit: int) -> bytes:
+    if _XML not in archive.files:
+        raise FMULoadError(f"{archive.path.name} is not an FMU: it has no {_XML}{_hint(archive)}")
+    content = archive.read(_XML, limit)
+    if len(content) > limit:
+        size = max(len(content), archive.files[_XML].file_size)
+        raise over_limit(f"{archive.path.name}: {_XML} has {size} bytes", limit, "max_xml_bytes")
+    try:
+        return _as_utf_8(content)
+    except (UnicodeError, LookupError) as error:
+        raise FMULoadError(f"{archive.path.name}: {_XML} is not valid XML: {error}") from None
+
+
+def _hint(archive: SafeZip) -> str:
+    """Name the mistake of those who pack a folder instead of what is in it."""
+    inside = next((p for p in archive.files if p.endswith(f"/{_XML}") and p.count("/") == 1), None)
+    if inside is None:
+        return ""
+    folder = inside.partition("/")[0]
+    return f", but {inside!r}; pack the files in the folder {folder!r}, not the folder itself"
+
+
+def _as_utf_8(content: bytes) -> bytes:
+    """Convert the text to UTF-8, with a declaration that says so and is the only one.
+
+    The parsers would find the encoding by themselves, but not all of them the same one.
+    """
+    encoding = _encoding_of(content)
+    if not re.fullmatch("utf-?8", encoding, re.IGNORECASE):
+        content = content.decode(encoding).encode()
+    text = content.removeprefix(_UTF_8_MARK).lstrip()
+    return _DECLARATION.sub(b'<?xml version="1.0" encoding="UTF-8"?>', text, count=1)
+
+
+def _encoding_of(content: bytes) -> str:
+    """The encoding by the byte order mark or else the declaration.
+
+    Raises:
+        LookupError: If markup could hide in it.
+    """
+    encoding = next((e for m, e in _BYTE_ORDER_MARKS.items() if content.startswith(m)), None)
+    if encoding is None:
+        declared = _ENCODING.match(content.lstrip()[:1000])
+        encoding = declared[1].decode("ascii", "replace") if declared else "utf-8"
+        if not _ENCODINGS.fullmatch(encoding):
+            raise LookupError(f"its encoding is {encoding[:40]!r}, expected 'UTF-8'")
+    return encoding
+
+
+def _check_markup(name: str, content: bytes, max_variables: int) -> None:
+    if re.search(rb"<!\s*DOCTYPE", content, re.IGNORECASE):  # its entities could grow without end
+        raise FMULoadError(f"{name}: {_XML} has a DOCTYPE, which FMI forbids")
+    count = content.count(b"<") + content.count(b"=")
+    limit = _MARKUP_PER_VARIABLE * max_variables + 1000
+    if count > limit:
+        found = f"{name}: {_XML} has some {count} elements and attributes"
+        raise over_limit(found, limit, "max_variables")
+
+
+def _without_dependencies(content: bytes) -> bytes:
+    """Leave out on what the unknowns depend.
+
+    No environment needs it, and FMPy makes millions of objects of a few megabytes of numbers. Line
+    breaks stay, since findings have the numbers of lines.
+    """
+    start = content.rfind(b"<ModelStructure")
+    if start < 0:
+        return content
+    rest = _DEPENDENCIES.sub(lambda match: b"\n" * match[0].count(b"\n"), content[start:])
+    return content[:start] + rest
+
+
+def _parse(name: str, content: bytes) -> Any:
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
+    try:
+        return etree.fromstring(content, parser)
+    except etree.XMLSyntaxError as error:
+        raise FMULoadError(f"{name}: {_XML} is not valid XML: {error}") from None
+
+
+def _check_root(name: str, root: Any, max_variables: int) -> None:
+    version = root.get("fmiVersion", "")
+    if root.tag != "fmiModelDescription" or not re.fullmatch(r"1\.0|2\.0(\.\d+)?|3\.\d.*", version):
+        raise FMULoadError(
+            f"{name}: expected a model description of FMI 1.0, 2.0 or 3.0, "
+            f"found <{root.tag} fmiVersion={version!r}>"
+        )
+    count = len(root.findall("ModelVariables/*"))
+    if count > max_variables:
+        raise over_limit(f"{name} has {count} variables", max_variables, "max_variables")
+
+
+def _parse_with_fmpy(content: bytes) -> Any:
+    """Hand FMPy an archive with nothing but the XML: what it reads is what was checked."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr(_XML, content)
+    return fmpy.read_model_description(buffer, validate=False)

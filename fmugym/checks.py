@@ -1,0 +1,246 @@
+"""Checks of single values that many arguments share.
+
+Each check takes the name of the value for the error, and any object at all, also one whose own
+methods fail. It returns the value in its plain Python type, or raises ``ConfigError``.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from numbers import Real
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.errors import ConfigError, shown, unknown_name
+
+__all__ = [
+    "LARGEST_COUNT",
+    "check_count",
+    "check_dict",
+    "check_flag",
+    "check_integer",
+    "check_mapping",
+    "check_number",
+    "check_option",
+    "check_path",
+    "check_seed",
+    "check_text",
+    "float_or_nan",
+    "has_method",
+    "integer_of",
+    "number_of",
+]
+
+LARGEST_COUNT: Final = 2**31 - 1
+"""The largest number of steps or threads that can be asked for."""
+
+
+def check_number(
+    what: str,
+    value: Any,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    *,
+    positive: bool = False,
+    may_be_infinite: bool = False,
+) -> float:
+    """Return a value as a float of a range.
+
+    Args:
+        what: The name of the value, for the error.
+        value: Any object.
+        minimum: The lowest number allowed.
+        maximum: The highest number allowed.
+        positive: Whether 0 is refused too.
+        may_be_infinite: Whether infinity is allowed.
+
+    Raises:
+        ConfigError: If it is no number, NaN, or out of its range.
+    """
+    number = number_of(what, value)
+    in_range = minimum <= number <= maximum and (number > 0 or not positive)
+    if in_range and (may_be_infinite or math.isfinite(number)):
+        return number
+    wanted = _range(minimum, maximum, positive, may_be_infinite)
+    raise ConfigError(f"{what} must be {wanted}, got {shown(value)}")
+
+
+def _range(minimum: float, maximum: float, positive: bool, may_be_infinite: bool) -> str:
+    kind = "a number" if may_be_infinite else "finite"
+    if maximum < math.inf:
+        return f"{kind} from {minimum:g} to {maximum:g}"
+    if positive:
+        return "positive" if may_be_infinite else "positive and finite"
+    if minimum == 0:
+        return f"{kind} and not negative"
+    return kind if minimum == -math.inf else f"{kind} and at least {minimum:g}"
+
+
+def number_of(what: str, value: Any) -> float:
+    """Return a value as a float, finite or not.
+
+    Raises:
+        ConfigError: If it is no real number.
+    """
+    if type(value) is float:
+        return value
+    if _is_real(value):
+        with suppress(Exception):  # the number is too large, or the object's own method fails
+            return float(value)
+    raise ConfigError(f"{what} must be a number, got {shown(value)}")
+
+
+def float_or_nan(value: Any) -> float:
+    """Return a value as a float; NaN if it is no real number."""
+    try:
+        return number_of("", value)
+    except ConfigError:
+        return math.nan
+
+
+def _is_real(value: Any) -> bool:
+    if issubclass(type(value), np.ndarray | np.generic):
+        return value.ndim == 0 and value.dtype.kind in "fiubO"
+    return issubclass(type(value), Real) or (
+        hasattr(type(value), "__float__") and not issubclass(type(value), str | bytes)
+    )
+
+
+def check_count(what: str, value: Any, largest: int = LARGEST_COUNT) -> int:
+    """Return a value as a positive integer.
+
+    Raises:
+        ConfigError: With the name and the value.
+    """
+    number = integer_of(value)
+    if number is None or not 0 < number <= largest:
+        bound = "" if number is None or number < 1 else f" of at most {largest}"
+        raise ConfigError(f"{what} must be a positive integer{bound}, got {shown(value)}")
+    return number
+
+
+def check_integer(what: str, value: Any, minimum: int, maximum: int) -> int:
+    """Return a value as an integer of a range.
+
+    Raises:
+        ConfigError: With the name and the value.
+    """
+    number = integer_of(value)
+    if number is None or not minimum <= number <= maximum:
+        raise ConfigError(
+            f"{what} must be an integer from {minimum} to {maximum}, got {shown(value)}"
+        )
+    return number
+
+
+def check_seed(value: Any) -> int | None:
+    """Return a seed as Gymnasium takes it: an integer that is not negative, or None.
+
+    Raises:
+        ConfigError: With the value.
+    """
+    if value is None:
+        return None
+    number = integer_of(value)
+    if number is None or number < 0:
+        raise ConfigError(f"seed must be an integer of at least 0, or None, got {shown(value)}")
+    return number
+
+
+def integer_of(value: Any) -> int | None:
+    """Return a value as an int; None if it is no integer, or a Boolean."""
+    if type(value) is int:
+        return value
+    if isinstance(value, bool | np.bool_):
+        return None
+    try:
+        return int(operator.index(value))
+    except Exception:  # a TypeError; or the object's own method fails
+        return None
+
+
+def check_flag(what: str, value: Any) -> bool:
+    """Return a value as True or False; 0 and 1 will do.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    number = integer_of(value)
+    if number not in {0, 1}:
+        raise ConfigError(f"{what} must be True or False, got {shown(value)}")
+    return bool(number)
+
+
+def has_method(value: object, name: str) -> bool:
+    """Whether a value has a method of this name; one that answers no question has none."""
+    try:
+        return callable(getattr(value, name, None))
+    except Exception:  # the object's own method fails
+        return False
+
+
+def check_text(what: str, value: Any) -> str:
+    """Return a value as a plain text.
+
+    Raises:
+        ConfigError: If it is no text.
+    """
+    if not isinstance(value, str):
+        raise ConfigError(f"{what} must be a text, got {shown(value)}")
+    return str.__str__(value)  # a subclass may have odd methods
+
+
+def check_option(kind: str, value: Any, known: Iterable[str]) -> str:
+    """Return a value that is one of some texts.
+
+    Raises:
+        ConfigError: With the nearest of them.
+    """
+    known = list(known)
+    if not isinstance(value, str) or str.__str__(value) not in known:
+        raise unknown_name(kind, value, known)
+    return str.__str__(value)
+
+
+def check_mapping(what: str, value: Any) -> dict[str, Any]:
+    """Return a mapping with names as keys as a new dict.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    items = check_dict(what, value)
+    if all(isinstance(name, str) for name in items):
+        return {str.__str__(name): item for name, item in items.items()}
+    raise ConfigError(f"{what} must be a dict with names as keys, got {shown(value)}")
+
+
+def check_dict(what: str, value: Any) -> dict[Any, Any]:
+    """Return a mapping as a new dict.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if issubclass(type(value), Mapping):
+        with suppress(Exception):  # a mapping of the caller's whose methods fail
+            return dict(value)
+    raise ConfigError(f"{what} must be a dict, got {shown(value)}")
+
+
+def check_path(what: str, value: Any) -> Path:
+    """Return a value as a path; ``~`` stands for the home folder.
+
+    Raises:
+        ConfigError: If it is no path.
+    """
+    try:
+        return Path(os.fsdecode(value)).expanduser()
+    except Exception:  # a TypeError; or nobody has this home, or the object's own method fails
+        raise ConfigError(f"{what} must be a path, got {shown(value)}") from None

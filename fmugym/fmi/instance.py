@@ -1,0 +1,371 @@
+"""One co-simulation instance of an FMU, whatever its FMI version.
+
+Calls in the step loop go through ctypes with prepared arguments, because FMPy's wrappers build new
+arrays for every call.
+"""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+import logging
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.log import MessageLog
+from fmugym.fmi.status import Phase, Status, sane
+
+__all__ = ["Initialize", "Instance", "SavedState", "Span"]
+
+
+class Span(NamedTuple):
+    """What the FMU gets to know at the start of a simulation; see ``Instance.initialize``."""
+
+    start_time: float
+    stop_time: float | None
+    tolerance: float | None
+
+    @property
+    def times(self) -> tuple[float, bool, float]:
+        """Start time, whether there is a stop time, and the stop time."""
+        return self.start_time, self.stop_time is not None, self.stop_time or 0.0
+
+    @property
+    def tolerances(self) -> tuple[bool, float]:
+        """Whether there is a tolerance, and the tolerance."""
+        return self.tolerance is not None, self.tolerance or 0.0
+
+
+Initialize = Callable[[Span, Callable[[], None]], None]
+"""Takes the span of the simulation and the function that sets the start values."""
+
+
+class Instance(ABC):
+    """One co-simulation instance of an FMU; made by ``Library.instantiate``.
+
+    Attributes:
+        phase: Decides which calls are legal.
+        step: Does one communication step. It takes the current communication point and the step
+            size in seconds, both finite, and returns a ``Status``. It never raises, because a
+            failed step ends only one episode.
+    """
+
+    slave_class: ClassVar[Any]
+    dtypes: ClassVar[dict[str, Any]]
+    """numpy's type for each C type of this FMI version."""
+    enumeration_type: ClassVar = "Integer"
+    """The C type of enumerations in this FMI version."""
+
+    def __init__(self, description: ModelDescription, slave: Any, target: logging.Logger) -> None:
+        self.phase = Phase.DEAD
+        self._description = description
+        self._slave = copy.copy(slave)  # shares the library and its functions
+        self._log = MessageLog(description.model_identifier, target)
+        self._slave.instanceName = self._log.instance_name
+        self._instantiate_checked()
+        self._component = ctypes.c_void_p(self._slave.component)
+        self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
+        self._may_return = False  # to a state of an earlier time, of which FMI tells the FMU
+        self.step = self._prepare_step()
+        self._initialize = self._prepare_initialization()
+        self._reset_function = self._function("Reset")
+
+    def _instantiate_checked(self) -> None:
+        failure = ""
+        try:
+            self._instantiate(self._log)
+        except Exception as error:
+            failure = f" ({error})"
+        if not self._slave.component:
+            said = self._log.said()
+            self._log.close()
+            raise FMULoadError(
+                f"{self._description.model_name} refused to be instantiated{failure}{said}"
+            )
+        self.phase = Phase.INSTANTIATED
+
+    # What differs between the versions.
+
+    @classmethod
+    def mend(cls, slave: Any) -> None:
+        """Correct FMPy's mistakes for this version; most need nothing."""
+        return
+
+    @abstractmethod
+    def _instantiate(self, log: MessageLog) -> None: ...
+
+    @abstractmethod
+    def _function_name(self, name: str) -> str: ...
+
+    @abstractmethod
+    def _prepare_step(self) -> Callable[[float, float], int]: ...
+
+    @abstractmethod
+    def _prepare_initialization(self) -> Initialize: ...
+
+    # What the versions have in common.
+
+    def _function(self, name: str, *argtypes: Any, restype: Any = ctypes.c_int) -> Any:
+        """Look up a function of our own, so that FMPy's prototype stays as it is."""
+        function = self._slave.dll[self._function_name(name)]
+        function.restype = restype
+        if argtypes:
+            function.argtypes = argtypes
+        return function
+
+    def c_type(self, variable: Variable) -> str:
+        """The C type of a variable, by its name in the standard."""
+        return self.enumeration_type if variable.kind == "enumeration" else variable.type
+
+    def prepare_access(
+        self, c_type: str, references: npt.NDArray[np.uint32], buffer: npt.NDArray[Any]
+    ) -> tuple[Any, Any, tuple[Any, ...]]:
+        """Prepare getting and setting of variables of one C type.
+
+        Returns:
+            The getter, the setter, and the arguments for both.
+        """
+        arguments = (
+            self._component,
+            references.ctypes.data_as(ctypes.c_void_p),
+            ctypes.c_size_t(len(references)),
+            buffer.ctypes.data_as(ctypes.c_void_p),
+            *self._trailing_arguments(len(references)),
+        )
+        return self._function(f"Get{c_type}"), self._function(f"Set{c_type}"), arguments
+
+    def _trailing_arguments(self, count: int) -> tuple[Any, ...]:
+        return ()
+
+    @contextmanager
+    def muted(self) -> Iterator[None]:
+        """Drop the FMU's messages inside this context."""
+        self._log.muted = True
+        try:
+            yield
+        finally:
+            self._log.muted = False
+
+    def set_string(self, variable: Variable, value: str) -> None:
+        """Set a String variable before initialization."""
+        reference = ctypes.c_uint32(variable.value_reference)
+        text = ctypes.c_char_p(value.encode())
+        count = ctypes.c_size_t(1)
+        status = self._function("SetString")(
+            self._component,
+            ctypes.byref(reference),
+            count,
+            ctypes.byref(text),
+            *self._trailing_arguments(1),
+        )
+        self.check(f"setting {variable.name!r}", status)
+
+    def initialize(
+        self,
+        start_time: float,
+        stop_time: float | None,
+        tolerance: float | None,
+        set_start_values: Callable[[], None],
+    ) -> None:
+        """Take a just instantiated or reset instance to its first communication point.
+
+        Args:
+            start_time: In seconds.
+            stop_time: In seconds, or None to leave it undefined.
+            tolerance: For the FMU's solver, or None to leave it to the FMU.
+            set_start_values: Sets the start values; called when FMI allows it.
+
+        Raises:
+            SimulationError: If the FMU fails.
+        """
+        self._require(Phase.INSTANTIATED, "initialize")
+        try:
+            self._initialize(Span(start_time, stop_time, tolerance), set_start_values)
+        except BaseException:  # half-way: only a reset is legal now
+            if self.phase is Phase.INSTANTIATED:
+                self.phase = Phase.FAILED
+            raise
+        self.phase = Phase.STEPPING
+
+    def reset(self) -> None:
+        """Return to the state just after instantiation, start values included.
+
+        Raises:
+            SimulationError: If the FMU fails, or had a fatal error before.
+        """
+        if self.phase is Phase.DEAD:
+            raise SimulationError(
+                f"{self._log.instance_name}: no reset is legal after a fatal error"
+            )
+        self.check("reset", self._reset_function(self._component))
+        self.phase = Phase.INSTANTIATED
+
+    def free(self) -> None:
+        """Terminate and free the instance; more than one call is fine."""
+        if not self._slave.component:
+            return
+        for state in self._saved_states:
+            state.release()
+        if self.can_read:
+            self.judge(self._function("Terminate")(self._component))
+        fatal, self.phase = self.phase is Phase.DEAD, Phase.DEAD
+        if not fatal:  # after Fatal the standard forbids even this: the memory stays lost
+            self._function("FreeInstance", restype=None)(self._component)
+        self._slave.component = None
+        self._log.close()
+
+    def check(self, doing: str, status: int) -> None:
+        """Raise for a status worse than a warning.
+
+        Raises:
+            SimulationError: With the call that failed and the FMU's last messages.
+        """
+        if status > Status.WARNING or status < 0:
+            raise SimulationError(self.describe_failure(doing, self.judge(status)))
+
+    def describe_failure(self, doing: str, status: int) -> str:
+        """Say which call failed, with the FMU's last messages."""
+        label = Status(status).name.capitalize()
+        return f"{self._log.instance_name}: {doing} returned {label}{self._log.said()}"
+
+    def judge(self, status: int) -> int:
+        """Note which calls are legal after a status; returns it as a ``Status``."""
+        status = sane(status)
+        if status == Status.FATAL:
+            self.phase = Phase.DEAD
+        elif status == Status.ERROR:
+            self.phase = Phase.FAILED
+        return status
+
+    def judge_step(self, status: int) -> int:
+        """As ``judge``, and forbid more steps after a step that was not done."""
+        if status != Status.TERMINATED:
+            status = self.judge(status)
+        if status > Status.WARNING:
+            self.forbid_steps()
+        return status
+
+    def forbid_steps(self) -> None:
+        """Forbid steps until a reset."""
+        if self.phase is Phase.STEPPING:
+            self.phase = Phase.ENDED
+
+    @property
+    def can_read(self) -> bool:
+        """Whether variables may be read now."""
+        return self.phase in (Phase.STEPPING, Phase.ENDED)
+
+    def _require(self, phase: Phase, doing: str) -> None:
+        if self.phase is not phase:
+            raise SimulationError(
+                f"{self._log.instance_name}: cannot {doing} while {self.phase.name.lower()}"
+            )
+
+    # Directional derivatives, where the FMU offers them (FMI 2.0 and 3.0).
+
+    def jacobian(
+        self, unknowns: Sequence[Variable], knowns: Sequence[Variable]
+    ) -> npt.NDArray[np.float64]:
+        """Differentiate variables by others at the current communication point.
+
+        Args:
+            unknowns: The variables to differentiate: outputs or derivatives, scalar reals.
+            knowns: The variables to differentiate by: continuous inputs or states, scalar reals.
+
+        Returns:
+            The partial derivatives, shape (len(unknowns), len(knowns)), in the variables' units.
+
+        Raises:
+            SimulationError: If the FMU provides no directional derivatives, or fails.
+        """
+        if not self._description.capabilities.provides_directional_derivatives:
+            raise SimulationError(
+                f"{self._description.model_name} provides no directional derivatives"
+            )
+        self._require(Phase.STEPPING, "differentiate")
+        result = np.zeros((len(unknowns), len(knowns)))
+        for column, known in zip(result.T, knowns, strict=True):
+            column[:] = self._partial_derivatives(unknowns, known)
+        return result
+
+    def _partial_derivatives(
+        self, unknowns: Sequence[Variable], known: Variable
+    ) -> npt.NDArray[np.float64]:
+        count, reference, seed = len(unknowns), known.value_reference, ctypes.c_double(1.0)
+        sensitivity = np.zeros(count)
+        status = self._function("GetDirectionalDerivative")(
+            self._component,
+            (ctypes.c_uint32 * count)(*(v.value_reference for v in unknowns)),
+            ctypes.c_size_t(count),
+            ctypes.byref(ctypes.c_uint32(reference)),
+            ctypes.c_size_t(1),
+            ctypes.byref(seed),
+            *self._trailing_arguments(1),
+            sensitivity.ctypes.data_as(ctypes.c_void_p),
+            *self._trailing_arguments(count),
+        )
+        self.check(f"the derivative by {known.name!r}", status)
+        return sensitivity
+
+    # FMU state, where the FMU offers it (FMI 2.0 and 3.0).
+
+    def save_state(self) -> SavedState:
+        """Copy the FMU state.
+
+        Raises:
+            SimulationError: If the FMU cannot save its state, or fails.
+        """
+        if not self._description.capabilities.can_get_and_set_fmu_state:
+            raise SimulationError(f"{self._description.model_name} cannot get and set its state")
+        self._require(Phase.STEPPING, "save the FMU state")
+        state = ctypes.c_void_p()
+        get_state = self._function(self._state_function("Get"))
+        self.check("saving the FMU state", get_state(self._component, ctypes.byref(state)))
+        if not self._may_return:
+            self._may_return = True
+            self.step = self._prepare_step()
+        saved = SavedState(self, state)
+        self._saved_states.add(saved)
+        return saved
+
+    def restore_state(self, state: SavedState) -> None:
+        """Return to a state saved by this instance.
+
+        Raises:
+            SimulationError: If the FMU fails, or had a fatal error before.
+        """
+        if self.phase is Phase.DEAD:
+            raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
+        self._log.recent.clear()
+        set_state = self._function(self._state_function("Set"))
+        self.check("restoring the FMU state", set_state(self._component, state.pointer))
+        self.phase = Phase.STEPPING
+
+    def free_state(self, pointer: ctypes.c_void_p) -> None:
+        """Free a state; only ``SavedState`` calls this."""
+        if self.phase is not Phase.DEAD:
+            free_state = self._function(self._state_function("Free"))
+            self.judge(free_state(self._component, ctypes.byref(pointer)))
+
+    def _state_function(self, verb: str) -> str:
+        return f"{verb}FMUState"
+
+
+class SavedState:
+    """The owner of an FMU state, which frees it once, while its instance lives.
+
+    Attributes:
+        pointer: The FMU's own handle.
+    """
+
+    def __init__(self, instance: Instance, pointer: ctypes.c_void_p) -> None:
+        self.pointer = pointer
+        self.release = weakref.finalize(self, instance.free_state, pointer)

@@ -1,0 +1,108 @@
+"""Messages of FMUs, on their way to Python's ``logging``.
+
+In FMI 1.0 and 2.0 the FMU gets a C function with a variable number of arguments, which ctypes
+cannot make. FMPy has a native proxy that formats the text. The proxy knows one target per process,
+and a call after that target is gone ends the process. So this module has one set of callbacks that
+lives as long as the process. They find the receiver by the unique name of the instance, in FMI 3.0
+by its environment pointer.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import logging
+from collections import deque
+from typing import Any
+
+import fmpy
+from fmpy.fmi1 import fmi1CallbackFunctions
+from fmpy.fmi2 import fmi2CallbackFunctions
+from fmpy.fmi3 import fmi3LogMessageCallback
+from fmpy.logging import addLoggerProxy
+
+from fmugym.errors import printable
+
+__all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message"]
+
+logger = logging.getLogger(__name__)
+
+_LEVELS = (logging.INFO, logging.WARNING, logging.WARNING, logging.ERROR, logging.CRITICAL)
+_receivers: dict[int, MessageLog] = {}
+_ids = itertools.count(1)
+
+
+class MessageLog:
+    """The receiver of one instance's messages.
+
+    Args:
+        model: The model's name, the first part of the instance name.
+        target: The logger for the messages.
+
+    Attributes:
+        environment: A number that is unique in the process.
+        instance_name: A name that is unique in the process.
+        recent: The last messages, for errors.
+        muted: Whether messages are dropped.
+    """
+
+    muted = False
+
+    def __init__(self, model: str, target: logging.Logger) -> None:
+        self.environment = next(_ids)
+        self.instance_name = f"{model}_{self.environment}"
+        self.recent: deque[str] = deque(maxlen=10)
+        self._target = target
+        _receivers[self.environment] = self
+
+    @property
+    def wants_debug(self) -> bool:
+        """Whether the FMU is asked to log more than errors."""
+        return self._target.isEnabledFor(logging.INFO)
+
+    def receive(self, status: int, category: str, message: str) -> None:
+        """Pass a message on, at the level of its status."""
+        if self.muted:
+            return
+        self.recent.append(message)
+        level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
+        self._target.log(level, "%s: [%s] %s", self.instance_name, category, message)
+
+    def said(self) -> str:
+        """The recent messages as the end of an error's text."""
+        return f"; the FMU said: {' | '.join(self.recent)}" if self.recent else ""
+
+    def close(self) -> None:
+        """Stop receiving; later messages go to this module's logger."""
+        _receivers.pop(self.environment, None)
+
+
+def _deliver(environment: int | None, status: int, category: bytes, message: bytes) -> None:
+    category_text = printable((category or b"").decode(errors="replace"))
+    text = printable((message or b"").decode(errors="replace").rstrip())
+    receiver = _receivers.get(environment or 0)
+    if receiver is not None:
+        receiver.receive(status, category_text, text)
+    else:
+        logger.info("[%s] %s", category_text, text)
+
+
+def _by_name(_: Any, name: bytes, status: int, category: bytes, message: bytes) -> None:
+    suffix = (name or b"").decode(errors="replace").rpartition("_")[2]
+    _deliver(int(suffix) if suffix.isdecimal() else None, status, category, message)
+
+
+def _make_callbacks(structure: Any) -> Any:
+    """Fill a callback structure. The members used here are the same in FMI 1.0 and 2.0."""
+    types = dict(structure._fields_)
+    callbacks = structure()
+    callbacks.logger = types["logger"](_by_name)
+    callbacks.allocateMemory = ctypes.cast(fmpy.calloc, types["allocateMemory"])
+    callbacks.freeMemory = ctypes.cast(fmpy.free, types["freeMemory"])
+    addLoggerProxy(ctypes.byref(callbacks))
+    return callbacks
+
+
+fmi1_callbacks = _make_callbacks(fmi1CallbackFunctions)
+fmi2_callbacks = _make_callbacks(fmi2CallbackFunctions)
+fmi3_log_message = fmi3LogMessageCallback(_deliver)

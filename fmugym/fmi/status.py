@@ -1,0 +1,39 @@
+"""What FMI calls return, and the states of FMI's state machine."""
+
+from __future__ import annotations
+
+import enum
+
+__all__ = ["Phase", "Status", "sane"]
+
+
+class Status(enum.IntEnum):
+    """What a call returned: FMI's codes, and two more."""
+
+    OK = 0
+    WARNING = 1
+    DISCARD = 2
+    ERROR = 3
+    FATAL = 4
+    TERMINATED = 6
+    """The FMU asked to stop; its outputs are valid."""
+    NOT_FINITE = 7
+    """An output is NaN or infinite."""
+
+
+class Phase(enum.Enum):
+    """The states of FMI's state machine that decide which calls are legal."""
+
+    INSTANTIATED = enum.auto()
+    STEPPING = enum.auto()
+    ENDED = enum.auto()
+    """After a step that was not done: only reading and a reset are legal."""
+    FAILED = enum.auto()
+    """After Error: only a reset is legal."""
+    DEAD = enum.auto()
+    """After Fatal or free: no call is legal."""
+
+
+def sane(status: int) -> int:
+    """Turn codes that no call here may return into an error, Pending included."""
+    return status if 0 <= status <= Status.FATAL else Status.ERROR

@@ -1,0 +1,344 @@
+"""The service behind the clients: it admits users, starts and stops sessions, and shows cells.
+
+The service has no thread of its own. Each request brings the cells that it needs to the present,
+and ends what should have ended since the last request.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.errors import unknown_name
+from fmugym.lab import controls
+from fmugym.lab.admission import check_lease, check_request
+from fmugym.lab.bookings import Bookings, new_token
+from fmugym.lab.cell import Cell
+from fmugym.lab.controls import Quantity
+from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
+from fmugym.lab.errors import LabError, as_lab_error
+from fmugym.lab.network import Network
+from fmugym.lab.pictures import CellPicture, LiveView
+from fmugym.lab.presets import Options
+from fmugym.lab.recording import Recording
+from fmugym.lab.requests import Request, cell_types_of, text_of
+from fmugym.lab.sessions import Gym, Session
+from fmugym.lab.timekeeper import Timekeeper
+from fmugym.lab.users import Account, Accounts
+from fmugym.lab.videos import VideoFolder
+from fmugym.pool.backend.clock import Clock
+
+__all__ = ["Service"]
+
+logger = logging.getLogger(__name__)
+
+_POLL: Final = 0.02  # s between two attempts to get a cell
+_RENDER_MODES: Final = ("rgb_array", "human")
+
+
+class Service:
+    """Answers the requests of clients.
+
+    Args:
+        options: What is simulated.
+        clock: The lab's time.
+        cells: The lab's cells.
+        users: The users by their tokens, or None; see `Accounts`.
+        rng: The random generator of the network's delays.
+        video_folder: The folder of videos, or None; see `VideoFolder`.
+
+    Attributes:
+        options: What is simulated.
+        clock: The lab's time.
+
+    Raises:
+        ConfigError: If the clock, the users or the folder cannot be used.
+    """
+
+    def __init__(
+        self,
+        options: Options,
+        clock: Clock,
+        cells: Sequence[Cell],
+        users: Any,
+        rng: np.random.Generator,
+        video_folder: str | Path | None,
+    ) -> None:
+        self.options, self.clock = options, clock
+        self._time = Timekeeper(clock)
+        self._network = Network(options, self._time, rng)
+        self._bookings = Bookings(cells)
+        self._accounts = Accounts(users, options, self._time.opened)
+        self._videos = VideoFolder(video_folder)
+        self._lock = threading.RLock()
+        self._is_closed = False
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._is_closed
+
+    def close(self) -> None:
+        """End all sessions, free the cells and remove temporary videos; twice is fine."""
+        with self._lock:
+            self._is_closed = True
+            self._bookings.end_all("the lab was closed")
+            self._bookings.settle(0.0)  # the time does not matter: everything has ended
+            for cell in self._bookings.cells:
+                cell.close()
+            self._videos.close()
+
+    # Users.
+
+    def user_info(self, user_token: str) -> UserInfo:
+        """See ``Client.get_user_info``."""
+        self._network.wait_for_getter()
+        with self._lock:
+            return self._account(user_token).info(self._now())
+
+    def cell_infos(self, user_token: str) -> list[CellInfo]:
+        """See ``Client.get_cells``."""
+        self._network.wait_for_getter()
+        with self._lock:
+            self._account(user_token)
+            return [CellInfo(cell.cell_id, cell.cell_type) for cell in self._bookings.cells]
+
+    # Starts.
+
+    def start_gym(self, user_token: str, length: float, wanted: Sequence[CellType]) -> str:
+        """See ``Client.start_gym``."""
+        self._network.wait_for_setter()
+        kinds = cell_types_of(wanted)
+        with self._lock:
+            account = self._account(user_token)
+            seconds = check_lease(self._bookings, account.user, length, kinds)
+            account.take_gym(self._now())
+        while (gym := self._lease(account, seconds, kinds)) is None:
+            self._time.wait(_POLL)
+        logger.info("livestream: %s", self.livestream_url(gym.token))
+        return gym.token
+
+    def start_experiment(self, user_token: str, request: Request) -> str:
+        """See ``Client.start_experiment``; returns the session token."""
+        self._network.wait_for_setter()
+        with self._lock:
+            account = self._account(user_token)
+            self._admit(account, request, None)
+            account.take_experiment(self._now())
+        return self._start_session(request, None)
+
+    def start_episode(self, gym_token: str, request: Request) -> str:
+        """See ``Client.start_episode``; returns the episode token."""
+        self._network.wait_for_setter()
+        with self._lock:
+            gym = self._open_gym(gym_token)
+            self._admit(gym.account, request, gym)
+            gym.account.take_start(self._now())
+        return self._start_session(request, gym)
+
+    # Stops.
+
+    def stop_session(self, token: str, kind: Literal["experiment", "episode"]) -> str:
+        """See ``Client.stop_experiment`` and ``Client.stop_episode``."""
+        self._network.wait_for_setter()
+        with self._lock:
+            session = self._bookings.find(text_of(kind, token), Session, kind)
+            session.bring_to(self._now())
+            session.stop()
+            self._bookings.settle(self._now())
+            recording, session.recording = session.recording, None
+        if recording is None:
+            return ""
+        name = f"cell{session.cell.cell_id}-{session.token[-8:]}"
+        return self._videos.write(recording, self._picture(session.cell), name)
+
+    def stop_gym(self, gym_token: str) -> None:
+        """See ``Client.stop_gym``."""
+        self._network.wait_for_setter()
+        with self._lock:
+            now = self._now()
+            gym = self._bookings.find(text_of("gym", gym_token), Gym, "gym")
+            self._bookings.settle(now)
+            gym.stop()
+            self._bookings.end_all("its gym was stopped", gym)
+            self._bookings.settle(now)
+
+    # Requests to a session. Each one is a heartbeat.
+
+    def read(self, token: str, quantity: Quantity) -> float | list[float]:
+        """Return the newest reading of a cell: a float for one actuator, a list for two."""
+        self._network.wait_for_getter()
+        with self._lock:
+            return controls.read(self._session(token), quantity)
+
+    def command(self, token: str, quantity: Quantity, value: Any) -> None:
+        """Set a target of the drive, or its torque; None entries leave a joint unchanged."""
+        self._network.wait_for_setter()
+        with self._lock:
+            controls.command(self._session(token), self.options, quantity, value)
+
+    def set_gains(self, token: str, kp: Any, kd: Any) -> None:
+        """Set the drive's stiffness in N m/rad and damping in N m s/rad."""
+        self._network.wait_for_setter()
+        with self._lock:
+            controls.set_gains(self._session(token), kp, kd)
+
+    def actuator_info(self, token: str) -> list[ActuatorInfo]:
+        """See ``Client.get_actuator_info``."""
+        self._network.wait_for_getter()
+        with self._lock:
+            return controls.actuators(self._session(token), self.options)
+
+    def logs(self, token: str) -> str:
+        """See ``Client.get_logs``."""
+        self._network.wait_for_getter()
+        with self._lock:
+            return "\n".join(self._session(token).log)
+
+    # Pictures.
+
+    def view(
+        self, gym_token: str, render_mode: Literal["rgb_array", "human"] = "rgb_array"
+    ) -> npt.NDArray[np.uint8] | None:
+        """Show the present state of all cells of a lease side by side.
+
+        It is not a request to a session, so it is not a heartbeat. Use windows from one thread
+        only.
+
+        Args:
+            gym_token: The token of the lease.
+            render_mode: ``"human"`` for a window, ``"rgb_array"`` for an array.
+
+        Returns:
+            An array of shape (height, number of cells * height, 3), or None for a window.
+
+        Raises:
+            ConfigError: If the mode does not exist.
+            LabError: If the lease does not exist or has ended, or there is no display.
+        """
+        if not isinstance(render_mode, str) or str.__str__(render_mode) not in _RENDER_MODES:
+            raise unknown_name("render mode", render_mode, _RENDER_MODES)
+        with self._lock:
+            gym = self._open_gym(gym_token)
+            if gym.view is None:
+                gym.view = LiveView([self._picture(cell) for cell in gym.cells])
+            view = gym.view
+            moments = [(cell.position, cell.torque, cell.time) for cell in gym.cells]
+        picture = view.draw(moments)
+        if str.__str__(render_mode) == "rgb_array":
+            return picture
+        with as_lab_error():
+            view.show(picture)
+        return None
+
+    def livestream_url(self, token: str) -> str:
+        """Return an address in place of a livestream's; `view` shows the picture.
+
+        Args:
+            token: The token of a gym, an experiment or an episode.
+
+        Raises:
+            LabError: If the token is unknown.
+        """
+        with self._lock:
+            owner = self._bookings.get(text_of("gym or session", token))
+        if owner is None:
+            raise LabError("unknown token")
+        cells = owner.cells if isinstance(owner, Gym) else [owner.cell]
+        return "fmugym-lab://cells/" + "+".join(str(cell.cell_id) for cell in cells)
+
+    # Lookups; the caller holds the lock.
+
+    def _now(self) -> float:
+        if self._is_closed:
+            raise LabError("the lab is closed")
+        return self._time.time()
+
+    def _account(self, user_token: str) -> Account:
+        now, token = self._now(), text_of("user", user_token)
+        if not token:
+            raise LabError("user token must be a text that is not empty")
+        if self._bookings.get(token) is not None:
+            raise LabError("this token is not a user token")
+        return self._accounts.find(token, now)
+
+    def _session(self, token: str) -> Session:
+        """Find a running session, and bring its cell to the present."""
+        now = self._now()
+        session = self._bookings.find(text_of("session", token), Session, "session")
+        session.request(now)
+        return session
+
+    def _open_gym(self, token: str) -> Gym:
+        """Find a running lease, and bring everything to the present."""
+        now = self._now()
+        gym = self._bookings.find(text_of("gym", token), Gym, "gym")
+        self._bookings.settle(now)
+        if gym.ended is not None:
+            raise LabError(gym.ended)
+        return gym
+
+    def _picture(self, cell: Cell) -> CellPicture:
+        return CellPicture(cell.cell_id, cell.cell_type, self.options.torque_limit)
+
+    # Parts of a start.
+
+    def _admit(self, account: Account, request: Request, gym: Gym | None) -> None:
+        check_request(self._bookings, account.user, self.options, request, gym)
+        if request.record:
+            self._videos.prepare()
+
+    def _lease(self, account: Account, length: float, wanted: Sequence[CellType]) -> Gym | None:
+        with self._lock:
+            now = self._now()
+            self._bookings.settle(now)
+            gym = Gym(new_token(), account, [], now + length)
+            return gym if self._bookings.lease(gym, wanted) else None
+
+    def _start_session(self, request: Request, gym: Gym | None) -> str:
+        while (cell := self._take_cell(request, gym)) is None:
+            self._time.wait(_POLL)
+        recording = Recording() if request.record else None
+        try:
+            with as_lab_error():
+                cell.start(request.experiment_type, request.angles, request.acting, recording)
+            self._time.sleep(self.options.homing_time + request.preparation_time)
+            return self._begin(request, cell, gym, recording)
+        except BaseException:
+            with self._lock:
+                self._bookings.give_back(cell)
+            raise
+
+    def _take_cell(self, request: Request, gym: Gym | None) -> Cell | None:
+        with self._lock:
+            self._bookings.settle(self._now())
+            if gym is not None and gym.ended is not None:
+                raise LabError(gym.ended)
+            return self._bookings.take(request, gym)
+
+    def _begin(
+        self, request: Request, cell: Cell, gym: Gym | None, recording: Recording | None
+    ) -> str:
+        with self._lock:
+            now = self._now()
+            if gym is not None:
+                self._open_gym(gym.token)
+            session = Session(
+                token=new_token(),
+                cell=cell,
+                experiment=request.experiment_type,
+                began=now,
+                length=request.length,
+                heartbeat=self.options.heartbeat,
+                grace=self.options.session_grace,
+                gym=gym,
+                recording=recording,
+            )
+            self._bookings.begin(session)
+            return session.token

@@ -1,0 +1,1 @@
+"""Rigs in the place of FMU instances, and the clocks that pace them."""

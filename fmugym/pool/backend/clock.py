@@ -1,0 +1,199 @@
+"""The time of what is not simulated step by step: real, faster than real, or moved by hand.
+
+A lab, and whatever is paced, asks its clock what time it is and sleeps on it; nothing else tells it
+the time. With any but the default clock a program takes `clock.time` and `clock.sleep` in the place
+of `time.time` and `time.sleep`, which the clock does not know of.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Final, Protocol
+
+from fmugym.checks import check_number
+
+__all__ = ["Clock", "ManualClock", "RealClock"]
+
+
+_OVERSLEPT: Final = 1e-4
+"""What sleeps of systems take longer than asked for, in s: the time given up, but not slept, at the
+end of a wait."""
+
+
+class Clock(Protocol):
+    """What is asked of a clock; both methods may be called from any thread."""
+
+    def time(self) -> float:
+        """Return the time, in s."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for some time, in s; not at all if that is negative."""
+        ...
+
+
+class RealClock:
+    """A clock that runs like the machine's own, or faster.
+
+    Args:
+        speed: Seconds of the clock's time per second. What the machine is late by grows with it:
+            0.1 ms are 1 ms of the clock's time at ``speed=10``.
+
+    Raises:
+        ConfigError: If the speed is not a positive, finite number.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.speed = check_number("speed", speed, positive=True)
+        self._start = time.perf_counter()
+
+    def time(self) -> float:
+        """Return the time since this clock was made, in s."""
+        return (time.perf_counter() - self._start) * self.speed
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for some of the clock's time, in s; not at all if that is negative."""
+        end = time.perf_counter() + seconds / self.speed
+        while (rest := end - time.perf_counter()) > 0.0:
+            time.sleep(max(0.0, rest - _OVERSLEPT))
+
+
+class ManualClock:
+    """A clock that stands still until it is moved.
+
+    `advance` moves it. So does `sleep`, which never waits longer than needed: time jumps to the
+    first waking as soon as all threads made by `thread` sleep, or at once if there is none.
+    Several threads thus take the same turns as in real time, each at its own exact moment.
+
+    Args:
+        start: The time to begin with, in s.
+
+    Raises:
+        ConfigError: If it is not a finite number.
+    """
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = check_number("start", start)
+        self._changed = threading.Condition()
+        self._crew: set[threading.Thread] = set()
+        self._working_for: dict[threading.Thread, set[threading.Thread]] = {}
+        self._sleepers: dict[threading.Thread, float] = {}
+
+    def time(self) -> float:
+        """Return the time, in s."""
+        return self._now
+
+    def advance(self, seconds: float) -> None:
+        """Move the time on, in s, and wake whoever slept until then.
+
+        Raises:
+            ConfigError: If the time would go backwards, or is not a finite number.
+        """
+        step = check_number("the seconds to advance by", seconds, 0.0)
+        with self._changed:
+            self._now += step
+            self._changed.notify_all()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for some time, in s; see the class for what moves the clock meanwhile.
+
+        Raises:
+            ConfigError: If the time is not a finite number.
+        """
+        if check_number("the seconds to sleep", seconds) <= 0.0:
+            return
+        thread = threading.current_thread()
+        with self._changed:
+            waking = self._sleepers[thread] = self._now + seconds
+            self._jump()
+            try:
+                while self._now < waking:
+                    self._changed.wait()
+            finally:
+                del self._sleepers[thread]
+
+    def thread(
+        self, target: Callable[..., object], args: tuple[Any, ...] = (), name: str | None = None
+    ) -> threading.Thread:
+        """Make a thread that time waits for, from its `start` until it ends.
+
+        Args:
+            target: As for `threading.Thread`; to wait it must sleep on this clock.
+            args: As for `threading.Thread`.
+            name: As for `threading.Thread`.
+
+        Returns:
+            The thread, not started.
+        """
+        return _CrewThread(self, target, args, name)
+
+    @contextmanager
+    def handed_over(self, threads: Sequence[threading.Thread]) -> Iterator[None]:
+        """Let time wait for threads that work for the caller, in the place of the caller's own.
+
+        Args:
+            threads: Each must `leave` when its work is done; with the last of them time waits for
+                the caller again, if it did before.
+        """
+        caller = threading.current_thread()
+        with self._changed:
+            if caller in self._crew:
+                self._crew.discard(caller)
+                self._working_for[caller] = set(threads)
+            self._crew.update(threads)
+            self._jump()
+        try:
+            yield
+        finally:
+            for thread in threads:
+                self.leave(thread)
+
+    def leave(self, thread: threading.Thread) -> None:
+        """Let time wait for a thread no longer."""
+        with self._changed:
+            self._crew.discard(thread)
+            for caller, threads in list(self._working_for.items()):
+                threads.discard(thread)
+                if not threads:
+                    del self._working_for[caller]
+                    self._crew.add(caller)
+            self._jump()
+
+    def _join(self, thread: threading.Thread) -> None:
+        with self._changed:
+            self._crew.add(thread)
+
+    def _jump(self) -> None:
+        """Go to the first waking if nobody is at work; those overdue are at work."""
+        if self._sleepers and self._crew <= self._sleepers.keys():
+            self._now = max(self._now, min(self._sleepers.values()))
+            self._changed.notify_all()
+
+
+class _CrewThread(threading.Thread):
+    def __init__(
+        self,
+        clock: ManualClock,
+        target: Callable[..., object],
+        args: tuple[Any, ...],
+        name: str | None,
+    ) -> None:
+        super().__init__(target=target, args=args, name=name)
+        self._clock = clock
+
+    def start(self) -> None:
+        self._clock._join(self)
+        try:
+            super().start()
+        except BaseException:
+            self._clock.leave(self)
+            raise
+
+    def run(self) -> None:
+        try:
+            super().run()
+        finally:
+            self._clock.leave(self)

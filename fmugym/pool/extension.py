@@ -1,0 +1,32 @@
+"""Whether the C extension is there, and what to do where it is not."""
+
+from __future__ import annotations
+
+import functools
+import logging
+
+__all__ = ["HOW_TO_BUILD", "has_native_pool", "warn_of_slow_path"]
+
+logger = logging.getLogger(__name__)
+
+HOW_TO_BUILD = (
+    "the C extension of fmugym was not built. Install a C compiler (on Debian: apt install gcc; "
+    "on macOS: xcode-select --install; on Windows: the Build Tools for Visual Studio) and install "
+    "fmugym again with: pip install --force-reinstall --no-deps --no-binary :all: fmugym-toolbox"
+)
+
+
+@functools.cache
+def has_native_pool() -> bool:
+    """Whether the C extension was built when this package was installed."""
+    try:
+        import fmugym._native  # noqa: F401  (can it be?)
+    except ImportError:
+        return False
+    return True
+
+
+@functools.cache
+def warn_of_slow_path() -> None:
+    """Say once in a process that FMUs are stepped by Python."""
+    logger.warning("FMUs are stepped by Python, which is slow: %s", HOW_TO_BUILD)

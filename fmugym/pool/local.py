@@ -1,0 +1,66 @@
+"""Pools in the caller's process: native if the extension was built, otherwise in Python."""
+
+from __future__ import annotations
+
+import logging
+
+from fmugym.archive.fmu import LoadableFMU
+from fmugym.errors import FMULoadError
+from fmugym.pool.base import Pool
+from fmugym.pool.extension import has_native_pool
+from fmugym.pool.health import HealthArray
+from fmugym.pool.python import PythonPool
+from fmugym.pool.spec import PoolSpec
+
+__all__ = ["local_pool"]
+
+
+def local_pool(
+    fmu: LoadableFMU,
+    spec: PoolSpec,
+    num_instances: int,
+    log: logging.Logger,
+    *,
+    native: bool | None = None,
+    threads: int | None = None,
+    private_libraries: bool | None = False,
+    first_index: int = 0,
+    counts: HealthArray | None = None,
+) -> Pool:
+    """Make a pool that loads the FMU into this process.
+
+    Args:
+        fmu: The FMU; closed with the pool.
+        spec: What to do at each reset and step.
+        num_instances: N.
+        log: The logger that gets the FMU's messages.
+        native: Whether to take the native pool; by default, if the extension was built.
+        threads: See ``NativePool``; the Python pool has one thread.
+        private_libraries: See ``NativePool``; the Python pool has one library.
+        first_index: See ``NativePool``.
+        counts: See ``NativePool``.
+
+    Raises:
+        FMULoadError: If the FMU cannot be loaded or instantiated, or if the Python pool is asked
+            for private libraries.
+    """
+    if has_native_pool() if native is None else native:
+        from fmugym.pool.native import NativePool
+
+        return NativePool(
+            fmu,
+            spec,
+            num_instances,
+            log,
+            threads=threads,
+            private_libraries=private_libraries,
+            first_index=first_index,
+            counts=counts,
+        )
+    if private_libraries:
+        fmu.close()
+        raise FMULoadError(
+            f"{fmu.path.name} needs a library of its own for each of {num_instances} "
+            "instances, which only the native pool or isolation='process' can provide"
+        )
+    return PythonPool(fmu, spec, num_instances, log, counts=counts)

@@ -1,0 +1,1 @@
+"""Pools whose instances run in supervised worker processes."""

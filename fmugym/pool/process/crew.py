@@ -1,0 +1,211 @@
+"""The workers of one pool: they work at the same time, and lost ones are replaced."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.archive.fmu import FMU
+from fmugym.errors import FMUGymError, FMULoadError, SimulationError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import MaskArray
+from fmugym.pool.health import Column
+from fmugym.pool.process.shared_memory import Arrays, Memory
+from fmugym.pool.process.supervisor import LostError, Supervisor
+from fmugym.pool.process.worker import Setup
+
+__all__ = ["Crew"]
+
+_CLOSING_TIME: Final = 5.0
+"""How long workers may take to free their instances, in seconds."""
+
+_crews: weakref.WeakSet[Crew] = weakref.WeakSet()
+
+
+class Crew:
+    """The supervisors of a pool's workers, and what became of their instances.
+
+    Args:
+        fmu: The FMU; closed with the crew.
+        setups: What each worker needs to know.
+        memory: Shared with the workers; closed with the crew.
+        arrays: Those of all instances, in this memory.
+        log: Gets the FMU's messages.
+        call_timeout: How long a call may take, in seconds; infinite for ever.
+
+    Attributes:
+        supervisors: One for each worker, in the order of the instances.
+        lost: Which instances have no process, or were not reset since it started, shape (N,).
+        any_lost: Whether there are any.
+        able: The supervisors of blocks that are not wholly lost.
+        refusal: Why nothing can be done any more; empty before.
+
+    Raises:
+        FMULoadError: If the FMU cannot be loaded or instantiated.
+    """
+
+    def __init__(
+        self,
+        fmu: FMU,
+        setups: Sequence[Setup],
+        memory: Memory,
+        arrays: Arrays,
+        log: logging.Logger,
+        call_timeout: float,
+    ) -> None:
+        self.supervisors = [Supervisor(setup, memory, log) for setup in setups]
+        self.lost: MaskArray = np.zeros(len(arrays.statuses), np.bool_)
+        self.refusal = ""
+        self._arrays, self._call_timeout = arrays, call_timeout
+        self.note_lost()
+        patience = min(_CLOSING_TIME, call_timeout)
+        self._close = weakref.finalize(self, _close, self.supervisors, memory, fmu, patience)
+        _crews.add(self)
+        self._open()
+
+    def _open(self) -> None:
+        """Let all workers make their instances at the same time."""
+        try:
+            for supervisor in self.supervisors:
+                supervisor.start()
+            for supervisor in self.supervisors:
+                supervisor.finish_opening(self._deadline())
+        except LostError as lost:
+            self.close()
+            raise FMULoadError(str(lost)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _deadline(self) -> float:
+        return time.monotonic() + self._call_timeout
+
+    def run(
+        self,
+        doing: str,
+        supervisors: Sequence[Supervisor],
+        tell: Callable[[Supervisor], None],
+    ) -> dict[Supervisor, Any]:
+        """Let workers do something at the same time.
+
+        Args:
+            doing: What they do, for the cause of deaths.
+            supervisors: The supervisors of these workers.
+            tell: Sends the request to a worker.
+
+        Returns:
+            The replies of the workers that live. The instances of the others are lost.
+
+        Raises:
+            SimulationError: If a worker reports an error, or the pool is closed.
+        """
+        if self.refusal:
+            raise SimulationError(self.refusal)
+        deadline = self._deadline()
+        replies: dict[Supervisor, Any] = {}
+        try:
+            for supervisor in supervisors:
+                tell(supervisor)
+            for supervisor in supervisors:
+                try:
+                    replies[supervisor] = supervisor.reply(deadline, doing)
+                except LostError:
+                    self._lose(supervisor)
+        except BaseException:  # such as KeyboardInterrupt: the next call would get these replies
+            self._stop_busy(supervisors)
+            raise
+        _raise_any(replies.values())
+        return replies
+
+    def _lose(self, supervisor: Supervisor) -> None:
+        """Note the loss of a block, and start its next worker before it is needed."""
+        block, arrays = supervisor.block, self._arrays
+        arrays.counts[block, Column.DEATHS] += 1
+        self.lost[block] = True
+        observed = arrays.observations.shape[1]
+        np.copyto(arrays.observations[block], arrays.outputs[:observed, block].T)
+        self.note_lost()
+        supervisor.start_ahead()
+
+    def _stop_busy(self, supervisors: Iterable[Supervisor]) -> None:
+        for supervisor in supervisors:
+            if supervisor.is_busy:
+                supervisor.bury("the call was interrupted")
+                self.lost[supervisor.block] = True
+        self.note_lost()
+
+    def note_lost(self) -> None:
+        """Update what depends on ``lost``."""
+        self.any_lost = bool(self.lost.any())
+        self.able = [s for s in self.supervisors if not self.lost[s.block].all()]
+        self._arrays.statuses[self.lost] = Status.FATAL
+
+    def revive(self, supervisors: Iterable[Supervisor]) -> list[Supervisor]:
+        """Start missing workers; returns the supervisors that have a worker now."""
+        return [supervisor for supervisor in supervisors if _is_revived(supervisor)]
+
+    def retire(self, supervisor: Supervisor, reason: str) -> None:
+        """End a worker that has not failed; its instances are lost until their reset."""
+        block = supervisor.block
+        supervisor.retire(reason, self._deadline())
+        self.lost[block] = True
+        self._arrays.counts[block, [[Column.REPLACEMENTS], [Column.RECYCLINGS]]] += 1
+
+    def of(self, index: int) -> Supervisor:
+        """The supervisor of an instance."""
+        return next(s for s in self.supervisors if index < s.block.stop)
+
+    def of_any(self, mask: MaskArray) -> list[Supervisor]:
+        """The supervisors of the instances in a mask of shape (N,)."""
+        return [s for s in self.supervisors if mask[s.block].any()]
+
+    def close(self) -> None:
+        """End the workers; calling it again is fine."""
+        self.refusal = self.refusal or "the pool is closed"
+        self._close()
+
+    def forget(self) -> None:
+        """Let go of the workers, because this process is a fork of the one that started them."""
+        self.refusal = "the pool belongs to the process that this one was forked from"
+        self._close.detach()
+        for supervisor in self.supervisors:
+            supervisor.forget()
+
+
+def _is_revived(supervisor: Supervisor) -> bool:
+    try:
+        supervisor.revive()
+    except LostError:
+        return False
+    return True
+
+
+def _raise_any(replies: Iterable[Any]) -> None:
+    for reply in replies:
+        if isinstance(reply, FMUGymError):
+            raise SimulationError(str(reply))
+
+
+def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, patience: float) -> None:
+    deadline = time.monotonic() + patience
+    for supervisor in supervisors:
+        supervisor.begin_closing()
+    for supervisor in supervisors:
+        supervisor.close(deadline)
+    memory.close()
+    fmu.close()
+
+
+def _forget_crews() -> None:
+    for crew in list(_crews):
+        crew.forget()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_crews)

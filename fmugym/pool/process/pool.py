@@ -1,0 +1,340 @@
+"""The pool of processes: an FMU may harm its own process, but not the caller's.
+
+Each worker process has a block of the instances in a pool of its own (``NativePool`` or
+``PythonPool``) and shares its inputs and outputs through memory. A worker that dies or hangs is
+replaced. Its instances have the status ``FATAL``, with the cause, until the next reset makes them
+anew. The instances of other workers go on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import weakref
+from collections.abc import Sequence
+from dataclasses import replace
+from threading import RLock
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_count, check_number
+from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import (
+    DEFAULT_CALL_TIMEOUT,
+    FloatArray,
+    MaskArray,
+    PoolSpec,
+    StatusArray,
+    available_processors,
+)
+from fmugym.pool.health import CountedPool, HealthArray
+from fmugym.pool.process.channel import Code
+from fmugym.pool.process.crew import Crew
+from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
+from fmugym.pool.process.supervisor import Supervisor
+from fmugym.pool.process.worker import Setup
+from fmugym.pool.spec import ResetMethod
+
+__all__ = ["ProcessPool"]
+
+
+class ProcessPool(CountedPool):
+    """N instances in blocks of supervised processes; see ``Pool`` for the contract.
+
+    Args:
+        fmu: The FMU; closed with the pool.
+        spec: What to do at each reset and step.
+        num_instances: N.
+        log: The logger that gets the FMU's messages.
+        native: Whether the workers have native pools, or Python ones.
+        workers: How many processes; by default one for each processor that this process may use,
+            and at most N.
+        threads: The most threads in each of them; by default, together one for each processor.
+        call_timeout: How long a call may take, in seconds of real time; None for ever. A worker
+            that takes longer is ended, unless a debugger holds it.
+
+    Attributes:
+        workers: How many processes there are.
+
+    Raises:
+        ConfigError: If ``workers``, ``threads`` or ``call_timeout`` is no positive number.
+        FMULoadError: If the FMU cannot be loaded or instantiated, or the system has no process,
+            memory or temporary folder left.
+    """
+
+    def __init__(
+        self,
+        fmu: FMU,
+        spec: PoolSpec,
+        num_instances: int,
+        log: logging.Logger,
+        *,
+        native: bool = True,
+        workers: int | None = None,
+        threads: int | None = None,
+        call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
+    ) -> None:
+        self.num_instances = num_instances
+        self._spec = spec
+        self._lock = RLock()
+        self._numbers: dict[tuple[Variable, ...], int] = {}
+        try:
+            _check_options(workers, threads, call_timeout)
+            self.workers = min(num_instances, workers or available_processors())
+            setup = Setup.of(fmu, spec, num_instances, log)
+            memory = _make_memory(size_for(spec, num_instances, self.workers))
+        except BaseException:
+            fmu.close()
+            raise
+        arrays = make_arrays(memory, spec, num_instances)
+        self.inputs, self.outputs = arrays.inputs, arrays.outputs
+        self.observations, self.statuses = arrays.observations, arrays.statuses
+        self._mask, self._counts = arrays.mask, arrays.counts
+        threads = threads or max(1, available_processors() // self.workers)
+        setups = _share_out(replace(setup, native=native, threads=threads), self.workers)
+        timeout = math.inf if call_timeout is None else float(call_timeout)
+        self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
+
+    # The contract of Pool.
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``; if a worker dies in it, a new worker tries again."""
+        values = np.asarray(values, np.float64)
+        mask = self._as_mask(mask)
+        with self._lock:
+            concerned = self._crew.of_any(mask)
+            if self._spec.reset_method == ResetMethod.PROCESS:
+                self._retire_used(concerned)
+            self._retire_grown(concerned, mask)
+            for _ in range(2):
+                concerned = self._reset(concerned, variables, values, mask)
+            self._crew.note_lost()
+        return self.outputs, self.statuses
+
+    def _as_mask(self, mask: MaskArray | None) -> MaskArray:
+        if mask is None:
+            return np.ones(self.num_instances, np.bool_)
+        return np.asarray(mask, np.bool_)
+
+    def _reset(
+        self,
+        supervisors: Sequence[Supervisor],
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        mask: MaskArray,
+    ) -> list[Supervisor]:
+        """Reset blocks; returns those that lost a used worker, since a new one may succeed."""
+        number = self._numbers.setdefault(variables, len(self._numbers))
+        used = [s for s in supervisors if not s.is_new]
+        alive = self._crew.revive(supervisors)
+
+        def tell(supervisor: Supervisor) -> None:
+            block = supervisor.block
+            told = None if number in supervisor.known else variables
+            supervisor.known.add(number)
+            supervisor.tell("reset", number, told, values[:, block], mask[block])
+
+        for supervisor, growth in self._crew.run("a reset", alive, tell).items():
+            supervisor.note_success()
+            supervisor.growth = growth
+            block = supervisor.block
+            self._crew.lost[block] &= ~mask[block]
+        return [s for s in used if s.is_new]
+
+    def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
+        """End the workers that have played an episode, so that each episode has a new process."""
+        for supervisor in supervisors:
+            if not supervisor.is_new:
+                self._crew.retire(supervisor, "each episode has a new process")
+
+    def _retire_grown(self, supervisors: Sequence[Supervisor], mask: MaskArray) -> None:
+        """Replace workers that leak, though their instances were recycled.
+
+        The best moment is when all instances of a worker start anew. At any other moment the others
+        lose their episodes, so the worker may first leak twice as much.
+        """
+        limit = math.inf if self._spec.leak_limit is None else 2 * self._spec.leak_limit
+        for supervisor in supervisors:
+            if supervisor.growth > (limit if mask[supervisor.block].all() else 2 * limit):
+                grown = f"by {supervisor.growth / 2**20:.0f} MB"
+                reason = f"worker process {supervisor.pid} was replaced: it had grown {grown}"
+                self._crew.retire(supervisor, reason)
+
+    def step(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.step``."""
+        self.step_into(inputs, skip, observations)
+        return self.outputs, self.statuses
+
+    def step_into(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> int:
+        """Do one step as ``step`` does.
+
+        Returns:
+            How many of the instances have a status worse than a warning.
+        """
+        with self._lock:
+            if inputs is not None:
+                np.copyto(self.inputs, inputs)
+            troubled = self._step(skip)
+            if observations is not None:
+                np.copyto(observations, self.observations)
+            return troubled
+
+    def step_own(self) -> int:
+        """See ``Pool.step_own``."""
+        with self._lock:
+            return self._step(None)
+
+    def _step(self, skip: MaskArray | None) -> int:
+        code = Code.STEP
+        if skip is not None or self._crew.any_lost:
+            code = Code.STEP_SOME
+            np.logical_or(self._crew.lost, False if skip is None else skip, out=self._mask)
+        replies = self._crew.run(
+            "a step", self._crew.able, lambda supervisor: supervisor.step(code)
+        )
+        if not self._crew.any_lost and Code.TROUBLE not in replies.values():
+            return 0
+        self._crew.note_lost()
+        return int(np.count_nonzero(self.statuses > Status.WARNING))
+
+    def save(self) -> _Snapshot:
+        """See ``Pool.save``."""
+        with self._lock:
+            self._require_present()
+            numbers = self._crew.run(
+                "saving a state", self._crew.supervisors, lambda s: s.tell("save")
+            )
+            self._require_present()
+            return _Snapshot({s: (s.generation, number) for s, number in numbers.items()})
+
+    def restore(
+        self, snapshot: _Snapshot, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.restore``; a state is lost with the process that saved it."""
+        mask = self._as_mask(mask)
+        parts = snapshot.parts if isinstance(snapshot, _Snapshot) else {}
+        if parts.keys() != set(self._crew.supervisors):
+            raise SimulationError("the snapshot was taken from another pool")
+        with self._lock:
+            self._require_present(mask)
+            concerned = self._crew.of_any(mask)
+            for supervisor in concerned:
+                _require_generation(supervisor, parts[supervisor][0])
+            self._crew.run(
+                "restoring a state",
+                concerned,
+                lambda s: s.tell("restore", parts[s][1], mask[s.block]),
+            )
+            self._crew.note_lost()
+        return self.outputs, self.statuses
+
+    def failure(self, index: int) -> str:
+        """See ``Pool.failure``."""
+        with self._lock:
+            supervisor = self._crew.of(index)
+            if not self._crew.lost[index]:
+                within = index - supervisor.block.start
+                texts = self._crew.run(
+                    "a question", [supervisor], lambda s: s.tell("failure", within)
+                )
+                for text in texts.values():
+                    return str(text)
+            return supervisor.reason
+
+    def _count_steps(self) -> None:
+        """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
+        with self._lock:
+            if not self._crew.refusal:
+                self._crew.run("a question", self._crew.able, lambda s: s.tell("count_steps"))
+
+    def _memory_growth(self) -> HealthArray:
+        growth = np.zeros(self.num_instances, np.int64)
+        for supervisor in self._crew.supervisors:
+            growth[supervisor.block] = supervisor.growth
+        return growth
+
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
+        """See ``Pool.read``."""
+        with self._lock:
+            self._require_present()
+            parts = self._crew.run(
+                "reading variables", self._crew.supervisors, lambda s: s.tell("read", variables)
+            )
+            self._require_present()
+            return np.concatenate(list(parts.values()), axis=1)
+
+    def close(self) -> None:
+        """See ``Pool.close``."""
+        with self._lock:
+            self._crew.close()
+
+    def processes(self) -> list[int]:
+        """Return the process numbers of the workers; 0 for a worker that was given up."""
+        return [supervisor.pid for supervisor in self._crew.supervisors]
+
+    def _require_present(self, mask: MaskArray | None = None) -> None:
+        lost = self._crew.lost
+        missing = np.flatnonzero(lost if mask is None else lost & mask)
+        if missing.size:
+            raise SimulationError(self.failure(int(missing[0])))
+
+
+class _Snapshot:
+    """The numbers of the workers' snapshots, with the generations of their processes."""
+
+    def __init__(self, parts: dict[Supervisor, tuple[int, int]]) -> None:
+        self.parts = parts
+        weakref.finalize(self, _release, parts).atexit = False
+
+
+def _require_generation(supervisor: Supervisor, generation: int) -> None:
+    if supervisor.generation != generation:
+        raise SimulationError(
+            "the snapshot is of instances whose process has been replaced since: "
+            f"{supervisor.reason}"
+        )
+
+
+def _release(parts: dict[Supervisor, tuple[int, int]]) -> None:
+    for supervisor, part in parts.items():
+        supervisor.released.append(part)
+
+
+def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:
+    if call_timeout is not None:
+        check_number("call_timeout", call_timeout, positive=True)
+    for what, count in (("workers", workers), ("threads", threads)):
+        if count is not None:
+            check_count(what, count)
+
+
+def _make_memory(size: int) -> Memory:
+    try:
+        return Memory(size)
+    except OSError as error:
+        raise FMULoadError(f"no memory can be shared with worker processes: {error}") from None
+
+
+def _share_out(setup: Setup, workers: int) -> list[Setup]:
+    """Give each worker a block of the instances, the blocks as equal as can be."""
+    bounds = [setup.num_instances * index // workers for index in range(workers + 1)]
+    blocks = itertools.starmap(slice, itertools.pairwise(bounds))
+    return [replace(setup, block=block, number=number) for number, block in enumerate(blocks)]

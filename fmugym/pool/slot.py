@@ -1,0 +1,311 @@
+"""One place of a pool in Python: an instance with its buffers, replaced if a reset cannot help."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fmugym.archive.description import Variable
+from fmugym.errors import FMUGymError, SimulationError, printable
+from fmugym.fmi.access import Access
+from fmugym.fmi.instance import Instance, SavedState
+from fmugym.fmi.library import Library
+from fmugym.fmi.status import Phase, Status
+from fmugym.pool.base import FloatArray, PoolSpec
+from fmugym.pool.health import Column, HealthArray
+from fmugym.pool.spec import ResetMethod
+
+__all__ = ["Slot", "Snapshot"]
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A saved state of one instance.
+
+    Attributes:
+        instance: The instance, which alone can restore the state.
+        state: The FMU state.
+        count: How many communication steps led to it.
+    """
+
+    instance: Instance
+    state: SavedState
+    count: int
+
+
+_REUSING = (ResetMethod.RESTORE, ResetMethod.RESET)
+_STEPPING = Phase.STEPPING
+_WARNING = int(Status.WARNING)
+_STATUSES = {Phase.FAILED: Status.ERROR, Phase.DEAD: Status.FATAL}
+
+
+def _all_finite(values: list[float]) -> bool:
+    total = sum(values)
+    return total - total == 0.0 or all(map(math.isfinite, values))
+
+
+def _is_fine(status: int) -> bool:
+    return 0 <= status <= _WARNING
+
+
+class Slot:
+    """One place of the pool: its instance, which is replaced if a reset cannot help.
+
+    Args:
+        library: The FMU's library.
+        spec: What to do at each reset and step.
+        input_row: The inputs of the instance, shape (k_in,).
+        output_row: Its outputs, shape (k,).
+        counts: Its counts, shape (HEALTH_COUNTS,).
+        states: What the pool's instances know about FMU states.
+
+    Attributes:
+        failure: Why the last status was worse than a warning.
+        is_due: Whether the next reset replaces the instance.
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        spec: PoolSpec,
+        input_row: FloatArray,
+        output_row: FloatArray,
+        counts: HealthArray,
+    ) -> None:
+        self.failure = ""
+        self.is_due = False
+        self._counts = counts
+        self._count = self._counted = 0
+        self._library = library
+        self._spec = spec
+        self._input_row, self._output_row = input_row, output_row
+        self._step_size = spec.communication_step_size
+        self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
+        self._build()
+
+    def _build(self) -> None:
+        self._instance = self._library.instantiate()
+        self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
+        self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
+        self._start_variables: tuple[Variable, ...] = ()
+        self._start = Access(self._instance, ())
+        self._start_key: tuple[tuple[Variable, ...], bytes] | None = None
+        self._saved: SavedState | None = None
+        self._good_outputs = self._output_row.tolist()
+
+    def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
+        """Start an episode anew by the spec's reset method.
+
+        With ``RESTORE``, the state after initialization is kept once the same start values come a
+        second time after an episode with steps, and it is restored from then on. Other start values
+        take a reset and an initialization.
+        """
+        key = (variables, values.tobytes())
+        stepped = self._count > self._spec.warm_up_steps * self._spec.substeps
+        self.count_steps()
+        self._counts[Column.RESETS] += 1
+        self._counts[Column.RETRIED] = 0
+        try:
+            self._make_anew_if_due()
+            if not self._restored(key):
+                self._initialize(variables, values)
+                self._keep_state(key, stepped)
+        except FMUGymError as error:
+            return self._failed(str(error))
+        self._begin_counting_at(self._spec.warm_up_steps * self._spec.substeps)
+        return self._read_outputs(Status.OK)
+
+    def count_steps(self) -> None:
+        """Add the steps until now to the counts."""
+        self._counts[Column.STEPS] += self._count - self._counted
+        self._counted = self._count
+
+    def _begin_counting_at(self, count: int) -> None:
+        self._count = self._counted = count
+
+    def _make_anew_if_due(self) -> None:
+        """Replace an instance that has leaked memory, or that no reset would make as new."""
+        is_due, self.is_due = self.is_due, False
+        if self._instance.phase in (Phase.DEAD, Phase.INSTANTIATED):
+            return
+        if is_due:
+            self._counts[Column.RECYCLINGS] += 1
+            self._replace()
+        elif self._spec.reset_method not in _REUSING:
+            self._rebuild()
+
+    def _restored(self, key: tuple[tuple[Variable, ...], bytes]) -> bool:
+        if self._saved is None or key != self._start_key or self._instance.phase is Phase.DEAD:
+            return False
+        try:
+            self._instance.restore_state(self._saved)
+        except SimulationError:  # a reset and an initialization may still work
+            self._saved = None
+        return self._saved is not None
+
+    def _keep_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> None:
+        """Keep the state if it will be of use."""
+        again = stepped and key == self._start_key
+        self._start_key, self._saved = key, None
+        if again and self._restores:
+            self._saved = self._instance.save_state()
+
+    def _initialize(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        self._return_to_instantiated()
+        if variables is not self._start_variables:
+            self._start = Access(self._instance, variables)
+            self._start_variables = variables
+        self._start.values[:] = values
+        spec = self._spec
+        self._instance.initialize(
+            spec.start_time, spec.stop_time, spec.tolerance, self._set_start_values
+        )
+        self._warm_up()
+
+    def _return_to_instantiated(self) -> None:
+        """Reset the instance, or replace it if it refuses or must not be reset."""
+        if self._instance.phase is Phase.INSTANTIATED:
+            return
+        try:
+            self._instance.reset()
+        except SimulationError:
+            self._replace()
+
+    def _replace(self) -> None:
+        self._counts[Column.REPLACEMENTS] += 1
+        self._rebuild()
+
+    def _rebuild(self) -> None:
+        self._library.discard(self._instance)
+        self._build()
+
+    def _set_start_values(self) -> None:
+        self._instance.check("setting the start values", self._start.set())
+        for variable, text in self._spec.strings:
+            self._instance.set_string(variable, text)
+
+    def _warm_up(self) -> None:
+        self._begin_counting_at(0)
+        for _ in range(self._spec.warm_up_steps):
+            status = self._advance()
+            self._begin_counting_at(self._count)
+            if not _is_fine(status):
+                raise SimulationError(f"the warm-up failed: {self.failure}")
+
+    def step(self) -> int:
+        """Set the inputs, step, and get the outputs; returns the status."""
+        if self._instance.phase is not _STEPPING:
+            return self._failed("the instance needs a reset before it can be stepped")
+        inputs = self._input_row.tolist()
+        if not _all_finite(inputs):
+            return self._not_finite("inputs", self._spec.inputs, inputs)
+        if self._spec.fault_retries:
+            self._counts[Column.RETRIED] = 0
+        status = self._inputs.set()
+        if status and not _is_fine(status):
+            return self._failed_call("setting the inputs", status)
+        status = self._advance()
+        if status and not _is_fine(status) and status != Status.TERMINATED:
+            return status
+        result = self._read_outputs(status)
+        if result > _WARNING and result != Status.NOT_FINITE:  # this may have been the last step
+            self._instance.forbid_steps()
+        return result
+
+    def _advance(self) -> int:
+        spec, status = self._spec, 0
+        do_step = self._step_with_retries if spec.fault_retries else self._instance.step
+        for _ in range(spec.substeps):
+            time = spec.communication_point(self._count)
+            status = do_step(time, self._step_size)
+            self._count += 1
+            if status and not _is_fine(status):
+                doing = f"the step at t = {time:g} s"
+                self.failure = self._instance.describe_failure(doing, status)
+                break
+        return status
+
+    def _step_with_retries(self, time: float, step_size: float) -> int:
+        """Repeat a discarded step as smaller ones.
+
+        Each attempt begins at the state before the first one: no step may follow a discarded one.
+        """
+        instance = self._instance
+        try:
+            before = instance.save_state()
+            status = instance.step(time, step_size)
+            for exponent in range(1, self._spec.fault_retries + 1):
+                if status != Status.DISCARD:
+                    break
+                instance.restore_state(before)
+                self._counts[[Column.RETRIES, Column.RETRIED]] += 1
+                status = self._step_in_parts(time, 2**exponent)
+            before.release()
+        except SimulationError:  # the state could not be saved or restored
+            status = Status.DISCARD
+            instance.forbid_steps()
+        return _STATUSES.get(instance.phase, status)
+
+    def _step_in_parts(self, time: float, parts: int) -> int:
+        size, status = self._step_size / parts, 0
+        for index in range(parts):
+            status = self._instance.step(time + index * size, size)
+            if status and not _is_fine(status):
+                break
+        return status
+
+    def _read_outputs(self, status: int) -> int:
+        """Read the outputs into the row; if any is not finite, keep the last good ones."""
+        got = self._outputs.get()
+        if got and not _is_fine(got):
+            return self._failed_call("reading the outputs", got)
+        values = self._output_row.tolist()
+        if not _all_finite(values):
+            self._output_row[:] = self._good_outputs
+            return self._not_finite("outputs", self._spec.outputs, values)
+        self._good_outputs = values
+        return status
+
+    def _not_finite(self, what: str, variables: Sequence[Variable], values: list[float]) -> int:
+        pairs = zip(variables, values, strict=True)
+        bad = (f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
+        self.failure = f"the {what} are not finite: {printable(', '.join(bad))}"
+        return Status.NOT_FINITE
+
+    def _failed_call(self, doing: str, status: int) -> int:
+        status = self._instance.judge(status)
+        self.failure = self._instance.describe_failure(doing, status)
+        self._output_row[:] = self._good_outputs
+        return status
+
+    def _failed(self, reason: str) -> int:
+        self.failure = reason
+        return Status.FATAL if self._instance.phase is Phase.DEAD else Status.ERROR
+
+    def save(self) -> Snapshot:
+        """Copy the FMU state and the time."""
+        return Snapshot(self._instance, self._instance.save_state(), self._count)
+
+    def require_own(self, snapshot: Snapshot) -> None:
+        """Refuse a state of another instance, since FMUs accept it silently."""
+        if snapshot.instance is not self._instance:
+            raise SimulationError("the snapshot is of another instance than this one")
+
+    def restore(self, snapshot: Snapshot) -> int:
+        """Return to a state and its time."""
+        self.count_steps()
+        try:
+            self._instance.restore_state(snapshot.state)
+        except SimulationError as error:
+            return self._failed(str(error))
+        self._begin_counting_at(snapshot.count)
+        return self._read_outputs(Status.OK)
+
+    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
+        """Read any variables now."""
+        if not self._instance.can_read:
+            raise SimulationError("the instance needs a reset before anything can be read")
+        access = Access(self._instance, variables)
+        self._instance.check("reading variables", access.get())
+        return access.values

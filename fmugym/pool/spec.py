@@ -1,0 +1,97 @@
+"""What a pool is told: its part of the config, checked and resolved against the FMU."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from fmugym.archive.description import Variable
+
+__all__ = [
+    "DEFAULT_CALL_TIMEOUT",
+    "DEFAULT_LEAK_LIMIT",
+    "ISOLATIONS",
+    "PoolSpec",
+    "ResetMethod",
+    "whole_number_of_steps",
+]
+
+ISOLATIONS: Final = ("none", "process")
+"""Where FMUs run: in the caller's process, or in worker processes."""
+
+DEFAULT_CALL_TIMEOUT: Final = 60.0
+"""How long a worker process may take for a call, in seconds of real time."""
+
+DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
+"""Bytes that resets may take for good."""
+
+
+class ResetMethod(StrEnum):
+    """How an instance starts an episode anew, from the fastest way to the surest."""
+
+    RESTORE = "restore"
+    """Restore the FMU state after initialization where the start values are the same."""
+    RESET = "reset"
+    """Call the FMU's reset function and initialize the instance."""
+    INSTANCE = "instance"
+    """Free the instance and make a new one."""
+    LIBRARY = "library"
+    """Also load the shared library anew, so that its global variables begin anew."""
+    PROCESS = "process"
+    """Start a new worker process."""
+
+
+@dataclass(frozen=True)
+class PoolSpec:
+    """What a pool does at each reset and step.
+
+    Attributes:
+        inputs: The variables set before each step, in the order of the rows of ``step``'s argument.
+        outputs: The variables read after each step, in the order of the rows of its result.
+        time_step: Simulated time of one step, in seconds.
+        num_observed: How many of the outputs, from the first, make an observation.
+        substeps: Number of communication steps in one step.
+        start_time: First communication point, in seconds.
+        stop_time: Passed to the FMU where it is not None, in seconds.
+        tolerance: Passed to the FMU where it is not None.
+        warm_up_steps: Steps simulated at each reset, inputs at their start values, before the
+            first output is read.
+        strings: String parameters and their values.
+        fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
+            8 ... smaller ones, from the FMU state before it.
+        leak_limit: Bytes that resets may take before instances are recycled; None for ever.
+        reset_method: How instances start an episode anew.
+        input_limits: Lowest and highest value of each input; empty for those of the FMU.
+    """
+
+    inputs: tuple[Variable, ...]
+    outputs: tuple[Variable, ...]
+    time_step: float
+    num_observed: int = 0
+    substeps: int = 1
+    start_time: float = 0.0
+    stop_time: float | None = None
+    tolerance: float | None = None
+    warm_up_steps: int = 0
+    strings: tuple[tuple[Variable, str], ...] = ()
+    fault_retries: int = 0
+    leak_limit: int | None = None
+    reset_method: ResetMethod = ResetMethod.RESET
+    input_limits: tuple[tuple[float, float], ...] = ()
+
+    def communication_point(self, count: int) -> float:
+        """The time after ``count`` communication steps; never a sum, which would drift."""
+        return self.start_time + count * self.time_step / self.substeps
+
+    @property
+    def communication_step_size(self) -> float:
+        """The step size that the FMU sees, in seconds."""
+        return self.time_step / self.substeps
+
+
+def whole_number_of_steps(duration: float, time_step: float) -> int | None:
+    """The number of steps in a duration, or None if it is not a whole one."""
+    count = round(duration / time_step)
+    return count if math.isclose(count * time_step, duration, abs_tol=1e-9) else None

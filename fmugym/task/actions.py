@@ -1,0 +1,122 @@
+"""From an action to the inputs of the FMU."""
+
+from __future__ import annotations
+
+import math
+import operator
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.archive.description import Variable
+from fmugym.errors import ConfigError
+from fmugym.task.spaces import to_input_types
+
+__all__ = ["elements_of", "flat_inputs", "has_nan", "is_element", "is_misfit", "no_action"]
+
+_OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
+"""What indexing and arithmetic raise for values of another kind or shape."""
+
+_FEW: Final = 64
+"""Up to so many elements Python's floats are faster than numpy."""
+
+
+def no_action(space: spaces.Space[Any]) -> Any:
+    """Return what hooks read before the first action; None for spaces that have no zero."""
+    if isinstance(space, spaces.Discrete):
+        return space.dtype.type(space.start)
+    if isinstance(space, spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete):
+        return np.zeros(space.shape, space.dtype)
+    return None
+
+
+def elements_of(space: spaces.Space[Any]) -> range | None:
+    """Return the elements of a ``Discrete``; None for other spaces."""
+    if isinstance(space, spaces.Discrete):
+        return range(int(space.start), int(space.start + space.n))
+    return None
+
+
+def is_element(action: Any, elements: range) -> bool:
+    """Whether an action is one of the elements of a ``Discrete``."""
+    if type(action) is int:
+        return action in elements
+    try:
+        return operator.index(action) in elements
+    except Exception:  # a TypeError; or the object's own method fails
+        return False
+
+
+def has_nan(action: Any) -> bool:
+    """Whether a number of an action is NaN, whatever the hooks would make of it."""
+    if isinstance(action, float | np.floating):
+        return math.isnan(action)
+    if isinstance(action, np.ndarray):
+        return action.dtype.kind == "f" and _holds_nan(action)
+    if not isinstance(action, list | tuple | Mapping):
+        return False
+    try:
+        return any(map(has_nan, action.values() if isinstance(action, Mapping) else action))
+    except Exception:  # a list that holds itself, or an object whose own methods fail
+        return False
+
+
+def is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
+    """Whether an exception of a hook comes from an action that is not in the action space.
+
+    Hooks may take more than the elements of the space, a bare number for an array of one, say. So
+    exceptions of other kinds than a misfit raises are the hook's own.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium warns of actions that are no arrays
+            if space.contains(action):
+                return False
+        is_numeric = np.asarray(action).dtype.kind in "biuf"
+    except Exception:  # an object whose own methods fail
+        return True
+    return not is_numeric or isinstance(error, _OF_MISFITS)
+
+
+def _holds_nan(array: npt.NDArray[np.floating[Any]]) -> bool:
+    is_short = type(array) is np.ndarray and array.ndim == 1 and array.size <= _FEW
+    if is_short and math.isfinite(math.hypot(*array.tolist())):
+        return False
+    return bool(np.isnan(np.asarray(array)).any())
+
+
+def flat_inputs(
+    values: Any, variables: Sequence[Variable], source: Callable[[Any], str]
+) -> npt.NDArray[np.float64]:
+    """Turn what ``_get_inputs`` returned into one number for each input.
+
+    Args:
+        values: Numbers, in any shape.
+        variables: The inputs.
+        source: Says for an error where values come from.
+
+    Returns:
+        New values of the inputs' types, as float64; they need not be finite.
+
+    Raises:
+        ConfigError: If these are no numbers, not one for each input, or too large for their type.
+    """
+    if values is None:
+        raise ConfigError("_get_inputs returned None, expected a number for each input")
+    try:
+        raw = np.asarray(values)
+        flat = raw.astype(np.float64, casting="unsafe" if raw.dtype == object else "same_kind")
+    except Exception:  # no numbers, too large ones, or objects whose own methods fail
+        raise ConfigError(f"{source(values)} does not make numbers") from None
+    flat = flat.ravel()
+    if flat.size != len(variables):
+        names = ", ".join(variable.name for variable in variables)
+        raise ConfigError(
+            f"{source(values)} makes {flat.size} values, "
+            f"expected {len(variables)}, one for each input ({names})"
+        )
+    return to_input_types(variables, flat)

@@ -1,0 +1,152 @@
+"""The hooks of an environment, and what they may read."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.checks import check_mapping
+from fmugym.config import EnvConfig
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.interface import Interface
+
+if TYPE_CHECKING:
+    from fmugym.rendering import Scene
+
+__all__ = ["Hooks"]
+
+
+class Hooks(gymnasium.Env[Any, Any], ABC):
+    """The hooks with their defaults; a subclass of ``FMUEnv`` overrides what its task needs.
+
+    What the hooks may read is listed at ``FMUEnv``.
+    """
+
+    config: EnvConfig
+    state: Any
+    previous_state: Any
+    out: Mapping[str, Any]
+    inputs: Any
+    action: Any
+    previous_action: Any
+    step_count: Any
+    done: Any
+    after_end: Any
+    parameters: Mapping[str, Any]
+    variables: dict[str, Any]
+
+    _interface: Interface
+    _action_values: Sequence[int] | None
+    _is_goal_task: bool
+    _observe: Callable[[Any], Any]
+
+    # In the order of a step.
+
+    def _get_inputs(self) -> Any:
+        """Turn ``self.action`` into the values of the inputs, in the order of the config.
+
+        Returns:
+            One number for each input. By default these are the action's own elements; for a
+            ``Discrete`` made from an Enumeration or Integer, the value that the element stands for.
+        """
+        values = self._action_values
+        if values is None:
+            return self.action
+        if isinstance(values, range):  # of an Integer; it may be a wide one
+            return values[0] + self.action
+        return np.array(values)[self.action]
+
+    def _update(self) -> None:
+        """Advance what the task integrates or filters; called once after each step of the FMU."""
+
+    @abstractmethod
+    def _is_done(self) -> bool:
+        """Whether the task has ended, by success or by failure: ``terminated``."""
+
+    def _is_truncated(self) -> bool:
+        """Whether to cut the episode short for a reason outside of the task."""
+        return False
+
+    def _reward_policy(self) -> Any:
+        """The reward of this step.
+
+        Returns:
+            By default ``negative_reward`` where the task has ended and ``positive_reward``
+            otherwise; for a goal task ``_goal_reward`` of this observation.
+        """
+        positive, negative = self.config.positive_reward, self.config.negative_reward
+        if self._is_goal_task:
+            return self._reward_for_goals(self._get_observation())
+        if isinstance(self.done, bool):
+            return negative if self.done else positive
+        return np.where(self.done, negative, positive)
+
+    def _reward_for_goals(self, observation: Mapping[str, Any]) -> Any:
+        """Call ``_goal_reward`` as ``compute_reward`` does, with environments first."""
+        try:
+            achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        except (KeyError, TypeError, IndexError):
+            raise ConfigError(
+                "_get_observation of a goal task must return a dict with 'achieved_goal' and "
+                "'desired_goal'"
+            ) from None
+        if not isinstance(self.done, bool):
+            achieved, desired = np.moveaxis(achieved, -1, 0), np.moveaxis(desired, -1, 0)
+        return self._goal_reward(achieved, desired)
+
+    def _get_observation(self) -> Any:
+        """The observation, a new array (or dict of new arrays).
+
+        Returns:
+            By default the outputs in the type of the observation space. If they do not make an
+            element of it, as where an own hook adds to them, in the type of the default space.
+        """
+        return self._observe(self.state)
+
+    def _get_info(self) -> dict[str, Any]:
+        """More facts about this step by name, a new dict."""
+        return {}
+
+    # Settled once, at construction.
+
+    def _get_action_space(self) -> spaces.Space[Any]:
+        """The action space; by default from the inputs' types, min and max."""
+        return fmu_spaces.action_space(self._interface)
+
+    def _get_observation_space(self) -> spaces.Space[Any]:
+        """The observation space; by default from the outputs' types, min and max."""
+        return fmu_spaces.observation_space(self._interface)
+
+    # Of some tasks only.
+
+    def _goal_reward(self, achieved_goal: Any, desired_goal: Any) -> Any:
+        """The reward for reaching one goal when another was wanted, element-wise.
+
+        Override it for a goal task, whose observations are dicts with ``achieved_goal`` and
+        ``desired_goal``. The default reward and ``compute_reward`` are then made from it.
+        """
+        raise SimulationError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
+
+    def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The parameters that the options of ``reset`` override for one episode, by name."""
+        return check_mapping("option 'model_parameters'", options.get("model_parameters", {}))
+
+    # Of pictures.
+
+    def _get_scene(self) -> Scene[Any]:
+        """What ``render`` draws; see ``fmugym.rendering``. Called once."""
+        raise SimulationError(f"{type(self).__name__} has render modes, but no _get_scene")
+
+    def _get_frame(self) -> Any:
+        """What the scene needs to know of this moment; by default ``out``."""
+        return self.out
+
+    def _describe_action(self) -> str:
+        """The action as text for the picture."""
+        return ", ".join(f"{value:+.3g}" for value in self.inputs)

@@ -1,0 +1,113 @@
+"""How an environment opens its FMU, and the pool that it runs in."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_option, check_path
+from fmugym.config import EnvConfig
+from fmugym.pool import Pool, PoolSpec
+from fmugym.pool.spec import ISOLATIONS
+from fmugym.task.episode import EpisodePlan
+from fmugym.trial.opening import make_pool
+
+__all__ = ["open_fmu", "open_pool", "request_pool"]
+
+_request: ContextVar[tuple[int, dict[str, Any]]] = ContextVar("request", default=(1, {}))
+
+
+@contextmanager
+def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
+    """Give environments that are made in this context a pool of this size.
+
+    Args:
+        num_instances: Number of FMU instances; a vector environment's prototype has all of them.
+        options: Passed to ``fmugym.trial.opening.make_pool``.
+    """
+    token = _request.set((num_instances, options))
+    try:
+        yield
+    finally:
+        _request.reset(token)
+
+
+def open_fmu(cls: type, path: str | os.PathLike[str], config: EnvConfig) -> FMU:
+    """Open the FMU of an environment; relative paths are relative to the file of its class.
+
+    Raises:
+        ConfigError: If an argument does not fit.
+        FMULoadError: If the file is missing or no sound FMU.
+    """
+    return FMU(
+        _find_file(cls, check_path("fmu_path", path)),
+        limits=config.archive_limits,
+        preload=[_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload],
+        probe_timeout=config.probe_timeout,
+    )
+
+
+def open_pool(
+    fmu: FMU,
+    spec: PoolSpec,
+    config: EnvConfig,
+    plan: EpisodePlan,
+    log: logging.Logger,
+    backend: Any,
+    isolation: str | None,
+) -> Pool:
+    """Make the pool that the config, the arguments and the context ask for.
+
+    Raises:
+        ConfigError: If an argument does not fit.
+        FMULoadError: If the FMU cannot be used on this machine.
+    """
+    if isolation is not None:
+        isolation = check_option("isolation", isolation, ISOLATIONS)
+    num_instances, requested = _request.get()
+    options: dict[str, Any] = {
+        "isolation": isolation or config.isolation,
+        "call_timeout": config.call_timeout,
+        "reset_method": config.reset_method,
+        "starts": plan.starts(),
+        **requested,
+    }
+    if backend is not None:
+        options["backend"] = backend
+    return make_pool(fmu, spec, num_instances, log, **options)
+
+
+def _find_file(cls: type, path: Path) -> Path:
+    """Find a relative path beside the file of the class, or of a class that it derives from.
+
+    Classes of a notebook or of the interactive interpreter have no file: for them the path is
+    relative to the working directory.
+    """
+    if path.is_absolute():
+        return path
+    own = takewhile(lambda c: c.__module__ != "fmugym.env", cls.__mro__)
+    folders = [Path(inspect.getfile(c)).parent for c in own if _has_file(c)] or [Path.cwd()]
+    candidates = [folder / path for folder in folders]
+    return next((c for c in candidates if _exists(c)), candidates[0])
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # no file can have this path
+        return False
+
+
+def _has_file(cls: type) -> bool:
+    try:
+        return Path(inspect.getfile(cls)).is_file()
+    except (TypeError, OSError):
+        return False

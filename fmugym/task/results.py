@@ -1,0 +1,184 @@
+"""Checks of what hooks return: of a kind that the environment can use, and finite.
+
+A result of the wrong kind is a mistake in the class, and ``ConfigError`` names the hook. Numbers
+that are not finite are a fault of the episode, like a failure of the FMU.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.checks import check_mapping, number_of
+from fmugym.errors import ConfigError, shown
+
+__all__ = [
+    "FLOAT32_LIMIT",
+    "as_flag",
+    "as_info",
+    "as_reward",
+    "finiteness_of",
+    "given",
+]
+
+FLOAT32_LIMIT: Final = float(np.finfo(np.float32).max)
+"""Greater numbers are infinite in an observation of float32."""
+
+_FEW: Final = 64
+"""Up to so many elements Python's floats are faster than numpy."""
+
+_OBSERVE: Final = "_get_observation"
+
+Finiteness = Callable[[Any], bool]
+"""Tells whether an observation is finite; raises ConfigError if it does not fit its space."""
+
+
+def given(value: Any, hook: str) -> Any:
+    """Return what a hook returned.
+
+    Raises:
+        ConfigError: If that is None.
+    """
+    if value is None:
+        raise ConfigError(f"{hook} returned None; is its return statement missing?")
+    return value
+
+
+def as_flag(hook: str, value: Any) -> bool:
+    """Return the True or False of a hook as a bool; 0 and 1, and arrays of one element, will do.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
+    flag = _single(given(value, hook))
+    if issubclass(type(flag), int | float | np.bool_ | np.number):
+        number = number_of(f"what {hook} returned", flag)
+        if number in (0.0, 1.0):
+            return bool(number)
+    raise ConfigError(f"{hook} returned {shown(value)}, expected True or False")
+
+
+def as_reward(value: Any) -> float:
+    """Return a reward as a float, finite or not; an array of one element will do.
+
+    Raises:
+        ConfigError: If it is no number.
+    """
+    return number_of("what _reward_policy returned", _single(given(value, "_reward_policy")))
+
+
+def as_info(value: Any) -> dict[str, Any]:
+    """Return the info of a hook as a new dict.
+
+    Raises:
+        ConfigError: If it is no mapping from names.
+    """
+    if type(value) is dict:
+        return value.copy()
+    return check_mapping("what _get_info returned", given(value, "_get_info"))
+
+
+def _single(value: Any) -> Any:
+    """The element of an array of one; anything else as it is."""
+    is_array = issubclass(type(value), np.ndarray)  # isinstance may call the object's own methods
+    return value.reshape(-1)[0] if is_array and value.size == 1 else value
+
+
+def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
+    """Make the check of the observations of a space.
+
+    Returns:
+        A function of an observation. It tells whether all numbers are finite, and raises
+        ``ConfigError`` if the observation does not have the shape and kind of the space. Bounds are
+        not checked.
+    """
+    if isinstance(space, spaces.Dict):
+        return _of_dict({name: finiteness_of(inner) for name, inner in space.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        return _of_tuple([finiteness_of(inner) for inner in space.spaces])
+    if isinstance(space, spaces.Box) and space.dtype.kind == "f":
+        return _of_floats(space)
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
+        return _of_integers(space)
+    return _of_others(space)
+
+
+def _of_floats(space: spaces.Box) -> Finiteness:
+    shape, dtype = space.shape, space.dtype
+    is_short = len(shape) == 1 and shape[0] <= _FEW
+
+    def is_finite(observation: Any) -> bool:
+        if type(observation) is not np.ndarray or observation.dtype is not dtype:
+            with np.errstate(over="ignore", invalid="ignore"):
+                observation = _numbers(observation, "fiub").astype(dtype)
+        if observation.shape != shape:
+            _refuse_shape(observation, shape)
+        if is_short and math.isfinite(math.hypot(*observation.tolist())):
+            return True
+        return bool(np.isfinite(observation).all())
+
+    return is_finite
+
+
+def _of_integers(space: Any) -> Finiteness:
+    def is_finite(observation: Any) -> bool:
+        array = _numbers(observation, "iubf")
+        if array.shape != space.shape:
+            _refuse_shape(array, space.shape)
+        return array.dtype.kind != "f" or bool(np.isfinite(array).all())
+
+    return is_finite
+
+
+def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
+    def is_finite(observation: Any) -> bool:
+        if not issubclass(type(observation), Mapping) or observation.keys() != parts.keys():
+            raise ConfigError(
+                f"{_OBSERVE} returned {shown(observation)}, expected a dict with the keys "
+                f"{', '.join(map(repr, parts))}"
+            )
+        return all(check(observation[name]) for name, check in parts.items())
+
+    return is_finite
+
+
+def _of_tuple(parts: list[Finiteness]) -> Finiteness:
+    def is_finite(observation: Any) -> bool:
+        if not issubclass(type(observation), tuple) or len(observation) != len(parts):
+            raise ConfigError(
+                f"{_OBSERVE} returned {shown(observation)}, expected a tuple of {len(parts)}"
+            )
+        return all(check(part) for check, part in zip(parts, observation, strict=True))
+
+    return is_finite
+
+
+def _of_others(space: spaces.Space[Any]) -> Finiteness:
+    def is_finite(observation: Any) -> bool:
+        if not space.contains(given(observation, _OBSERVE)):
+            raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, which is not in {space}")
+        return True
+
+    return is_finite
+
+
+def _numbers(observation: Any, kinds: str) -> np.ndarray[Any, Any]:
+    given(observation, _OBSERVE)
+    try:
+        array = np.asarray(observation)
+    except Exception:  # ragged lists, or objects whose own methods fail
+        array = np.asarray(None)
+    if array.dtype.kind not in kinds:
+        raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, expected an array of numbers")
+    return array
+
+
+def _refuse_shape(array: np.ndarray[Any, Any], shape: tuple[int, ...] | None) -> None:
+    raise ConfigError(
+        f"{_OBSERVE} returned an array of shape {array.shape}, but the observation space has "
+        f"{shape}"
+    )

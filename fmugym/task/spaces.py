@@ -1,0 +1,223 @@
+"""Spaces made from the FMU's variables, and the way between their elements and FMU values.
+
+======================================  ==========================================================
+variables                               space
+======================================  ==========================================================
+one Enumeration or one bounded Integer  ``Discrete``; element i is the i-th value in rising order
+Booleans only                           ``MultiBinary``
+anything else                           flat ``Box`` of float32; Booleans are 0 or 1 in it
+======================================  ==========================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.archive.description import Variable
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.task.interface import Interface, checked_value
+
+__all__ = [
+    "action_space",
+    "default_observation",
+    "discrete_values",
+    "observation_space",
+    "outputs_observation",
+    "to_input_types",
+]
+
+_LARGEST_EXACT_INTEGER = 2.0**53
+
+
+def action_space(interface: Interface) -> spaces.Space[Any]:
+    """Make the action space of an environment's inputs.
+
+    Raises:
+        ConfigError: If there is no input, or one has no limits; the text says how to give them.
+    """
+    if not interface.inputs:
+        raise ConfigError(
+            "there are no inputs in 'model_input_names' to make an action space from; "
+            "name some, or override _get_action_space"
+        )
+    for variable in interface.inputs:
+        if variable.kind in {"real", "integer"} and not _bounded(interface, variable):
+            raise ConfigError(
+                f"input {variable.name!r} has no min and max in the FMU: give "
+                f"'bounds': {{{variable.name!r}: (low, high)}} in the config, or override "
+                "_get_action_space"
+            )
+    return _space(interface, interface.inputs)
+
+
+def observation_space(interface: Interface) -> spaces.Space[Any]:
+    """Make the observation space of an environment's outputs; a Real may be unbounded in it."""
+    return _space(interface, interface.outputs)
+
+
+def discrete_values(interface: Interface, variables: Sequence[Variable]) -> Sequence[int] | None:
+    """The values that the elements of a ``Discrete`` stand for.
+
+    Returns:
+        The values in rising order, or None if the variables do not make a ``Discrete``.
+    """
+    if len(variables) != 1:
+        return None
+    (variable,) = variables
+    if variable.kind == "enumeration" and variable.items:
+        return sorted(value for _, value in variable.items)
+    if variable.kind in {"integer", "enumeration"} and _countable(interface, variable):
+        return _integers(variable, *interface.bounds(variable))
+    return None
+
+
+def _integers(variable: Variable, low: float, high: float) -> range:
+    values = range(math.ceil(low), math.floor(high) + 1)  # not a list: it may be long
+    if not values:
+        raise ConfigError(
+            f"{variable.name!r} has no integer from {low} to {high}; give it 'bounds'"
+        )
+    return values
+
+
+def _space(interface: Interface, variables: tuple[Variable, ...]) -> spaces.Space[Any]:
+    values = discrete_values(interface, variables)
+    if values is not None:
+        return spaces.Discrete(len(values))
+    if all(variable.kind == "boolean" for variable in variables):
+        return spaces.MultiBinary(len(variables))
+    limits = np.array([_box_limits(interface, v) for v in variables], dtype=np.float32)
+    return spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
+
+
+def _box_limits(interface: Interface, variable: Variable) -> tuple[float, float]:
+    if variable.kind == "boolean":
+        return 0.0, 1.0
+    if variable.items:
+        values = [value for _, value in variable.items]
+        return min(values), max(values)
+    return interface.bounds(variable)
+
+
+def _bounded(interface: Interface, variable: Variable) -> bool:
+    return all(map(math.isfinite, interface.bounds(variable)))
+
+
+def _countable(interface: Interface, variable: Variable) -> bool:
+    """Whether a ``Discrete`` can have an element for each integer within the limits."""
+    return all(abs(limit) <= _LARGEST_EXACT_INTEGER for limit in interface.bounds(variable))
+
+
+def to_input_types(
+    variables: Sequence[Variable], values: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Round values to their inputs' types: Booleans from 0.5 up, others to the nearest value.
+
+    Args:
+        variables: The inputs.
+        values: One number for each, finite or not.
+
+    Returns:
+        The values for the FMU, still as float64.
+
+    Raises:
+        ConfigError: If a value is out of its type's range.
+    """
+    result = values.copy()
+    for index, variable in enumerate(variables):
+        if math.isfinite(values[index]) and variable.type not in {"Real", "Float64"}:
+            result[index] = _to_input_type(variable, float(values[index]))
+    return result
+
+
+def _to_input_type(variable: Variable, value: float) -> float:
+    if variable.kind == "boolean":
+        return float(value >= 0.5)
+    if variable.kind in {"integer", "enumeration"}:
+        value = round(value)
+    items = [item for _, item in variable.items]
+    if items and min(items) <= value <= max(items):  # there may be gaps between them
+        value = min(items, key=lambda item: abs(item - value))
+    return checked_value(variable, value)
+
+
+def default_observation(
+    interface: Interface, space: spaces.Space[Any]
+) -> Callable[[Sequence[float]], Any]:
+    """Make the function from the outputs to an element of an observation space.
+
+    Args:
+        interface: Names the outputs.
+        space: A ``Box`` or ``MultiBinary`` with one element for each output, or a ``Discrete``
+            for a single one.
+
+    Returns:
+        The function; it returns a new array each time.
+
+    Raises:
+        ConfigError: If the space does not fit the outputs.
+    """
+    if isinstance(space, spaces.Discrete):
+        return _discrete_observation(interface, space)
+    count = len(interface.outputs)
+    if not isinstance(space, spaces.Box | spaces.MultiBinary) or space.shape != (count,):
+        raise ConfigError(
+            f"the {count} outputs do not make an element of {space}; override _get_observation"
+        )
+    dtype = space.dtype
+    return lambda state: np.array(state, dtype=dtype)
+
+
+def outputs_observation(
+    interface: Interface, space: spaces.Space[Any]
+) -> Callable[[Sequence[float]], Any]:
+    """Make what ``super()._get_observation()`` returns to a class with an own hook.
+
+    Args:
+        interface: Names the outputs.
+        space: The environment's observation space, which the outputs alone may not fit.
+
+    Returns:
+        The function to elements of the space, or else of the default space of the outputs. It
+        raises ``ConfigError`` when it is called if there is neither.
+    """
+
+    @cache
+    def make() -> Callable[[Sequence[float]], Any]:
+        try:
+            return default_observation(interface, space)
+        except ConfigError:
+            return default_observation(interface, observation_space(interface))
+
+    return lambda state: make()(state)
+
+
+def _discrete_observation(
+    interface: Interface, space: spaces.Discrete
+) -> Callable[[Sequence[float]], Any]:
+    if len(interface.outputs) != 1:
+        raise ConfigError(
+            f"{len(interface.outputs)} outputs do not make an element of {space}; "
+            "override _get_observation"
+        )
+    values = discrete_values(interface, interface.outputs)
+    if values is None or space.n != len(values):
+        return lambda state: np.int64(state[0])
+    (variable,) = interface.outputs
+
+    def observe(state: Sequence[float]) -> np.int64:
+        try:
+            return np.int64(values.index(int(state[0])) + int(space.start))
+        except ValueError:
+            raise SimulationError(
+                f"output {variable.name!r} is {state[0]:g}, which is not one of its declared values"
+            ) from None
+
+    return observe

@@ -1,0 +1,167 @@
+"""The mappings through which hooks and infos read values by name."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from fmugym.errors import ConfigError, shown, unknown_name
+
+__all__ = ["EpisodeVariables", "LateDict", "NamedValues"]
+
+
+class NamedValues(Mapping[str, Any]):
+    """A read-only mapping from names to values that are kept in a fixed order.
+
+    Args:
+        kind: What the names name, for error texts.
+        names: The names, in the order of the values.
+        get_values: Returns the present values.
+
+    Raises:
+        ConfigError: By ``[]``, for an unknown name; the text has the nearest one.
+    """
+
+    def __init__(
+        self, kind: str, names: Sequence[str], get_values: Callable[[], Sequence[Any]]
+    ) -> None:
+        self._kind = kind
+        self._index = {name: index for index, name in enumerate(names)}
+        self._get_values = get_values
+
+    def __getitem__(self, name: str) -> Any:
+        try:
+            index = self._index[name]
+        except Exception:  # a KeyError; or something that is no key at all
+            raise unknown_name(self._kind, name, self._index) from None
+        return self._get_values()[index]
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and str.__str__(name) in self._index
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a value, or the default if there is none of this name."""
+        if name not in self:
+            return default
+        return self._get_values()[self._index[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._index)
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({dict(self)})"
+
+
+class EpisodeVariables(dict[str, Any]):
+    """The episode variables: a dict whose names are those of the config.
+
+    Args:
+        names: The names; their values are None until the first reset.
+    """
+
+    def __init__(self, names: Mapping[str, Any]) -> None:
+        super().__init__(dict.fromkeys(names))
+
+    def __missing__(self, name: str) -> Any:
+        raise unknown_name("episode variable", name, self)
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        if not isinstance(name, str) or name not in self:
+            raise unknown_name("episode variable", name, self)
+        super().__setitem__(name, value)
+
+    def update(self, *args: Any, **kwargs: Any) -> None:
+        """Write several variables, as in a dict; none is written if a name is unknown."""
+        try:
+            new = dict(*args, **kwargs)
+        except Exception:  # no dict at all, or one whose own methods fail
+            raise ConfigError(f"{shown(args)} are no values by name") from None
+        for name in new:
+            if name not in self:
+                raise unknown_name("episode variable", name, self)
+        super().update(new)
+
+    def __ior__(self, other: Any) -> EpisodeVariables:  # type: ignore[misc, override]
+        self.update(other)
+        return self
+
+    def setdefault(self, name: str, default: Any = None) -> Any:
+        """Read a variable; the default is not used, as all variables are there."""
+        return self[name]
+
+    def _keep(self, *_: Any) -> Any:
+        raise ConfigError("episode variables are those of the config; none can be removed")
+
+    __delitem__ = pop = popitem = clear = _keep
+
+    def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
+        """A copy is a plain dict."""
+        return dict, (dict(self),)
+
+
+class LateDict(dict[str, Any]):
+    """A dict that is filled when it is first read or written, for values that are rarely read.
+
+    Every method of ``dict`` fills it first. Functions in C that look into a dict without calling
+    its methods (none of the standard library's does) would find ``_UNFILLED``.
+
+    Args:
+        fill: Returns the items.
+        arguments: What to call it with.
+    """
+
+    __slots__ = ("_fill",)
+
+    _fill: tuple[Callable[..., Mapping[str, Any]], tuple[Any, ...]] | None
+
+    @classmethod
+    def of(cls, fill: Callable[..., Mapping[str, Any]], *arguments: Any) -> LateDict:
+        """Make one in a third of the time that a constructor in Python takes."""
+        late: LateDict = dict.__new__(cls)
+        late._fill = fill, arguments
+        dict.__setitem__(late, _UNFILLED, None)  # json.dumps writes {} for a dict of no items
+        return late
+
+    def _filled(self) -> dict[str, Any]:
+        if self._fill is not None:
+            (fill, arguments), self._fill = self._fill, None
+            dict.clear(self)
+            dict.update(self, fill(*arguments))
+        return self
+
+    __hash__ = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is a plain dict."""
+        return dict, (dict(self.items()),)
+
+
+_UNFILLED: Final = "fmugym: not filled yet"
+
+_NOT_OF_THE_ITEMS: Final = {
+    *("__class_getitem__", "__getattribute__", "__hash__", "__init__", "__new__", "fromkeys"),
+    "__reduce__",
+}
+"""The methods of ``dict`` that do not depend on its items, or that ``LateDict`` has itself."""
+
+
+def _filling(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a method of ``dict`` fill every ``LateDict`` that it is called with."""
+
+    @functools.wraps(method)
+    def call(*values: Any, **items: Any) -> Any:
+        for value in values:
+            if isinstance(value, LateDict):
+                value._filled()
+        return method(*values, **items)
+
+    return call
+
+
+for _name, _method in vars(dict).items():
+    if callable(_method) and _name not in _NOT_OF_THE_ITEMS:
+        setattr(LateDict, _name, _filling(_method))

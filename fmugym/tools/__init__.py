@@ -1,0 +1,1 @@
+"""Tools around an FMU: the command line, overviews, skeletons, linear models."""

@@ -1,0 +1,191 @@
+"""Linear models of FMUs from their directional derivatives (FMI 2.0 and 3.0)."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.fmu import FMU
+from fmugym.errors import ConfigError
+from fmugym.fmi.access import Access
+from fmugym.fmi.instance import Instance
+from fmugym.fmi.library import Library
+from fmugym.task.interface import checked_value, start_variable
+from fmugym.trial.trial import meet
+
+__all__ = ["LinearModel", "linearize"]
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+Variables = tuple[Variable, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """A model x_dot = f + A (x - x0) + B (u - u0), in continuous time and the FMU's own units.
+
+    Attributes:
+        A: Derivatives of ``derivatives`` by ``states``, shape (n, n).
+        B: Derivatives of ``derivatives`` by ``inputs``, shape (n, m).
+        f: The values of ``derivatives`` at the point of linearization, shape (n,); 0 at an
+            equilibrium.
+        x0: The values of ``states`` there, shape (n,).
+        u0: The values of ``inputs`` there, shape (m,).
+        states: The names of the states, in the order of rows and columns.
+        inputs: The names of the inputs, in the order of columns.
+        derivatives: The names of the derivatives of the states, in the order of rows.
+        units: The unit of each of these variables; None where the FMU gives none.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    f: FloatArray
+    x0: FloatArray
+    u0: FloatArray
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    derivatives: tuple[str, ...]
+    units: Mapping[str, str | None]
+
+
+def linearize(
+    fmu: FMU | str | os.PathLike[str],
+    *,
+    states: str | Sequence[str] | None = None,
+    inputs: str | Sequence[str] | None = None,
+    at: Mapping[str, float | str] | None = None,
+) -> LinearModel:
+    """Linearize an FMU at the point it reaches by its initialization.
+
+    The FMU computes the derivatives itself, by ``fmi2GetDirectionalDerivative`` or
+    ``fmi3GetDirectionalDerivative``. So there is no step size and no truncation error.
+
+    Args:
+        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` are used.
+        states: Names of continuous states, or one name; by default all that the FMU declares. The
+            other states are held constant.
+        inputs: Names of continuous inputs, or one name; by default all of them.
+        at: Values by name, set before initialization: start values of states, inputs, parameters.
+
+    Returns:
+        The linear model.
+
+    Raises:
+        ConfigError: If the FMU provides no directional derivatives or declares no states; if a name
+            is unknown or belongs to a variable of another kind; if a value does not fit.
+        FMULoadError: If the FMU cannot be loaded.
+        SimulationError: If the FMU fails.
+    """
+    fmu = FMU.of(fmu)
+    description = fmu.description
+    _require_derivatives(description)
+    x = _chosen(description, "continuous state", states, list(description.state_derivatives))
+    u = _chosen(description, "continuous input", inputs, _inputs(description))
+    start = _start_values(description, at or {})
+    meet(fmu)
+    with closing(Library(fmu, logger)) as library:
+        instance = library.instantiate()
+        _initialize(instance, description, start)
+        return _linear_model(instance, description, x, u)
+
+
+def _require_derivatives(description: ModelDescription) -> None:
+    name = f"{description.model_name} (FMI {description.fmi_version})"
+    if not description.capabilities.provides_directional_derivatives:
+        raise ConfigError(
+            f"{name} cannot be linearized: it provides no directional derivatives, which are an "
+            "option of FMI 2.0 and 3.0; its exporter may have a setting for them"
+        )
+    if not description.state_derivatives:
+        raise ConfigError(
+            f"{name} cannot be linearized: its ModelStructure declares no scalar derivatives "
+            "of continuous states"
+        )
+
+
+def _inputs(description: ModelDescription) -> list[str]:
+    return [
+        v.name
+        for v in description.variables.values()
+        if (v.causality, v.variability, v.kind, v.shape) == ("input", "continuous", "real", ())
+    ]
+
+
+def _chosen(
+    description: ModelDescription,
+    kind: str,
+    names: str | Sequence[str] | None,
+    known: Sequence[str],
+) -> Variables:
+    """Look up the chosen variables, or all known ones if none were chosen."""
+    names = known if names is None else (names,) if isinstance(names, str) else names
+    for name in names:
+        variable = description.variable(name)
+        if name not in known:
+            raise ConfigError(
+                f"{name!r} is no {kind} of {description.model_name} but a {variable.variability} "
+                f"{variable.causality}; expected some of: {', '.join(map(repr, known)) or 'none'}"
+            )
+    return tuple(map(description.variable, names))
+
+
+def _start_values(
+    description: ModelDescription, values: Mapping[str, float | str]
+) -> dict[Variable, float | str]:
+    """Check the values; values of Strings stay texts."""
+    checked: dict[Variable, float | str] = {}
+    for name, value in values.items():
+        variable = start_variable(description, name, value)
+        is_text = variable.kind == "string"
+        checked[variable] = value if is_text else checked_value(variable, value)
+    return checked
+
+
+def _initialize(
+    instance: Instance, description: ModelDescription, start: Mapping[Variable, float | str]
+) -> None:
+    numbers = {v: value for v, value in start.items() if not isinstance(value, str)}
+    access = Access(instance, tuple(numbers), np.array(list(numbers.values()), float))
+
+    def set_start_values() -> None:
+        instance.check("setting the start values", access.set())
+        for variable, value in start.items():
+            if isinstance(value, str):
+                instance.set_string(variable, value)
+
+    instance.initialize(description.start_time, None, None, set_start_values)
+
+
+def _linear_model(
+    instance: Instance, description: ModelDescription, x: Variables, u: Variables
+) -> LinearModel:
+    x_dot = tuple(description.variable(description.state_derivatives[v.name]) for v in x)
+    return LinearModel(
+        A=instance.jacobian(x_dot, x),
+        B=instance.jacobian(x_dot, u),
+        f=_read(instance, x_dot),
+        x0=_read(instance, x),
+        u0=_read(instance, u),
+        states=_names(x),
+        inputs=_names(u),
+        derivatives=_names(x_dot),
+        units={v.name: v.unit for v in (*x, *u, *x_dot)},
+    )
+
+
+def _read(instance: Instance, variables: Variables) -> FloatArray:
+    access = Access(instance, variables)
+    instance.check("reading variables", access.get())
+    return access.values
+
+
+def _names(variables: Variables) -> tuple[str, ...]:
+    return tuple(variable.name for variable in variables)

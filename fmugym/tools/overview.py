@@ -1,0 +1,317 @@
+"""The facts about an FMU that a user asks for first, as plain data and as text.
+
+They come from the archive and the XML. Nothing of the FMU is executed.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.archive.packages import missing_tool, source_of
+from fmugym.errors import FMULoadError, printable
+from fmugym.trial.trial import known_verdict
+
+__all__ = ["as_text", "overview", "plain", "start_value"]
+
+SCHEMA: Final = 1
+"""Raised when a key goes or changes its meaning; new keys do not raise it."""
+
+SHOWN: Final = ("input", "output", "parameter")
+"""The causalities that are listed by default."""
+
+_HEADINGS: Final = {
+    "input": "Inputs",
+    "output": "Outputs",
+    "parameter": "Parameters",
+    "structuralParameter": "Structural parameters",
+    "calculatedParameter": "Calculated parameters",
+    "local": "Locals",
+    "independent": "Independent variables",
+}
+_COLUMNS: Final = ("name", "type", "unit", "range", "start", "variability", "description")
+_WIDEST: Final = 44
+_MOST_FINDINGS: Final = 100
+
+
+def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) -> dict[str, Any]:
+    """Gather the facts about an FMU.
+
+    Args:
+        fmu: The FMU.
+        everything: List variables of all causalities, not only those in ``SHOWN``.
+        pattern: List the variables of all causalities whose name matches. ``*`` matches any text
+            and ``?`` one character; brackets match themselves, since names of arrays have them.
+
+    Returns:
+        Dicts, lists, strings, finite numbers, Booleans and None; ``fmugym.tools.cli`` describes
+        the keys. Variables are in the order of the model description.
+    """
+    description = fmu.description
+    variables = description.variables.values()
+    return {
+        "schema": SCHEMA,
+        "path": str(fmu.path),
+        **{name: getattr(description, name) for name in _TEXTS},
+        "interfaces": list(description.interfaces),
+        "platforms": list(fmu.platforms),
+        "platform": fmu.platform,
+        "library": fmu.library,
+        "runs_here": fmu.runs_here,
+        "obstacles": list(fmu.obstacles),
+        "missing_libraries": [_library_row(name) for name in _missing_libraries(fmu)],
+        "missing_tool": missing_tool(
+            description.generation_tool, description.capabilities.needs_execution_tool
+        ),
+        "capabilities": asdict(description.capabilities),
+        "default_experiment": {name: getattr(description, name) for name in _TIMES},
+        "fixed_internal_step_size": description.fixed_internal_step_size,
+        "trial": _trial(fmu),
+        "findings": list(fmu.findings),
+        "variable_counts": dict(Counter(variable.causality for variable in variables)),
+        "variables": [_row(v) for v in variables if _is_wanted(v, everything, pattern)],
+    }
+
+
+def _trial(fmu: FMU) -> dict[str, Any] | None:
+    """What the first meeting has shown on this machine; None if there was none yet."""
+    verdict = known_verdict(fmu)
+    if verdict is None:
+        return None
+    return {
+        "deterministic": verdict.deterministic,
+        "resets": {str(method): str(grade) for method, grade in verdict.resets.items()},
+        "reset_method": str(verdict.reset_method) if verdict.resets else None,
+        "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
+        "isolate": verdict.isolate,
+        "deaths": list(verdict.reasons),
+    }
+
+
+def _missing_libraries(fmu: FMU) -> tuple[str, ...]:
+    try:
+        return fmu.missing_libraries
+    except FMULoadError:  # the obstacles tell why
+        return ()
+
+
+def _library_row(name: str) -> dict[str, str]:
+    return {"name": name, **source_of(name)._asdict()}
+
+
+_TEXTS: Final = (
+    "fmi_version",
+    "model_name",
+    "model_identifier",
+    "instantiation_token",
+    "description",
+    "generation_tool",
+)
+_TIMES: Final = ("start_time", "stop_time", "step_size", "tolerance")
+
+
+def _is_wanted(variable: Variable, everything: bool, pattern: str | None) -> bool:
+    if pattern is None:
+        return everything or variable.causality in SHOWN
+    expression = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
+    return re.fullmatch(expression, variable.name, re.DOTALL) is not None
+
+
+def _row(variable: Variable) -> dict[str, Any]:
+    return {
+        "name": variable.name,
+        "causality": variable.causality,
+        "variability": variable.variability,
+        "initial": variable.initial,
+        "type": variable.type,
+        "shape": list(variable.shape),
+        "unit": variable.unit,
+        "min": _finite(variable.minimum),
+        "max": _finite(variable.maximum),
+        "nominal": variable.nominal,
+        "start": start_value(variable),
+        "items": [{"name": name, "value": value} for name, value in variable.items],
+        "description": variable.description,
+        "settable_at_start": variable.settable_at_start,
+        "settable_in_step": variable.settable_in_step,
+    }
+
+
+def _finite(number: float) -> float | None:
+    """JSON has no infinities."""
+    return number if math.isfinite(number) else None
+
+
+def start_value(variable: Variable) -> bool | int | float | str | None:
+    """Convert the start value, which the XML has as text, to the variable's type.
+
+    Returns:
+        The value; the text itself for strings, arrays and what is not finite or malformed.
+    """
+    text = variable.start
+    if text is None or variable.shape or variable.kind in {"string", "binary", "clock"}:
+        return text
+    if variable.kind == "boolean":
+        return {"true": True, "1": True, "false": False, "0": False}.get(text.lower(), text)
+    try:
+        number = float(text) if variable.kind == "real" else int(text)
+        return number if math.isfinite(number) else text
+    except (ValueError, OverflowError):
+        return text
+
+
+def plain(text: object) -> str:
+    """Bring a text of a foreign file into one line of printable ASCII.
+
+    Other characters are escaped: an old console cannot show them, and a terminal may obey them.
+    """
+    line = printable(" ".join(str(text).split()))
+    return line.encode("ascii", "backslashreplace").decode()
+
+
+def as_text(facts: Mapping[str, Any]) -> str:
+    """Format an overview for a terminal.
+
+    Args:
+        facts: What ``overview`` returned.
+
+    Returns:
+        Lines of printable ASCII.
+    """
+    return "\n".join([*_heading(facts), *_findings(facts), *_tables(facts), *_not_listed(facts)])
+
+
+def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
+    yield plain(f"{facts['model_name']} (FMI {facts['fmi_version']})")
+    if facts["description"]:
+        yield plain(facts["description"])
+    rows = {
+        "file": facts["path"],
+        "generated by": facts["generation_tool"] or "not given",
+        "interfaces": ", ".join(facts["interfaces"]),
+        "platforms": ", ".join(facts["platforms"]) or "none",
+        "this machine": _this_machine(facts),
+        "first meeting": _first_meeting(facts["trial"]),
+        "default experiment": _experiment(facts),
+        "capabilities": _capabilities(facts["capabilities"]),
+    }
+    for name, value in rows.items():
+        yield f"  {name:<20}{plain(value)}"
+
+
+def _this_machine(facts: Mapping[str, Any]) -> str:
+    platform, tool = facts["platform"], facts["missing_tool"]
+    if not facts["runs_here"]:
+        return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
+    return f"{platform}: runs here" + (f" if it is installed: {tool}" if tool else "")
+
+
+def _first_meeting(trial: Mapping[str, Any] | None) -> str:
+    if trial is None:
+        return "not yet, or exempt"
+    grades = ", ".join(f"{method} is {_GRADES[g]}" for method, g in trial["resets"].items())
+    parts = [grades] if grades else []
+    if trial["reset_method"]:
+        parts.append(f"episodes begin by {trial['reset_method']!r}")
+    if not trial["deterministic"]:
+        parts.append("fresh instances differ")
+    if trial["several_instances"]:
+        parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
+    if trial["isolate"]:
+        parts.append("it harms its process and is isolated")
+    return "; ".join([*parts, *trial["deaths"]]) or "it survived"
+
+
+_GRADES: Final = {
+    "bitwise": "right to the last bit",
+    "tolerance": "right within the solver's tolerance",
+    "wrong": "wrong",
+    "fails": "failing",
+    "absent": "not offered",
+}
+_NEEDS: Final = {
+    "independent": "independent",
+    "one thread": "one thread for all",
+    "libraries": "a copy of the library each",
+    "processes": "a process each",
+}
+
+
+def _experiment(facts: Mapping[str, Any]) -> str:
+    times = dict(facts["default_experiment"])
+    if facts["fixed_internal_step_size"] is not None:
+        times["internal step"] = facts["fixed_internal_step_size"]
+    units = {"tolerance": ""}
+    return ", ".join(
+        f"{name.removesuffix('_time').removesuffix('_size')} "
+        + ("not given" if value is None else f"{value:g}{units.get(name, ' s')}")
+        for name, value in times.items()
+    )
+
+
+def _capabilities(flags: Mapping[str, bool]) -> str:
+    return ", ".join(name for name, flag in flags.items() if flag) or "none"
+
+
+def _findings(facts: Mapping[str, Any]) -> Iterator[str]:
+    if facts["findings"]:
+        yield f"\nFindings ({len(facts['findings'])})"
+    for finding in facts["findings"][:_MOST_FINDINGS]:
+        yield f"  - {plain(finding)}"
+    if len(facts["findings"]) > _MOST_FINDINGS:
+        yield "  - more are listed with --json"
+
+
+def _tables(facts: Mapping[str, Any]) -> Iterator[str]:
+    causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones last
+    for causality in dict.fromkeys(causalities):
+        rows = [v for v in facts["variables"] if v["causality"] == causality]
+        if rows:
+            yield f"\n{_HEADINGS.get(causality, plain(causality))} ({len(rows)})"
+            yield from _table([_COLUMNS, *map(_cells, rows)])
+
+
+def _not_listed(facts: Mapping[str, Any]) -> Iterator[str]:
+    listed = Counter(variable["causality"] for variable in facts["variables"])
+    left_out = Counter(facts["variable_counts"]) - listed
+    if left_out:
+        counts = ", ".join(f"{count} {plain(name)}" for name, count in left_out.items())
+        yield f"\nNot listed: {counts}"
+
+
+def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    shape = f"[{','.join(map(str, row['shape']))}]" if row["shape"] else ""
+    start = row["start"]
+    cells = (
+        row["name"],
+        row["type"] + shape,
+        row["unit"] or "-",
+        _range(row),
+        "-" if start is None else f"{start:.10g}" if isinstance(start, float) else start,
+        row["variability"],
+        row["description"],
+    )
+    return tuple(map(plain, cells))
+
+
+def _range(row: Mapping[str, Any]) -> str:
+    if row["items"]:
+        return " ".join(f"{item['value']}={item['name']}" for item in row["items"])
+    low, high = row["min"], row["max"]
+    if low is None and high is None:
+        return "-"
+    return f"{-math.inf if low is None else low:g} .. {math.inf if high is None else high:g}"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Align the columns; a cell wider than ``_WIDEST`` pushes the rest of its line."""
+    widths = [min(_WIDEST, max(map(len, column))) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True))
+        yield ("  " + "  ".join(cells)).rstrip()

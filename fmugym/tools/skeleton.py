@@ -1,0 +1,247 @@
+"""A first version of an environment for an FMU, written from its model description.
+
+The names and texts come from a foreign file. They enter the program only as literals and in
+comments of one line, so that none of them can become code.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Final
+
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.errors import ConfigError
+from fmugym.tools.overview import plain, start_value
+
+__all__ = ["Skeleton"]
+
+MOST_PARAMETERS: Final = 40
+"""More parameters than this are left out; ``fmugym info`` lists them."""
+
+MOST_LOCALS: Final = 8
+"""Locals that replace outputs where the FMU has none."""
+
+_PROGRAM: Final = '''\
+"""An environment for the FMU {file}. Decide what is marked with TODO.
+
+Running this file checks the environment.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+{import_}import fmugym
+from fmugym.testing import check_fmu_env
+
+FMU_PATH = {path}  # a relative path is relative to this file
+
+
+class {name}(fmugym.FMI{version}CSEnv):
+    """TODO: what is there to learn?"""
+
+    def __init__(self, log_level: int = logging.WARNING) -> None:
+        config = {{
+{config}
+        }}
+        super().__init__(FMU_PATH, config, log_level)
+{hooks}
+    def _is_done(self) -> Any:
+        """Whether the task has ended, by success or by failure."""
+        # TODO: for example  return abs(self.out[{first_output}]) > 1.0
+        return False
+
+    def _reward_policy(self) -> Any:
+        """The reward of this step."""
+        # TODO: by default positive_reward, and negative_reward in the step that ends the task
+        return super()._reward_policy()
+
+
+if __name__ == "__main__":
+    env = {name}()
+    check_fmu_env(env)
+    env.close()
+    print("{name} keeps the contract of an environment.")
+'''
+
+_IMPORT_WITHOUT_INPUT: Final = "from gymnasium import spaces\n\n"
+
+_HOOKS_WITHOUT_INPUT: Final = '''
+    def _get_action_space(self) -> spaces.Space[Any]:
+        """The FMU has no numeric input, so the only action is to wait."""
+        return spaces.Discrete(1)  # TODO: or name a tunable parameter as an input
+
+    def _get_inputs(self) -> Any:
+        return ()
+'''
+
+
+class Skeleton:
+    """The Python file for one FMU, with notes on what in it is a guess.
+
+    Args:
+        fmu: The FMU; nothing of it is executed.
+
+    Raises:
+        ConfigError: If the FMU has no numeric variable to observe.
+    """
+
+    def __init__(self, fmu: FMU) -> None:
+        self._fmu = fmu
+        self._description = fmu.description
+        if not self.outputs:
+            raise ConfigError(
+                f"{fmu.path.name} has no scalar Real, Integer, Boolean or Enumeration to observe"
+            )
+
+    @cached_property
+    def inputs(self) -> list[Variable]:
+        """The numeric inputs."""
+        return [v for v in self._of("input") if v.numeric]
+
+    @cached_property
+    def outputs(self) -> list[Variable]:
+        """The numeric outputs, or some locals if there are none."""
+        outputs = [v for v in self._of("output") if v.numeric]
+        return outputs or [v for v in self._of("local") if v.numeric][:MOST_LOCALS]
+
+    @cached_property
+    def parameters(self) -> list[Variable]:
+        """The parameters that can be set and have a start value, at most ``MOST_PARAMETERS``."""
+        return self._settable_parameters[:MOST_PARAMETERS]
+
+    @cached_property
+    def _settable_parameters(self) -> list[Variable]:
+        return [v for v in self._of("parameter") if v.settable_at_start and _literal(v)]
+
+    def _of(self, causality: str) -> list[Variable]:
+        return [v for v in self._description.variables.values() if v.causality == causality]
+
+    @property
+    def class_name(self) -> str:
+        """A name for the class, made of the last part of the model's name."""
+        words = re.findall(r"[A-Za-z0-9]+", self._description.model_name.split(".")[-1])
+        name = "".join(word[0].upper() + word[1:] for word in words)
+        return ("Model" if not name or name[0].isdigit() else "") + name + "Env"
+
+    def notes(self) -> Iterator[str]:
+        """What the user has to decide before the file is useful."""
+        for variable in filter(_needs_bounds, self.inputs):
+            yield f"the FMU gives no limits of input {variable.name!r}; set them in 'bounds'"
+        if not self.inputs:
+            yield "the FMU has no numeric input"
+        if not self._of("output"):
+            yield "the FMU has no outputs; locals replace them"
+        if self._description.step_size is None:
+            yield "the FMU gives no step size; set 'time_step'"
+        for obstacle in self._fmu.obstacles:
+            yield f"the FMU does not run on this machine: {obstacle}"
+
+    def text(self) -> str:
+        """The Python file, ASCII."""
+        return _PROGRAM.format(
+            file=re.sub(r'["\\]', "_", plain(self._fmu.path.name)),
+            import_="" if self.inputs else _IMPORT_WITHOUT_INPUT,
+            path=_quoted(self._fmu.path.as_posix()),
+            name=self.class_name,
+            version=self._description.fmi_major_version,
+            config=textwrap.indent("\n".join(self._config()), " " * 12),
+            hooks="" if self.inputs else _HOOKS_WITHOUT_INPUT,
+            first_output=_quoted(self.outputs[0].name),
+        )
+
+    def _config(self) -> Iterator[str]:
+        yield from _listing("model_input_names", [_name_line(v) for v in self.inputs])
+        yield from self._bounds()
+        yield from _listing("model_output_names", [_name_line(v) for v in self.outputs])
+        yield "# A value may be a distribution, drawn at each reset: fmugym.Uniform(low, high), ..."
+        yield from _listing("model_parameters", list(self._parameter_lines()), "{}")
+        yield from self._times()
+
+    def _bounds(self) -> Iterator[str]:
+        unbounded = [v for v in self.inputs if _needs_bounds(v)]
+        if unbounded:
+            yield "# TODO: the FMU gives no limits of these; (low, high)."
+            yield from _listing("bounds", [_bounds_line(v) for v in unbounded], "{}")
+
+    def _parameter_lines(self) -> Iterator[str]:
+        for variable in self.parameters:
+            yield f"{_quoted(variable.name)}: {_literal(variable)},{_comment(variable)}"
+        left_out = len(self._of("parameter")) - len(self.parameters)
+        if left_out:
+            yield f"# {left_out} more are listed by: fmugym info"
+
+    def _times(self) -> Iterator[str]:
+        step = self._description.step_size
+        if step is None:
+            step = self._description.fixed_internal_step_size or 0.01
+            yield f'"time_step": {step!r},  # s; TODO: the FMU gives none'
+        else:
+            yield f'"time_step": {step!r},  # s, the default of the FMU'
+        yield f'"max_episode_steps": {self._episode_steps(step)},'
+
+    def _episode_steps(self, step: float) -> int:
+        """The steps of the FMU's default experiment, or 200 if it has none of sensible length."""
+        stop = self._description.stop_time
+        steps = 0.0 if stop is None else (stop - self._description.start_time) / step
+        return round(steps) if 1 <= steps <= 100_000 else 200
+
+
+def _listing(key: str, lines: list[str], brackets: str = "[]") -> Iterator[str]:
+    if not lines:
+        yield f'"{key}": {brackets},'
+        return
+    yield f'"{key}": {brackets[0]}'
+    yield from (f"    {line}" for line in lines)
+    yield f"{brackets[1]},"
+
+
+def _name_line(variable: Variable) -> str:
+    return f"{_quoted(variable.name)},{_comment(variable)}"
+
+
+def _needs_bounds(variable: Variable) -> bool:
+    limits = variable.minimum, variable.maximum
+    return variable.kind in {"real", "integer"} and not all(map(math.isfinite, limits))
+
+
+def _bounds_line(variable: Variable) -> str:
+    """Guess missing limits from the nominal value, which tells the scale of the variable."""
+    low, high = variable.minimum, variable.maximum
+    reach = abs(variable.nominal or 1.0)
+    if not math.isfinite(low):
+        low = -reach if not math.isfinite(high) else min(high - reach, -reach)
+    if not math.isfinite(high):
+        high = max(low + reach, reach)
+    return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # TODO"
+
+
+def _literal(variable: Variable) -> str:
+    """The start value as the config takes it; empty if the config takes none."""
+    value = start_value(variable)
+    if variable.kind == "string" and not variable.shape and isinstance(value, str):
+        return _quoted(value)
+    if not variable.numeric or value is None or isinstance(value, str):
+        return ""  # a text is malformed or not finite here
+    names = [name for name, number in variable.items if number == value]
+    if variable.items:
+        return _quoted(names[0]) if names else ""
+    return repr(value)
+
+
+def _quoted(text: str) -> str:
+    """A literal in ASCII, in double quotes where they need no escape."""
+    literal = ascii(text)
+    return literal if '"' in literal else f'"{literal[1:-1]}"'
+
+
+def _comment(variable: Variable) -> str:
+    unit = f"[{variable.unit}] " if variable.unit else ""
+    text = textwrap.shorten(plain(unit + variable.description), 60, placeholder=" ...")
+    return f"  # {text}" if text else ""

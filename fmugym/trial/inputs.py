@@ -1,0 +1,89 @@
+"""Inputs for trials: within their limits, moving, and different for each instance."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from fmugym.archive.description import Variable
+from fmugym.pool.base import FloatArray
+from fmugym.pool.spec import PoolSpec
+
+__all__ = ["moving_inputs", "neighbour_inputs", "start_inputs"]
+
+_UNBOUNDED: Final = 1.0
+"""How far a Real without limits moves to each side, in its own unit."""
+
+
+def start_inputs(spec: PoolSpec) -> FloatArray:
+    """Start values of the inputs, moved into their limits, shape (inputs,)."""
+    return np.array([_start(*pair) for pair in _with_limits(spec)], np.float64)
+
+
+def neighbour_inputs(spec: PoolSpec) -> FloatArray:
+    """Inputs for an instance that may disturb another: the other end of each range."""
+    return np.array([_other(*pair) for pair in _with_limits(spec)], np.float64)
+
+
+def moving_inputs(spec: PoolSpec, steps: int, amplitude: float, phase: float = 0.0) -> FloatArray:
+    """Inputs that move from step to step, each at a pace of its own.
+
+    Args:
+        spec: Names the inputs.
+        steps: How many.
+        amplitude: How far they move, as a part of the range on each side of the start value.
+        phase: Makes the inputs of one instance differ from those of another, in steps.
+
+    Returns:
+        Shape (steps, inputs).
+    """
+    rows = np.empty((steps, len(spec.inputs)))
+    for index, (variable, limits) in enumerate(_with_limits(spec)):
+        pace = 0.7 + 0.31 * index
+        swing = amplitude * np.sin(pace * (np.arange(steps) + 1.0 + phase))
+        rows[:, index] = _moved(variable, limits, swing)
+    return rows
+
+
+_Limits = tuple[float, float]
+
+
+def _with_limits(spec: PoolSpec) -> list[tuple[Variable, _Limits]]:
+    limits = spec.input_limits or [(v.minimum, v.maximum) for v in spec.inputs]
+    return list(zip(spec.inputs, limits, strict=True))
+
+
+def _start(variable: Variable, limits: _Limits) -> float:
+    low, high = limits
+    start = variable.start_number
+    return min(max(start, low), high) if low <= high else start
+
+
+def _moved(variable: Variable, limits: _Limits, swing: FloatArray) -> FloatArray:
+    """Values around the start: up to the upper limit, down to the lower one."""
+    start = _start(variable, limits)
+    if variable.kind == "boolean":
+        return np.where(swing > 0.3, 1.0 - start, start)
+    if variable.items:
+        values = np.array(sorted(value for _, value in variable.items), np.float64)
+        other = values[(np.arange(len(swing)) % len(values))]
+        return np.where(swing > 0.3, other, start)
+    room = _UNBOUNDED if variable.kind == "real" else 1.0
+    up = limits[1] - start if math.isfinite(limits[1]) else room
+    down = start - limits[0] if math.isfinite(limits[0]) else room
+    values = start + np.where(swing > 0.0, swing * up, swing * down)
+    return np.rint(values) if variable.kind == "integer" else values
+
+
+def _other(variable: Variable, limits: _Limits) -> float:
+    start = _start(variable, limits)
+    if variable.kind == "boolean":
+        return 1.0 - start
+    if variable.items:
+        return float(next((v for _, v in variable.items if v != start), start))
+    for bound in (limits[1], limits[0]):
+        if math.isfinite(bound) and bound != start:
+            return bound if variable.kind == "real" else float(math.trunc(bound))
+    return start + 1.0

@@ -1,0 +1,229 @@
+"""Which pool an FMU gets: decided by what the caller asks for and what the first meeting shows."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fmugym.archive.bundled import is_bundled
+from fmugym.archive.fmu import FMU
+from fmugym.errors import ConfigError, FMULoadError, SimulationError, unknown_name
+from fmugym.pool.backend.pool import BackendPool
+from fmugym.pool.base import Pool
+from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
+from fmugym.pool.local import local_pool
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
+from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.rehearsal import Starts
+from fmugym.trial.trial import Candidate, examine
+from fmugym.trial.verdict import Grade, Neighbours, Verdict
+
+__all__ = ["make_pool"]
+
+_NAMES = ("auto", "fmu", "native", "python")
+
+
+def make_pool(
+    fmu: FMU,
+    spec: PoolSpec,
+    num_instances: int,
+    log: logging.Logger,
+    backend: Any = "auto",
+    *,
+    starts: Starts | None = None,
+    reset_method: str | None = None,
+    threads: int | None = None,
+    private_libraries: bool | None = None,
+    isolation: str | None = None,
+    workers: int | None = None,
+    call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
+) -> Pool:
+    """Make the fastest pool that gives right values.
+
+    Args:
+        fmu: The FMU; closed with the pool.
+        spec: What to do at each reset and step.
+        num_instances: N.
+        log: The logger that gets the FMU's messages.
+        backend: ``"native"``, ``"python"``, or ``"auto"`` (also ``"fmu"``): native where the
+            extension was built. Or what stands in for the FMU; see ``BackendPool``.
+        starts: Start values of two episodes, for the trial of resets.
+        reset_method: One of ``ResetMethod``; by default the fastest one that the trial has found
+            to be right.
+        threads: See ``NativePool``; the Python pool has one thread. By default one where instances
+            disturb each other at the same time.
+        private_libraries: See ``NativePool``; by default where the FMU says that it can be
+            instantiated only once per process, or where two instances are found to disturb each
+            other. The Python pool has one library.
+        isolation: ``"process"`` for worker processes, ``"none"`` for this one. By default this one,
+            unless instances disturb each other and private libraries do not help.
+        workers: See ``ProcessPool``; by default one for each instance where they disturb each
+            other.
+        call_timeout: See ``ProcessPool``; nothing limits a call in this process.
+
+    Raises:
+        ConfigError: If the backend, the isolation or the reset method is unknown.
+        FMULoadError: If the FMU cannot be loaded or instantiated, or the backend is not there.
+    """
+    if not isinstance(backend, str):
+        if spec.fault_retries:
+            fmu.close()
+            raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
+        return BackendPool(fmu, spec, num_instances, backend)
+    native = _is_native(backend)
+    if isolation not in (None, *ISOLATIONS):
+        raise unknown_name("isolation", isolation, ISOLATIONS)
+    if reset_method not in (None, *ResetMethod):
+        raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
+    plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
+    plan = plan.completed(fmu, _verdict(fmu, spec, starts, num_instances, plan), num_instances, log)
+    spec = replace(spec, reset_method=plan.method)
+    if plan.isolation == "process":
+        return ProcessPool(
+            fmu,
+            spec,
+            num_instances,
+            log,
+            native=native,
+            workers=plan.workers,
+            threads=plan.threads,
+            call_timeout=call_timeout,
+        )
+    return local_pool(
+        fmu,
+        spec,
+        num_instances,
+        log,
+        native=native,
+        threads=plan.threads,
+        private_libraries=plan.private_libraries,
+    )
+
+
+def _is_native(backend: str) -> bool:
+    if backend not in _NAMES:
+        raise unknown_name("backend", backend, _NAMES)
+    if backend == "native" and not has_native_pool():
+        raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
+    if backend in ("auto", "fmu") and not has_native_pool():
+        warn_of_slow_path()
+    return backend != "python" and has_native_pool()
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How to open a pool: first what the caller demands, then completed by what a trial shows."""
+
+    native: bool
+    reset_method: str | None = None
+    threads: int | None = None
+    private_libraries: bool | None = None
+    isolation: str | None = None
+    workers: int | None = None
+
+    @property
+    def method(self) -> ResetMethod:
+        """How episodes begin."""
+        return ResetMethod(self.reset_method or ResetMethod.RESET)
+
+    @property
+    def has_own_workers(self) -> bool:
+        """Whether the caller has settled which instances share a process."""
+        return self.isolation == "process" and self.workers is not None
+
+    def completed(
+        self, fmu: FMU, verdict: Verdict, num_instances: int, log: logging.Logger
+    ) -> _Plan:
+        """Settle what the caller has left open, and tell in the log what is not as usual."""
+        plan = self
+        if plan.reset_method is None:
+            plan = replace(plan, reset_method=verdict.reset_method)
+            _tell_of_resets(fmu, verdict, log)
+        if plan.private_libraries is None and num_instances > 1 and not plan.has_own_workers:
+            plan = plan._apart(
+                fmu, verdict.neighbours or Neighbours.INDEPENDENT, num_instances, log
+            )
+        if verdict.isolate and plan.isolation is None:
+            log.warning("%s harms its process: it runs in worker processes", fmu.path.name)
+            plan = replace(plan, isolation="process")
+        return plan._with_means_of_reset(num_instances)
+
+    def _apart(
+        self, fmu: FMU, neighbours: Neighbours, num_instances: int, log: logging.Logger
+    ) -> _Plan:
+        if neighbours is Neighbours.INDEPENDENT:
+            return self
+        plan, what = replace(self, threads=1), "all are stepped by one thread"
+        in_process = self.isolation == "none"
+        if neighbours is Neighbours.LIBRARIES and (in_process or self._can_copy_libraries):
+            plan, what = replace(self, private_libraries=True), "each gets a copy of the library"
+        elif neighbours is Neighbours.PROCESSES and in_process:
+            plan, what = self, "isolation='none' keeps them in one process all the same"
+        elif neighbours is not Neighbours.ONE_THREAD:
+            workers = self.workers or num_instances
+            plan, what = replace(self, isolation="process", workers=workers), "each gets a process"
+        log.warning("the instances of %s disturb each other: %s", fmu.path.name, what)
+        return plan
+
+    @property
+    def _can_copy_libraries(self) -> bool:
+        return self.native and self.isolation is None
+
+    def _with_means_of_reset(self, num_instances: int) -> _Plan:
+        """New libraries need private ones of the native pool, new processes one each."""
+        method = self.method
+        if method is ResetMethod.LIBRARY and (self.isolation == "process" or not self.native):
+            method = ResetMethod.PROCESS
+        if method is ResetMethod.LIBRARY:
+            return replace(self, private_libraries=True)
+        if method is ResetMethod.PROCESS:
+            return replace(self, reset_method=method, isolation="process", workers=num_instances)
+        return replace(self, reset_method=method)
+
+
+def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
+    """Say which reset methods the FMU promises and cannot keep."""
+    wrong = [m for m, g in verdict.resets.items() if g in (Grade.WRONG, Grade.FAILS)]
+    if not verdict.deterministic:
+        log.warning("%s gives other outputs each time, even if it begins afresh", fmu.path.name)
+    if ResetMethod.RESET in wrong:
+        log.warning(
+            "%s does not begin anew when it is reset; episodes begin by the method %r instead",
+            fmu.path.name,
+            str(verdict.reset_method),
+        )
+    elif verdict.resets:
+        log.info("%s: episodes begin by the method %r", fmu.path.name, str(verdict.reset_method))
+
+
+def _verdict(
+    fmu: FMU, spec: PoolSpec, starts: Starts | None, num_instances: int, plan: _Plan
+) -> Verdict:
+    """What is known of an FMU: from a trial, or from here where trials are turned off."""
+    candidate = Candidate.of(fmu)
+    spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
+    if is_bundled(fmu.path):
+        return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
+    several = num_instances > 1 and plan.private_libraries is None and not plan.has_own_workers
+    once = fmu.description.capabilities.can_be_instantiated_only_once_per_process
+    isolated = plan.isolation == "process"
+    if not candidate.exempt:
+        return examine(
+            candidate, spec, starts, several=several, alone=once, must_survive=not isolated
+        )
+    if several and (once or isolated or _disturb_here(candidate, spec)):
+        verdict = examine(
+            candidate, spec, several=True, alone=not isolated or once, must_survive=False
+        )
+        return Verdict(neighbours=verdict.neighbours or Neighbours.PROCESSES)
+    return Verdict()
+
+
+def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:
+    """Compare two instances in this process, where the FMU will run untried anyway."""
+    try:
+        return disturb_in_turn(candidate, spec)
+    except SimulationError:  # it fails alone too, without the values that the caller will set
+        return False

@@ -1,0 +1,219 @@
+"""Whether an FMU begins each episode as a fresh instance does: found out by trying.
+
+The reference is a fresh instance of a fresh copy of the FMU's library. One instance then plays
+several episodes, each begun by the reset method in question, and each is compared with the
+reference: after a short and after a long episode, twice, and with start values that differ. The
+inputs move, since a reset that forgets something often shows only then.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from fmugym.archive.description import Variable
+from fmugym.errors import FMUGymError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.local import local_pool
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.inputs import moving_inputs
+from fmugym.trial.trial import Candidate
+from fmugym.trial.verdict import Grade
+
+__all__ = ["Rehearsal", "Starts"]
+
+_SHORT: Final = 3
+"""Steps of a short episode."""
+
+_LONGEST: Final = 400
+"""Steps of a long episode, at most."""
+
+_LONG_SECONDS: Final = 0.1
+"""Real time after which a long episode of a slow FMU ends."""
+
+_AMPLITUDES: Final = (1.0, 0.1, 0.0)
+"""How far inputs move, as a part of their range: less where the FMU fails."""
+
+_RELATIVE_TOLERANCE: Final = 1e-4
+"""Of solvers, where neither the config nor the FMU names one."""
+
+_SLACK: Final = 10.0
+"""How many tolerances two runs of a solver may differ by."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Start values of two episodes that differ.
+
+    Attributes:
+        variables: The variables set before initialization, P of them.
+        values: Their values, shape (P, 2).
+    """
+
+    variables: tuple[Variable, ...] = ()
+    values: tuple[tuple[float, float], ...] = ()
+
+    def column(self, index: int) -> FloatArray:
+        """The values of one episode, shape (P, 1)."""
+        return np.array(self.values, np.float64).reshape(-1, 2)[:, index : index + 1]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One episode: a row of outputs for its start and for each step, and how it ended."""
+
+    rows: FloatArray
+    status: int
+    failure: str = ""
+
+    def cut(self, steps: int) -> _Run:
+        """The episode as it is if it is stopped after some steps."""
+        if steps + 1 > len(self.rows):
+            return self
+        return _Run(self.rows[: steps + 1], Status.OK)
+
+
+class Rehearsal:
+    """Plays episodes of one FMU with different reset methods.
+
+    Args:
+        candidate: The FMU.
+        spec: What to do at each reset and step.
+        starts: The start values of two episodes.
+
+    Attributes:
+        deterministic: Whether two fresh instances give the same outputs.
+        reason: What the FMU said where not even a fresh instance can play an episode, or "".
+    """
+
+    def __init__(self, candidate: Candidate, spec: PoolSpec, starts: Starts) -> None:
+        self._candidate, self._starts = candidate, starts
+        self._spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
+        self.deterministic, self.reason = True, ""
+        self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
+        self._references: list[_Run] = []
+        self._tolerance = _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)
+        self._find_reference()
+
+    @property
+    def possible(self) -> bool:
+        """Whether a fresh instance can play an episode, so that there is a reference."""
+        return bool(self._references)
+
+    def _find_reference(self) -> None:
+        """Play the reference with inputs that move as far as the FMU bears."""
+        for amplitude in _AMPLITUDES:
+            self._inputs = moving_inputs(self._spec, _LONGEST, amplitude)
+            self._steps = _LONGEST
+            first = self._play_fresh(0, measured=True)
+            if first.status in (Status.OK, Status.WARNING, Status.TERMINATED):
+                self._references = [first, self._play_fresh(1)]
+                self._compare_fresh_instances()
+                return
+            self.reason = first.failure
+
+    def _compare_fresh_instances(self) -> None:
+        again = self._play_fresh(0)
+        if not _same(again, self._references[0]):
+            self.deterministic = False
+            difference = _difference(again, self._references[0])
+            self._tolerance = max(self._tolerance, _SLACK * difference)
+
+    def _play_fresh(self, start: int, *, measured: bool = False) -> _Run:
+        pool = self._open(ResetMethod.RESET)
+        try:
+            return self._play(pool, start, self._steps, measured=measured)
+        finally:
+            pool.close()
+
+    def _open(self, method: ResetMethod) -> Pool:
+        log = logging.getLogger(__name__)
+        return local_pool(
+            self._candidate.open(),
+            replace(self._spec, reset_method=method),
+            1,
+            log,
+            threads=1,
+            private_libraries=method is ResetMethod.LIBRARY,
+        )
+
+    def _play(self, pool: Pool, start: int, steps: int, *, measured: bool = False) -> _Run:
+        """Play one episode; a measured one settles how many steps a long episode has."""
+        deadline = time.perf_counter() + _LONG_SECONDS
+        outputs, statuses = pool.reset(self._starts.variables, self._starts.column(start))
+        rows = [outputs[:, 0].copy()]
+        for row in self._inputs[:steps]:
+            if statuses[0] > Status.WARNING:
+                break
+            outputs, statuses = pool.step(row[:, None])
+            rows.append(outputs[:, 0].copy())
+            if measured and time.perf_counter() > deadline:
+                self._steps = len(rows) - 1
+                break
+        status = int(statuses[0])
+        return _Run(np.array(rows), status, pool.failure(0) if status > Status.WARNING else "")
+
+    def grade(self, method: ResetMethod) -> Grade:
+        """Play several episodes with one instance and compare each with a fresh one.
+
+        Args:
+            method: How the episodes begin.
+
+        Returns:
+            The worst grade of all episodes.
+        """
+        try:
+            pool = self._open(method)
+        except FMUGymError:
+            return Grade.FAILS
+        try:
+            return self._worst_grade(pool)
+        finally:
+            pool.close()
+
+    def _worst_grade(self, pool: Pool) -> Grade:
+        worst = Grade.BITWISE
+        for start, steps in self._episodes():
+            run = self._play(pool, start, steps)
+            grade = self._compare(run, self._references[start].cut(steps))
+            if grade in (Grade.WRONG, Grade.FAILS):
+                return grade
+            worst = Grade.TOLERANCE if Grade.TOLERANCE in (grade, worst) else worst
+        return worst
+
+    def _episodes(self) -> Sequence[tuple[int, int]]:
+        """Which start values and how many steps: each follows a short and a long one."""
+        short, long = min(_SHORT, self._steps), self._steps
+        return ((0, short), (0, long), (0, long), (1, short), (0, short), (0, long), (1, long))
+
+    def _compare(self, run: _Run, reference: _Run) -> Grade:
+        if run.status > Status.WARNING and run.status != reference.status:
+            return Grade.FAILS
+        if _same(run, reference):
+            return Grade.BITWISE
+        close = len(run.rows) == len(reference.rows) and run.status == reference.status
+        if close and _difference(run, reference) <= self._tolerance:
+            return Grade.TOLERANCE
+        return Grade.WRONG
+
+
+def _same(one: _Run, other: _Run) -> bool:
+    return one.rows.tobytes() == other.rows.tobytes() and one.status == other.status
+
+
+def _difference(one: _Run, other: _Run) -> float:
+    """The largest difference of an output, as a part of its largest size."""
+    length = min(len(one.rows), len(other.rows))
+    a, b = one.rows[:length], other.rows[:length]
+    if a.size == 0:
+        return 0.0
+    scale = np.maximum(np.abs(a).max(axis=0), np.abs(b).max(axis=0))
+    with np.errstate(all="ignore"):
+        relative = np.abs(a - b).max(axis=0) / np.where(scale == 0.0, 1.0, scale)
+    return float(np.nan_to_num(relative, nan=np.inf).max())

@@ -1,0 +1,112 @@
+"""What the first meeting with an FMU has shown, as a value and as the text that is cached."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final
+
+from fmugym.pool.spec import ResetMethod
+
+__all__ = ["Grade", "Neighbours", "Verdict"]
+
+_FORMAT: Final = 1
+
+
+class Grade(StrEnum):
+    """How an episode after a reset compares with the same episode of a fresh instance."""
+
+    BITWISE = "bitwise"
+    """All outputs are equal to the last bit."""
+    TOLERANCE = "tolerance"
+    """The outputs differ by no more than a solver's tolerance."""
+    WRONG = "wrong"
+    """The outputs differ, or an episode ends that should go on."""
+    FAILS = "fails"
+    """The FMU returned an error or ended its process."""
+    ABSENT = "absent"
+    """The FMU does not offer it."""
+
+
+class Neighbours(StrEnum):
+    """What several instances need so as not to disturb each other."""
+
+    INDEPENDENT = "independent"
+    ONE_THREAD = "one thread"
+    """They are right in turn, but not at the same time."""
+    LIBRARIES = "libraries"
+    """Each needs a copy of the shared library."""
+    PROCESSES = "processes"
+    """Each needs a process."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The result of a trial.
+
+    Attributes:
+        complete: Whether an instance could be made, initialized and stepped.
+        deterministic: Whether two fresh instances give the same outputs.
+        resets: The grade of each reset method that was tried.
+        neighbours: What several instances need; None if only one was tried.
+        isolate: Whether one instance alone has harmed its process.
+        reasons: What was seen, one sentence each, for the log and ``fmugym info``.
+    """
+
+    complete: bool = False
+    deterministic: bool = True
+    resets: Mapping[ResetMethod, Grade] = field(default_factory=dict)
+    neighbours: Neighbours | None = None
+    isolate: bool = False
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def reset_method(self) -> ResetMethod:
+        """The first method of the best grade; a reset function if nothing was tried."""
+        for wanted in (Grade.BITWISE, Grade.TOLERANCE):
+            for method in ResetMethod:
+                if self.resets.get(method) is wanted:
+                    return method
+        return ResetMethod.PROCESS if self.resets else ResetMethod.RESET
+
+    def to_text(self) -> str:
+        """Write the verdict as JSON."""
+        return json.dumps(
+            {
+                "format": _FORMAT,
+                "complete": self.complete,
+                "deterministic": self.deterministic,
+                "resets": {str(method): str(grade) for method, grade in self.resets.items()},
+                "neighbours": None if self.neighbours is None else str(self.neighbours),
+                "isolate": self.isolate,
+                "reasons": list(self.reasons),
+            }
+        )
+
+    @classmethod
+    def from_text(cls, text: str | None) -> Verdict | None:
+        """Read a verdict; None for anything that ``to_text`` would not write."""
+        try:
+            return cls._from_data(json.loads(text or ""))
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            return None
+
+    @classmethod
+    def _from_data(cls, data: dict[str, Any]) -> Verdict | None:
+        flags = data["complete"], data["deterministic"], data["isolate"]
+        reasons = data["reasons"]
+        if data["format"] != _FORMAT or not all(isinstance(flag, bool) for flag in flags):
+            return None
+        if not isinstance(reasons, list) or not all(isinstance(one, str) for one in reasons):
+            return None
+        given = data["neighbours"]
+        return cls(
+            complete=flags[0],
+            deterministic=flags[1],
+            resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
+            neighbours=None if given is None else Neighbours(given),
+            isolate=flags[2],
+            reasons=tuple(reasons),
+        )

@@ -1,0 +1,204 @@
+"""The process in which an FMU is tried for the first time; see ``fmugym.trial.trial``.
+
+It talks through files in a folder of its own, which no output of the FMU can disturb: it reads
+``request``, and writes ``stage`` before each step and ``answer`` as far as it has one. What the FMU
+says goes to standard error at once, since the next call may be the last.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import json
+import logging
+import os
+import pickle
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
+from fmugym.errors import FMUGymError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import Pool
+from fmugym.pool.extension import has_native_pool
+from fmugym.pool.local import local_pool
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.inputs import start_inputs
+from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
+from fmugym.trial.rehearsal import Rehearsal, Starts
+from fmugym.trial.trial import Candidate, Request, Stage
+from fmugym.trial.verdict import Grade, Neighbours
+
+_NO_DIALOGUES: Final = 0x0003
+"""``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: a fault on Windows asks nobody."""
+
+_LINE_BUFFERED: Final = 1
+"""``_IOLBF`` of glibc, musl and macOS."""
+
+
+class Notes:
+    """What the parent can read at any time, also after the process has died.
+
+    Args:
+        folder: Gets the files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._answer: dict[str, Any] = {}
+
+    def stage(self, stage: str) -> None:
+        """Tell what is about to be done."""
+        (self._folder / "stage").write_text(stage)
+
+    def answer(self, **values: Any) -> None:
+        """Add to the answer; the file is replaced in one go."""
+        self._answer |= values
+        path = self._folder / "answer.new"
+        path.write_text(json.dumps(self._answer))
+        path.replace(self._folder / "answer")
+
+
+def main(folder: Path) -> None:
+    """Try an FMU.
+
+    Args:
+        folder: Has the request; gets the stage and the answer.
+    """
+    request: Request = pickle.loads((folder / "request").read_bytes())
+    _prepare(request.candidate.timeout or DEFAULT_PROBE_TIMEOUT)
+    notes = Notes(folder)
+    complete = _try_alone(request.candidate, notes)
+    notes.answer(complete=complete)
+    if complete and request.spec is not None:
+        _try_resets(request, notes)
+        if request.several:
+            _try_several(request, notes)
+    notes.answer(finished=True)
+
+
+def _prepare(timeout: float) -> None:
+    """Outlive neither the time-out nor, for long, a killed parent; leave no core dump."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    faulthandler.dump_traceback_later(timeout, exit=True, file=nowhere)
+    if sys.platform == "win32":
+        ctypes.windll.kernel32.SetErrorMode(_NO_DIALOGUES)
+    else:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        _print_line_by_line()
+
+
+def _print_line_by_line() -> None:
+    """What C prints to a pipe would be held back until much came together, and lost at a crash."""
+    library = ctypes.CDLL(None)
+    name = "__stdoutp" if sys.platform == "darwin" else "stdout"
+    stream = ctypes.c_void_p.in_dll(library, name)
+    library.setvbuf(stream, None, _LINE_BUFFERED, ctypes.c_size_t(0))
+
+
+def _try_alone(candidate: Candidate, notes: Notes) -> bool:
+    """Try one instance; returns whether more of the FMU would be seen another time.
+
+    In Python first: there messages come while the FMU runs. FMPy wants every function of the
+    standard to be there, the native pool does not.
+    """
+    for native in (False, True) if has_native_pool() else (False,):
+        try:
+            _step_once(candidate, native, notes)
+            return True
+        except FMUGymError:  # it is alive, and the caller will hear of it as well
+            continue
+    return False
+
+
+def _step_once(candidate: Candidate, native: bool, notes: Notes) -> None:
+    fmu = candidate.open()
+    spec = default_spec(fmu)
+    notes.stage("loading and instantiation")
+    pool = local_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native, threads=1)
+    try:
+        _reset_and_step(pool, spec, notes)
+    finally:
+        notes.stage("closing")
+        pool.close()
+
+
+def _reset_and_step(pool: Pool, spec: PoolSpec, notes: Notes) -> None:
+    notes.stage("initialization")
+    _, statuses = pool.reset((), np.zeros((0, 1)))
+    if statuses[0] <= Status.WARNING:  # otherwise it may need the values that the caller will set
+        notes.stage("the first step")
+        pool.step(start_inputs(spec)[:, None])
+
+
+def _try_resets(request: Request, notes: Notes) -> None:
+    """Grade the reset methods, from the fastest on, until one is right to the last bit."""
+    notes.stage(Stage.REFERENCE)
+    if Stage.REFERENCE in request.skip:
+        return
+    rehearsal = Rehearsal(request.candidate, request.spec, request.starts or Starts())
+    if not rehearsal.possible:
+        return
+    notes.answer(deterministic=rehearsal.deterministic)
+    grades: dict[str, str] = {}
+    for method in _methods(request):
+        stage = Stage.of(method)
+        notes.stage(stage)
+        skipped = stage in request.skip
+        grades[method] = Grade.FAILS if skipped else rehearsal.grade(method)
+        notes.answer(resets=grades)
+        if grades[method] == Grade.BITWISE:
+            break
+
+
+def _methods(request: Request) -> list[ResetMethod]:
+    """What can be tried in this process: libraries are loaded anew by the native pool only."""
+    able = request.candidate.open().description.capabilities.can_get_and_set_fmu_state
+    methods = [ResetMethod.RESTORE] if able else []
+    methods += [ResetMethod.RESET, ResetMethod.INSTANCE]
+    return [*methods, ResetMethod.LIBRARY] if has_native_pool() else methods
+
+
+def _try_several(request: Request, notes: Notes) -> None:
+    notes.answer(neighbours=_need_of_several(request, notes))
+
+
+def _need_of_several(request: Request, notes: Notes) -> Neighbours:
+    """Find the least that keeps instances from disturbing each other."""
+    if request.alone or _disturbed(request, notes, private_libraries=False):
+        copies = has_native_pool() and not _disturbed(request, notes, private_libraries=True)
+        return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
+    notes.stage(Stage.THREADS)
+    try:
+        if Stage.THREADS in request.skip or disturb_in_threads(request.candidate, request.spec):
+            return Neighbours.ONE_THREAD
+    except FMUGymError:  # FMPy cannot load it, or it fails without the values of the caller
+        pass
+    return Neighbours.INDEPENDENT
+
+
+def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bool:
+    stage = Stage.COPIES if private_libraries else Stage.SECOND
+    notes.stage(stage)
+    if stage in request.skip:
+        return True
+    try:
+        return disturb_in_turn(request.candidate, request.spec, private_libraries=private_libraries)
+    except FMUGymError:  # it fails alone too, without the values that the caller will set
+        return False
+
+
+class _Echo(logging.Logger):
+    """Writes every message down at once, also those that its level would drop."""
+
+    def log(self, level: int, msg: object, *args: object, **_: Any) -> None:
+        os.write(2, f"{str(msg) % args}\n".encode(errors="replace"))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

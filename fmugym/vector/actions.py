@@ -1,0 +1,79 @@
+"""Checks of the actions that ``step`` of a vector environment is given."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.errors import ConfigError, shown
+
+__all__ = ["checked_actions", "is_array_space"]
+
+_ARRAY_SPACES: Final = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
+
+
+def is_array_space(space: spaces.Space[Any]) -> bool:
+    """Whether elements of N environments make one array."""
+    return isinstance(space, _ARRAY_SPACES)
+
+
+def checked_actions(space: Any, num_envs: int, actions: Any) -> npt.NDArray[Any]:
+    """Copy the actions of N environments.
+
+    All of them are checked, also those of environments that are about to be reset: what such an
+    environment does with its action does not depend on the way of calling hooks.
+
+    Args:
+        space: The action space of one environment; see ``is_array_space``.
+        num_envs: N.
+        actions: What the caller gave.
+
+    Returns:
+        A new array of shape (N, ...).
+
+    Raises:
+        ConfigError: If the shape or the type does not fit, an action of a ``Discrete`` is out of
+            its range, or one is NaN.
+    """
+    array = _numbers(actions)
+    if array.shape != (num_envs, *space.shape):
+        raise ConfigError(
+            f"the actions have shape {array.shape}, expected {(num_envs, *space.shape)}"
+        )
+    if array.dtype.kind == "f":
+        _require_numbers(array)
+    if space.dtype.kind != "f":
+        _require_integers(space, array)
+        if array.dtype.kind == "b":
+            return array.astype(space.dtype)
+    return array
+
+
+def _numbers(actions: Any) -> npt.NDArray[Any]:
+    try:
+        array = np.array(actions)
+        is_numeric = array.dtype.kind in "biuf"
+    except Exception:  # lists that make no array, and the user's own __array__
+        is_numeric = False
+    if not is_numeric:
+        raise ConfigError(f"the actions do not make an array of numbers: {shown(actions)}")
+    return array
+
+
+def _require_numbers(array: npt.NDArray[Any]) -> None:
+    if np.count_nonzero(np.isnan(array)):
+        index = int(np.argwhere(np.isnan(array))[0][0])
+        raise ConfigError(f"the action of environment {index} is not a number: {array[index]}")
+
+
+def _require_integers(space: Any, array: npt.NDArray[Any]) -> None:
+    if array.dtype.kind == "f":
+        raise ConfigError(f"the actions are of type {array.dtype}, expected integers")
+    if isinstance(space, spaces.Discrete):
+        low, high = int(space.start), int(space.start + space.n - 1)
+        if array.min() < low or array.max() > high:
+            index = int(np.flatnonzero((array < low) | (array > high))[0])
+            raise ConfigError(f"action {array[index]} of environment {index} is not in {space}")

@@ -1,0 +1,92 @@
+"""What every way of playing N environments has in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmugym.env import FMUEnv
+from fmugym.pool.base import FloatArray, MaskArray
+
+__all__ = ["Engine", "StepResult"]
+
+
+class StepResult(NamedTuple):
+    """What a step of N environments gives; all arrays are new."""
+
+    observations: Any
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    infos: dict[str, Any]
+
+
+class Engine(ABC):
+    """Drives N environments; when an ended one starts again is not its concern.
+
+    Attributes:
+        ended: Whether the last step ended the episode, shape (N,); always the same array.
+        any_ended: Whether the last step ended any episode.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self.ended = np.zeros(num_envs, np.bool_)
+        self.any_ended = False
+
+    def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
+        """Note which episodes a step has ended."""
+        np.logical_or(terminated, truncated, out=self.ended)
+        self.any_ended = bool(np.count_nonzero(self.ended))
+
+    def note_starts(self, mask: MaskArray) -> None:
+        """Note which episodes have started."""
+        self.ended[mask] = False
+        self.any_ended = bool(np.count_nonzero(self.ended))
+
+    @abstractmethod
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes of the environments in the mask; returns the observations of all."""
+
+    @abstractmethod
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """Step the environments; those in the mask start an episode instead."""
+
+    @abstractmethod
+    def seed_of(self, index: int) -> int | None:
+        """Return the seed of an environment's generator."""
+
+    @abstractmethod
+    def single(self, index: int) -> FMUEnv:
+        """Return an environment as a single one, for reading it and for calling its methods."""
+
+    @abstractmethod
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """Call a method of some environments; what it assigns takes effect.
+
+        Raises:
+            ConfigError: If a method changes what environments of this engine cannot have each for
+                itself. Then none of them has changed.
+        """
+
+    @abstractmethod
+    def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """Set an attribute of some environments, by index.
+
+        Raises:
+            ConfigError: If environments of this engine cannot have these values.
+        """
+
+    @abstractmethod
+    def set_parameter(self, name: str, values: FloatArray) -> None:
+        """Give a parameter one value for each environment, from its next episode on."""

@@ -1,0 +1,496 @@
+"""N environments whose hooks are evaluated once for all, on arrays."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.health import fault_rates
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.episode import EpisodePlan
+from fmugym.vector.actions import checked_actions
+from fmugym.vector.calls import MethodCall, attribute
+from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.hooks import results
+from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of, within
+from fmugym.vector.streams import EpisodeStreams
+from fmugym.vector.views import batched, column
+
+__all__ = ["BatchEngine"]
+
+IndexArray = npt.NDArray[np.intp]
+
+
+class BatchEngine(Engine):
+    """Turns a prototype into N environments: from now on its hooks read arrays.
+
+    Args:
+        env: The prototype, made with a pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+    """
+
+    def __init__(self, env: FMUEnv, num_envs: int, max_episode_steps: int | None) -> None:
+        super().__init__(num_envs)
+        self.env = env
+        self._n = num_envs
+        self._pool = env._open_pool("a vector environment")
+        self._streams = EpisodeStreams(num_envs, env._plan)
+        self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
+        self._longest = 0
+        self._foreign = np.zeros(num_envs, np.bool_)
+        batched(env, num_envs)
+        env._values, env.inputs = self._pool.outputs, self._pool.inputs
+        env.state = self._pool.outputs[: env._output_count]
+        env._was_reset = True  # for the views of single environments
+        self._given: dict[str, npt.NDArray[Any]] = {}
+        self._outputs_before: FloatArray = self._pool.outputs
+        self._variables_before: dict[str, FloatArray] = {}
+        self._make_parameters(env._plan)
+        self._note_foreign(slice(None), False)
+
+    def _make_parameters(self, plan: EpisodePlan) -> None:
+        self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
+        names = [variable.name for variable in plan.model_variables]
+        self._parameters = dict(zip(names, self._start_values, strict=True))
+        self.env.parameters = MappingProxyType(self._parameters)
+
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """See ``Engine.set_parameter``."""
+        env, before = self.env, self._parameters
+        self._given[name] = values
+        parameters = {**env._interface.parameters, name: values[0]}
+        env._interface = replace(env._interface, parameters=parameters)
+        env._plan = env._plan_episode({})
+        self._make_parameters(env._plan)
+        for known in before.keys() & self._parameters.keys():
+            self._parameters[known][:] = before[known]
+        self._note_foreign(slice(None), True)
+
+    def seed_of(self, index: int) -> int | None:
+        """See ``Engine.seed_of``."""
+        return self._streams.seed_of(index)
+
+    def single(self, index: int) -> FMUEnv:
+        """See ``Engine.single``; the environment is a view."""
+        return column(self.env, index)
+
+    def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """See ``Engine.set_attribute``; values that differ must be numbers."""
+        self._assign({name: self._of_all(name, values)})
+
+    def _of_all(self, name: str, values: Mapping[int, Any]) -> tuple[Any, bool]:
+        """The value for all environments, and whether it is an array of one for each."""
+        if len(values) < self._n:
+            present = {i: attribute(self.single(i), name) for i in range(self._n)}
+            values = {**present, **values}
+        each = [values[index] for index in range(self._n)]
+        if all(value is each[0] for value in each):
+            return each[0], False
+        return _row_of(name, each), True
+
+    def _assign(self, attributes: Mapping[str, tuple[Any, bool]]) -> None:
+        rows = {n: row for n, row in self.env._per_env_attributes.items() if n not in attributes}
+        for name, (value, is_row) in attributes.items():
+            setattr(self.env, name, value)
+            if is_row:
+                rows[name] = value
+        self.env._per_env_attributes = rows
+
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """See ``Engine.call``."""
+        calls = [MethodCall(self.single(index), index) for index in indices]
+        returned = [call(name, arguments, keywords) for call in calls]
+        attributes = {
+            attribute_name: self._of_all(attribute_name, values)
+            for attribute_name, values in _by_name(calls, MethodCall.assigned_attributes).items()
+        }
+        variables = {
+            variable: self._with(variable, values)
+            for variable, values in _by_name(calls, MethodCall.assigned_variables).items()
+        }
+        if attributes:
+            self._assign(attributes)
+        self.env.variables.update(variables)
+        return returned
+
+    def _with(self, variable: str, values: Mapping[int, Any]) -> FloatArray:
+        """The row of an episode variable with other values for some environments."""
+        row = np.array(self._row(variable))
+        for index, value in values.items():
+            try:
+                row[..., index] = value
+            except (TypeError, ValueError):
+                raise ConfigError(
+                    f"a method has set the episode variable {variable!r} to {shown(value)}, "
+                    f"expected {row[..., index].size} numbers"
+                ) from None
+        return row
+
+    def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
+        """Note whose constants are those of another plan: of options, or of an earlier one."""
+        self._foreign[indices] = foreign
+        self._any_foreign = bool(self._foreign.any())
+
+    # Episodes.
+
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Engine.reset``."""
+        indices = np.flatnonzero(mask)
+        self._streams.seed(seeds, indices)
+        drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
+        self.env._in_hooks = True
+        try:
+            observations = self._observe(None)
+            self._require_finite_start(observations, mask)
+            return observations, self._infos(mask) | drawn_info(drawn, mask)
+        finally:
+            self.env._in_hooks = False
+            self.note_starts(mask)
+
+    def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
+        wrong = not_finite(observations)
+        if wrong is not None and (wrong & mask).any():
+            index = int(np.flatnonzero(wrong & mask)[0])
+            first = shown(observation_of(observations, index))
+            raise SimulationError(
+                f"environment {index}: the first observation is not finite: {first}"
+            )
+
+    def _begin(
+        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
+    ) -> dict[str, FloatArray]:
+        """Draw and start episodes; returns the values that the info tells, by name."""
+        values = self._draw(indices, plan)
+        _, statuses = self._pool.reset(plan.model_variables, values, mask)
+        if np.count_nonzero(statuses):
+            self._require_started(indices, statuses)
+        self._forget(indices, plan)
+        return {name: self._drawn(name) for name in [*plan.told, *plan.drawn_names]}
+
+    def _drawn(self, name: str) -> FloatArray:
+        """The row of a value just drawn; a variable may have become a table of equal rows."""
+        row = self._row(name)
+        return (row if row.ndim == 1 else row.reshape(-1, self._n)[0]).copy()
+
+    def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
+        """After a reset, hooks read what they read in a single environment."""
+        env = self.env
+        env.step_count[indices] = 0
+        env.previous_state[:, indices] = env.state[:, indices]
+        no_action = np.reshape(env._no_action, (*env.action.shape[:-1], 1))
+        env.action[..., indices] = env.previous_action[..., indices] = no_action
+        env.done = env.done.copy()  # the caller has this array
+        env.done[indices] = False
+        for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
+            row[indices] = (
+                self._parameters[name][indices] if name in plan.parameter_names else start
+            )
+
+    def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
+        for index in indices.tolist():
+            if statuses[index] > Status.WARNING:
+                raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+
+    def _draw(self, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
+        """Draw episodes into the rows of the parameters and variables.
+
+        Returns:
+            The parameters in the order of the plan, shape (P, N).
+        """
+        default = plan is self.env._plan
+        if plan.num_uniform is not None and plan.num_uniform == self._streams.num_draws:
+            drawn = plan.scaled(self._streams.fractions(indices))
+            self._place(plan.drawn_names, drawn, indices)
+        else:
+            self._place_each(indices, plan)
+        if not default or self._any_foreign:
+            constants = plan.constant_parameters
+            self._place(constants, constants.values(), indices)
+            self._note_foreign(indices, not default)
+        self._place(plan.constant_variables, plan.constant_variables.values(), indices)
+        constant = plan.constant_parameters.keys() - plan.told.keys()
+        given = {name: self._given[name][indices] for name in self._given if name in constant}
+        self._place(given, given.values(), indices)
+        if default:
+            return self._start_values
+        return np.stack([self._parameters[variable.name] for variable in plan.model_variables])
+
+    def _place_each(self, indices: IndexArray, plan: EpisodePlan) -> None:
+        episodes = [plan.draw(self._streams.generator(index)) for index in indices.tolist()]
+        for name in plan.drawn_names:
+            values = [{**e.parameters, **e.variables}[name] for e in episodes]
+            self._place([name], [values], indices)
+
+    def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
+        for name, value in zip(names, values, strict=True):
+            self._row(name)[..., indices] = value
+
+    def _row(self, name: str) -> FloatArray:
+        """The values of a parameter or an episode variable, one for each environment."""
+        variables = self.env.variables
+        if name in variables:
+            row: FloatArray = variables[name]
+            if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
+                row = variables[name] = results.variable(name, row, self._n)
+        else:
+            row = self._parameters.setdefault(name, np.full(self._n, np.nan))
+        return row
+
+    # Steps.
+
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """See ``Engine.step``."""
+        env, pool = self.env, self._pool
+        actions = self._checked(actions)
+        env._in_hooks = True
+        try:
+            self._take_actions(actions, resetting)
+            drawn: dict[str, FloatArray] = {}
+            if resetting is not None:
+                drawn = self._begin(resetting, np.flatnonzero(resetting), env._plan)
+            observed = self._new_observations()
+            pool.step(None, resetting, observed)
+            env.step_count += 1
+            if resetting is None:
+                return self._evaluate(observed, None)
+            env.step_count[resetting] = 0
+            result = self._evaluate(observed, resetting)
+            result.infos.update(drawn_info(drawn, resetting))
+            return result
+        finally:
+            env._in_hooks = False
+
+    def _take_actions(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
+        env = self.env
+        before = env.action, env.previous_action, env.previous_state
+        env.previous_action, env.action = env.action, actions
+        self._outputs_before = self._pool.outputs.copy()
+        env.previous_state = self._outputs_before[: env._output_count]
+        try:
+            self._write_inputs(env._get_inputs(), resetting)
+        except BaseException:  # no FMU was touched: better actions may follow
+            env.action, env.previous_action, env.previous_state = before
+            raise
+
+    def _checked(self, actions: Any) -> npt.NDArray[Any]:
+        """Copy the actions, environments last as hooks want them."""
+        space: Any = self.env.action_space
+        array = checked_actions(space, self._n, actions)
+        if array.dtype != space.dtype:
+            with np.errstate(over="ignore"):  # it becomes infinite, and so does an input
+                array = array.astype(space.dtype)
+        return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
+
+    def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
+        inputs = self._pool.inputs
+        results.write_inputs(values, inputs)
+        if not self.env._real_inputs:
+            for index in self._stepping(resetting):
+                inputs[:, index] = fmu_spaces.to_input_types(
+                    self.env._interface.inputs, inputs[:, index]
+                )
+        self._require_finite_inputs(resetting)
+
+    def _stepping(self, resetting: MaskArray | None) -> list[int]:
+        """The numbers of the environments that do not start an episode in this step."""
+        return [i for i in range(self._n) if resetting is None or not resetting[i]]
+
+    def _require_finite_inputs(self, resetting: MaskArray | None) -> None:
+        inputs = self._pool.inputs
+        finite = np.isfinite(inputs)
+        if finite.all():
+            return
+        for index in self._stepping(resetting):
+            if not finite[:, index].all():
+                raise ConfigError(
+                    f"an input of environment {index} is not finite: {inputs[:, index]}"
+                )
+
+    def _new_observations(self) -> npt.NDArray[np.float32] | None:
+        if not self.env._pool_observes:
+            return None
+        return np.empty((self._n, self.env._output_count), np.float32)
+
+    def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
+        env = self.env
+        if env._has_update:
+            self._update(resetting, self._failed(self._pool.statuses))
+        terminated = results.flags("_is_done", env._is_done(), self._n)
+        statuses = self._pool.statuses
+        has_faults = bool(np.count_nonzero(statuses))
+        if has_faults:
+            terminated |= self._stopped(statuses)
+        env.done = terminated
+        truncated = self._reached_limit()
+        if env._has_truncation:
+            truncated |= results.flags("_is_truncated", env._is_truncated(), self._n)
+        rewards = results.rewards(env._reward_policy(), self._n)
+        if resetting is not None:
+            terminated[resetting] = truncated[resetting] = False
+            rewards[resetting] = 0.0
+        infos = self._infos(np.ones(self._n, np.bool_)) if env._has_info else {}
+        result = StepResult(self._observe(observed), rewards, terminated, truncated, infos)
+        if resetting is not None:
+            self._require_finite_start(result.observations, resetting)
+        self._handle_faults(result, statuses, has_faults)
+        self.note_ends(terminated, truncated)
+        return result
+
+    def _update(self, resetting: MaskArray | None, failed: MaskArray) -> None:
+        """Call the hook, but keep the variables of environments that did not step.
+
+        What it assigns is copied: it may be part of an array that the next step writes again.
+        """
+        variables = self.env.variables
+        before = {name: self._row(name) for name in variables}
+        self._variables_before = {name: row.copy() for name, row in before.items()}
+        self.env._update()
+        for name, row in before.items():
+            if variables[name] is not row:
+                variables[name] = results.variable(name, variables[name], self._n)
+        idle = failed if resetting is None else failed | resetting
+        if idle.any():
+            self._restore_variables(idle)
+
+    def _restore_variables(self, mask: MaskArray) -> None:
+        for name, values in self._variables_before.items():
+            results.restore_variable(name, self._row(name), mask, values[..., mask])
+
+    def _reached_limit(self) -> MaskArray:
+        """Compare only when the longest episode may have got there."""
+        self._longest += 1
+        if self._longest < self._limit:
+            return np.zeros(self._n, np.bool_)
+        self._longest = int(self.env.step_count.max())
+        reached: MaskArray = self.env.step_count >= self._limit
+        return reached
+
+    def _observe(self, observed: Any) -> Any:
+        if observed is not None:
+            return observed
+        env = self.env
+        return results.observations(env._get_observation(), env.observation_space, self._n)
+
+    def _infos(self, mask: MaskArray) -> dict[str, Any]:
+        if not self.env._has_info:
+            return {}
+        infos = results.info_arrays(self.env._get_info(), mask)
+        if self.env._pool_tells:
+            infos |= results.info_arrays(self._pool.info(), mask)
+        return infos
+
+    def _stopped(self, statuses: StatusArray) -> MaskArray:
+        stopped: MaskArray = statuses == Status.TERMINATED
+        return stopped
+
+    def _failed(self, statuses: StatusArray) -> MaskArray:
+        failed: MaskArray = (statuses > Status.WARNING) & (statuses != Status.TERMINATED)
+        return failed
+
+    def _handle_faults(self, result: StepResult, statuses: StatusArray, has_faults: bool) -> None:
+        """Deal with FMUs that failed or asked to stop, and with numbers that are not finite."""
+        wrong_rewards = not_finite(result.rewards)
+        wrong_observations = not_finite(result.observations)
+        if not has_faults and wrong_rewards is None and wrong_observations is None:
+            return
+        stopped, failed = self._stopped(statuses), self._failed(statuses)
+        if stopped.any():
+            result.infos.update({"fmu_terminated": stopped, "_fmu_terminated": stopped.copy()})
+        reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
+        for index in _indices(wrong_rewards, ~failed):
+            reasons[index] = f"_reward_policy returned {result.rewards[index]}{self._when(index)}"
+        for index in _indices(wrong_observations, ~failed):
+            observation = shown(observation_of(result.observations, index))
+            reasons.setdefault(index, f"the observation is {observation}{self._when(index)}")
+        if reasons:
+            self._end_with_faults(result, dict(sorted(reasons.items())), failed)
+
+    def _when(self, index: int) -> str:
+        return f" at t = {self.single(index).time:g} s"
+
+    def _end_with_faults(
+        self, result: StepResult, reasons: Mapping[int, str], failed: MaskArray
+    ) -> None:
+        """End the episodes of some environments, whose state is that before the step."""
+        env, config = self.env, self.env.config
+        faulty = np.zeros(self._n, np.bool_)
+        faulty[list(reasons)] = True
+        if config.on_fault == "raise":
+            index, reason = next(iter(reasons.items()))
+            raise SimulationError(f"environment {index}: {reason}")
+        for index, reason in reasons.items():
+            env.logger.warning("environment %d: %s", index, reason)
+        if (faulty & ~failed).any():
+            self._undo(result, faulty & ~failed, reasons)
+        texts = np.full(self._n, None, dtype=object)
+        texts[faulty] = list(reasons.values())
+        rates = within(faulty, fault_rates(self._pool.health()))
+        result.infos.update({"fault": texts, "_fault": faulty})
+        result.infos.update({"fault_rate": rates, "_fault_rate": faulty.copy()})
+        result.rewards[faulty] = config.fault_reward
+        result.terminated[faulty] = config.on_fault == "terminate"
+        result.truncated[faulty] = config.on_fault == "truncate"
+
+    def _undo(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
+        """Return environments to the state before a step whose numbers are not finite."""
+        env, pool = self.env, self._pool
+        pool.outputs[:, mask] = self._outputs_before[:, mask]
+        if env._has_update:
+            self._restore_variables(mask)
+        for index in np.flatnonzero(mask).tolist():
+            pool.note_fault(index)
+        env._halt()
+        again = results.observations(env._get_observation(), env.observation_space, self._n)
+        for index in _indices(not_finite(again), mask):
+            before = shown(observation_of(again, index))
+            raise SimulationError(
+                f"environment {index}: {reasons[index]}; before it the observation is {before}"
+            )
+        copy_rows(again, result.observations, mask)
+        if env._has_info:
+            copy_rows(self._infos(np.ones(self._n, np.bool_)), result.infos, mask)
+
+
+def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
+    """The numbers of the environments that are in both masks; None stands for an empty mask."""
+    return [] if rows is None else np.flatnonzero(rows & mask).tolist()
+
+
+def _by_name(
+    calls: Iterable[MethodCall], assigned: Callable[[MethodCall], Mapping[str, Any]]
+) -> dict[str, dict[int, Any]]:
+    """What methods have assigned: values by the number of the environment, by name."""
+    by_name: dict[str, dict[int, Any]] = {}
+    for call in calls:
+        for name, value in assigned(call).items():
+            by_name.setdefault(name, {})[call.index] = value
+    return by_name
+
+
+def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
+    try:
+        row = np.array(values)
+    except (TypeError, ValueError):  # lists that make no array
+        row = np.empty(0, object)
+    if row.ndim != 1 or row.dtype.kind not in "biuf":
+        raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")
+    return row

@@ -1,0 +1,219 @@
+"""N environments whose hooks run as programs in the native pool's own pass."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.values import LateDict
+from fmugym.vector.engines.base import StepResult
+from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.hooks import results
+from fmugym.vector.hooks.check import sample_states
+from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
+from fmugym.vector.hooks.trace import trace_hooks
+from fmugym.vector.infos import not_finite
+from fmugym.vector.views import light_copy
+
+__all__ = ["CompiledEngine", "find_programs"]
+
+logger = logging.getLogger(__name__)
+
+_FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
+_REWARD = 2
+"""The number of the reward among the results of the second program."""
+
+_make_tuple: Any = tuple.__new__  # a third of what a NamedTuple's own constructor takes
+
+
+def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program] | None:
+    """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
+
+    Args:
+        env: A prototype whose hooks work on arrays.
+        required: Whether hooks that cannot be compiled are an error.
+
+    Returns:
+        The program for the inputs and the program for done, truncated and reward; or None.
+
+    Raises:
+        ConfigError: If the programs are required, but the hooks cannot be compiled.
+    """
+    try:
+        _require_playable(env)
+        programs = trace_hooks(env)
+        _require_same(sample_states(env), programs)
+    except Exception as reason:  # hooks do with numbers whatever they like
+        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
+        if required:
+            raise ConfigError(text) from None
+        logger.debug("%s", text)
+        return None
+    return programs
+
+
+def _require_playable(env: FMUEnv) -> None:
+    """Refuse what the native pool does not do in its own pass, whatever the hooks are."""
+    if not env._open_pool("a vector environment").can_play:
+        raise UntraceableError("the pool is not the native one")
+    if env._plan.num_uniform is None:
+        raise UntraceableError(
+            "its episodes have draws other than uniform ones of Real variables: "
+            + ", ".join(map(repr, env._plan.drawn_names))
+        )
+
+
+def _require_same(batch: FMUEnv, programs: tuple[Program, Program]) -> None:
+    with np.errstate(all="ignore"):
+        inputs = np.array(evaluate(programs[0], batch))
+        batch.inputs = inputs
+        done, truncated, reward = evaluate(programs[1], batch)
+        batch.done = done != 0.0
+        hooks = (batch._is_done(), batch._is_truncated(), batch._reward_policy())
+        expected_inputs = batch._get_inputs()
+    for value, expected in zip((done, truncated, reward), hooks, strict=True):
+        if not _equal(value, expected):
+            raise UntraceableError("the program gives other values than the hooks")
+    if not _equal(inputs, expected_inputs):
+        raise UntraceableError("the program gives other inputs than the hook")
+
+
+def _equal(value: FloatArray, expected: Any) -> bool:
+    """Whether values are the same to the last bit, NaN included."""
+    floats = np.asarray(expected, np.float64)
+    return np.array_equal(value, np.broadcast_to(floats, value.shape), equal_nan=True)
+
+
+class CompiledEngine(BatchEngine):
+    """A ``BatchEngine`` whose steps are done by the native pool alone, hooks included.
+
+    Resets are those of ``BatchEngine``, on the same arrays. So are steps while parameters of a
+    running episode were overridden or set since it began, and where hooks cannot be compiled any
+    more after their attributes were set.
+
+    Args:
+        env: The prototype, made with a native pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+        programs: From ``find_programs``.
+    """
+
+    def __init__(
+        self,
+        env: FMUEnv,
+        num_envs: int,
+        max_episode_steps: int | None,
+        programs: tuple[Program, Program],
+    ) -> None:
+        super().__init__(env, num_envs, max_episode_steps)
+        self._shape = num_envs, env._output_count
+        self._stream_version = -1
+        self._prepare(programs)
+
+    def _prepare(self, programs: tuple[Program, Program] | None) -> None:
+        """Give the pool all that a step consists of, if it can draw the episodes."""
+        plan, streams = self.env._plan, self._streams
+        self._programs = programs
+        self._prepared = False
+        if programs is None or plan.num_uniform is None or plan.num_uniform != streams.num_draws:
+            return
+        space: Any = self.env.action_space
+        self._may_overflow = not is_always_finite(programs[1], _REWARD)
+        self._names = plan.drawn_names
+        rows = [plan.parameter_names.index(name) for name in self._names]
+        self._drawn_shape = len(rows), self._n
+        self._play = self._pool.prepare_play(
+            plan.model_variables,
+            programs,
+            (int(space.start), int(space.start + space.n - 1)),
+            self._start_values,
+            (streams.block, streams.used, *plan.limits, np.array(rows, np.int64)),
+            (self.env.step_count, self.ended, self._limit),
+        )
+        self._play_with_resets = self._pool.watched(self._play)
+        self._prepared = True
+
+    def set_parameter(self, name: str, values: FloatArray) -> None:
+        """See ``Engine.set_parameter``."""
+        super().set_parameter(name, values)
+        self._prepare(self._programs)
+
+    def _assign(self, attributes: Mapping[str, tuple[Any, bool]]) -> None:
+        """Compile the hooks anew: the programs hold the former values of the attributes."""
+        super()._assign(attributes)
+        try:
+            programs = trace_hooks(self.env)
+            _require_same(self._copy_for_hooks(), programs)
+        except Exception as reason:  # as in find_programs
+            logger.debug("the hooks cannot be compiled any more: %s", reason)
+            programs = None
+        self._prepare(programs)
+
+    def _copy_for_hooks(self) -> FMUEnv:
+        batch = light_copy(self.env)
+        batch._in_hooks = True
+        return batch
+
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Engine.reset``."""
+        result = super().reset(mask, seeds, options)
+        if self._stream_version != self._streams.version:
+            self._pool.set_streams(self._streams.bit_generators())
+            self._stream_version = self._streams.version
+        return result
+
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """See ``Engine.step``."""
+        if self._any_foreign or not self._prepared:
+            return super().step(actions, resetting)
+        self._longest = self._limit  # this path does not count steps
+        if self._may_overflow:
+            self._outputs_before = self._pool.outputs.copy()
+        observations = np.empty(self._shape, _FLOAT32)
+        rewards = np.empty(self._n)
+        terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
+        arrays = observations, rewards, terminated, truncated
+        drawn = np.empty(self._drawn_shape)
+        play = self._play if resetting is None else self._play_with_resets
+        try:
+            troubled, ended = play(actions, *arrays, drawn)
+        except (TypeError, ValueError, BufferError):
+            actions = np.require(self._checked(actions), np.int64, ["C", "A"])
+            troubled, ended = play(actions, *arrays, drawn)
+        self.any_ended = ended > 0
+        infos: dict[str, Any] = {}
+        if resetting is not None:
+            told = LateDict.of(_told, self._names, drawn, resetting)  # few ever look at it
+            infos = {"drawn": told, "_drawn": resetting}
+        result: StepResult = _make_tuple(StepResult, (*arrays, infos))
+        if troubled or (self._may_overflow and not_finite(rewards) is not None):
+            self._mend(actions, result, resetting)
+        return result
+
+    def _mend(self, actions: Any, result: StepResult, resetting: MaskArray | None) -> None:
+        """Handle FMUs that failed or asked to stop: they are rare, so numpy is fast enough."""
+        statuses = self._pool.statuses
+        if resetting is not None:
+            self._require_started(np.flatnonzero(resetting), statuses)
+        self._require_finite_inputs(resetting)
+        stopped = self._stopped(statuses)
+        if stopped.any():
+            result.terminated[stopped] = True
+            self.env.action, self.env.done = self._checked(actions), result.terminated
+            rewards = results.rewards(self.env._reward_policy(), self._n)
+            result.rewards[stopped] = rewards[stopped]
+        self._handle_faults(result, statuses, True)
+        self.note_ends(result.terminated, result.truncated)
+
+
+def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    named = dict(zip(names, np.where(mask, drawn, 0.0), strict=True))
+    return named | {f"_{name}": mask.copy() for name in named}

@@ -1,0 +1,234 @@
+"""N environments whose hooks are evaluated one environment after another."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, FMUGymError, shown
+from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.task.values import EpisodeVariables
+from fmugym.vector.actions import checked_actions, is_array_space
+from fmugym.vector.calls import attribute
+from fmugym.vector.column import PoolColumn
+from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.views import copied_attributes, light_copy
+
+__all__ = ["PerEnvEngine"]
+
+AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
+
+
+class PerEnvEngine(Engine):
+    """Calls the hooks of light copies of a prototype, which share its pool.
+
+    The FMUs still step together on all threads, unless the class has its own ``step``.
+
+    Args:
+        env: The prototype, made with a pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+        action_space: The space of the actions of all environments.
+        add_info: Merges the info of one environment into that of all.
+    """
+
+    def __init__(
+        self,
+        env: FMUEnv,
+        num_envs: int,
+        max_episode_steps: int | None,
+        action_space: Any,
+        add_info: AddInfo,
+    ) -> None:
+        super().__init__(num_envs)
+        self._pool = pool = env._open_pool("a vector environment")
+        self._envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
+        self._together = type(env).step is FMUEnv.step
+        self._limit = max_episode_steps
+        self._action_space = action_space
+        self._add_info = add_info
+        self._space = env.observation_space
+        self._observations: list[Any] = [None] * num_envs
+
+    def seed_of(self, index: int) -> int | None:
+        """See ``Engine.seed_of``."""
+        return self._envs[index].np_random_seed
+
+    def single(self, index: int) -> FMUEnv:
+        """See ``Engine.single``."""
+        return self._envs[index]
+
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """See ``Engine.call``."""
+        values = [attribute(self._envs[index], name) for index in indices]
+        return [v(*arguments, **keywords) if callable(v) else v for v in values]
+
+    def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """See ``Engine.set_attribute``; here the values may be anything."""
+        for index, value in values.items():
+            setattr(self._envs[index], name, value)
+
+    def set_parameter(self, name: str, values: FloatArray) -> None:
+        """See ``Engine.set_parameter``."""
+        for env, value in zip(self._envs, values.tolist(), strict=True):
+            parameters = {**env._interface.parameters, name: value}
+            env._interface = replace(env._interface, parameters=parameters)
+            env._plan = env._plan_episode({})
+
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Engine.reset``."""
+        infos: dict[str, Any] = {}
+        for index in np.flatnonzero(mask).tolist():
+            self._observations[index], info = self._reset(index, seeds[index], options)
+            infos = self._with_info(infos, info, index)
+        self.note_starts(mask)
+        return self._stacked(), infos
+
+    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """See ``Engine.step``."""
+        count = len(self._envs)
+        rewards = np.zeros(count)
+        terminated, truncated = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+        infos: dict[str, Any] = {}
+        items = self._actions(actions)
+        if self._together:
+            self._step_pool(items, resetting)
+        for index, action in enumerate(items):
+            if resetting is not None and resetting[index]:
+                self._observations[index], info = self._reset(index, None, {})
+            else:
+                result = self._stepped(index, action)
+                self._observations[index], rewards[index], terminated[index] = result[:3]
+                truncated[index] = result[3] or self._reached_limit(self._envs[index])
+                info = result[4]
+            infos = self._with_info(infos, info, index)
+        self.note_ends(terminated, truncated)
+        return StepResult(self._stacked(), rewards, terminated, truncated, infos)
+
+    def _reset(
+        self, index: int, seed: int | None, options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        try:
+            return self._envs[index].reset(seed=seed, options=dict(options))
+        except FMUGymError as error:
+            raise _located(error, index) from error
+
+    def _stepped(self, index: int, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        env = self._envs[index]
+        try:
+            return _concluded(env) if self._together else env.step(action)
+        except FMUGymError as error:
+            raise _located(error, index) from error
+
+    def _step_pool(self, actions: Sequence[Any], resetting: MaskArray | None) -> None:
+        """Step the FMUs whose episodes go on, once all of their actions are known to be good."""
+        taken: list[tuple[FMUEnv, tuple[Any, ...]]] = []
+        try:
+            for index, env in enumerate(self._envs):
+                if resetting is None or not resetting[index]:
+                    taken.append((env, _moment(env)))
+                    _take_action(env, actions[index])
+        except BaseException as error:
+            for env, moment in taken:
+                env.action, env.previous_action, env.previous_state, env.inputs = moment
+            if isinstance(error, FMUGymError):
+                raise _located(error, index) from error
+            raise
+        self._pool.step(None, resetting, self._pool.observations)
+
+    def _actions(self, actions: Any) -> Sequence[Any]:
+        """The action of each environment, as copies: hooks keep them."""
+        space = self._envs[0].action_space
+        if self._together and is_array_space(space):
+            return list(checked_actions(space, len(self._envs), actions))
+        try:
+            items = list(iterate(self._action_space, copy.deepcopy(actions)))
+        except Exception:  # the actions are the user's
+            raise ConfigError(
+                f"the actions do not make one of {space} for each environment: {shown(actions)}"
+            ) from None
+        if len(items) != len(self._envs):
+            raise ConfigError(f"there are {len(items)} actions, expected {len(self._envs)}")
+        return items
+
+    def _reached_limit(self, env: FMUEnv) -> bool:
+        return self._limit is not None and env.step_count >= self._limit
+
+    def _with_info(self, infos: dict[str, Any], info: Any, index: int) -> dict[str, Any]:
+        """Merge the info of one environment; Gymnasium does so for what its types can hold."""
+        try:
+            return self._add_info(infos, info, index)
+        except Exception:  # the info is the user's
+            raise ConfigError(
+                f"environment {index}: its info does not fit those of the others: {shown(info)}"
+            ) from None
+
+    def _stacked(self) -> Any:
+        empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)
+        try:
+            return concatenate(self._space, self._observations, empty)
+        except Exception:  # the observations are the user's
+            raise ConfigError(
+                f"_get_observation returned {shown(self._observations[0])}, which is no element of "
+                f"{self._space}"
+            ) from None
+
+
+def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
+    """Share what is costly to make, and copy all other attributes of the subclass."""
+    single = light_copy(env)
+    single.__dict__.update(copied_attributes(env))
+    single.variables = EpisodeVariables(env.config.episode_variables)
+    single._pool = PoolColumn(pool, index)
+    single._input_row = single._pool.inputs[:, 0]
+    single._output_row = single._pool.outputs[:, 0]
+    single._observation_row = single._pool.observations[0]
+    single._step_pool = single._pool.step_own
+    single._np_random = single._np_random_seed = None
+    return single
+
+
+def _located(error: FMUGymError, index: int) -> FMUGymError:
+    return type(error)(f"environment {index}: {error}")
+
+
+def _moment(env: FMUEnv) -> tuple[Any, ...]:
+    """The attributes that taking an action changes."""
+    return env.action, env.previous_action, env.previous_state, env.inputs
+
+
+def _take_action(env: FMUEnv, action: Any) -> None:
+    """The part of ``FMUEnv.step`` before the FMU's step."""
+    env._in_hooks = True
+    try:
+        env._take_action(action)
+    finally:
+        env._in_hooks = False
+
+
+def _concluded(env: FMUEnv) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """The part of ``FMUEnv.step`` after the FMU's step."""
+    pool = env._open_pool("step")
+    env.step_count += 1
+    env._in_hooks = True
+    try:
+        result = env._evaluate(pool, pool.statuses.item(0))
+    finally:
+        env._in_hooks = False
+    if env.render_mode is not None:
+        env._note_for_picture(result[1])
+    return result

@@ -1,0 +1,81 @@
+"""Vector entry points: functions that make a vector environment of a class, also by name.
+
+Gymnasium's specs need names in order to be written as text:
+
+``"fmugym.vector.entry_points:me.boilers.Boiler"`` is the vector entry point of the class ``Boiler``
+in the module ``me.boilers``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode
+
+from fmugym.vector.arguments import POOL_OPTIONS
+from fmugym.vector.env import FMUVectorEnv
+
+__all__ = ["vector_entry_point", "vectorized"]
+
+
+def vector_entry_point(entry_point: str) -> str:
+    """Return the vector entry point for the entry point ``"module:Class"`` of one environment."""
+    return f"{__name__}:{entry_point.replace(':', '.')}"
+
+
+def __getattr__(name: str) -> Callable[..., Any]:
+    module, _, attribute = name.rpartition(".")
+    if not module:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return vectorized(f"{module}:{attribute}")
+
+
+class VectorEntryPoint:
+    """Makes vector environments of one class; see ``vectorized``.
+
+    It pickles if the class does.
+    """
+
+    def __init__(self, env_class: Callable[..., Any] | str) -> None:
+        self._env_class = env_class
+
+    def __call__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        hooks: str = "auto",
+        backend: Any = "auto",
+        **kwargs: Any,
+    ) -> FMUVectorEnv:
+        """Make a vector environment; see ``FMUVectorEnv``."""
+        pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
+        env_class = self._env_class
+        creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class
+        if not isinstance(backend, str):  # it names no pool: the class knows what to do with it
+            kwargs["backend"], backend = backend, "auto"
+        return FMUVectorEnv(
+            partial(creator, **kwargs),
+            num_envs,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            hooks=hooks,
+            backend=backend,
+            **pool_options,
+        )
+
+
+def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEnv]:
+    """Make the vector entry point of a class.
+
+    Args:
+        env_class: The class, or ``"module:Class"``.
+
+    Returns:
+        A function that makes a ``FMUVectorEnv``. It takes the arguments of ``FMUVectorEnv`` except
+        ``make_env``, and passes all others to the class.
+    """
+    return VectorEntryPoint(env_class)

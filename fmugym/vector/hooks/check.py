@@ -1,0 +1,282 @@
+"""The hook check: do hooks give the same on arrays as one environment at a time?
+
+``if abs(x) > 2.4`` raises on arrays, but ``np.any`` and ``norm`` without an axis silently give one
+answer for all environments. So the check evaluates every hook on some distinct states both ways.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.env import FMUEnv
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.task.values import EpisodeVariables
+from fmugym.vector.actions import is_array_space
+from fmugym.vector.views import batched, column, copied_attributes, differs, light_copy
+
+__all__ = ["CURE", "find_difference", "sample_states"]
+
+CURE = (
+    "Write hooks element-wise: & and | for 'and' and 'or', numpy.where for 'if', no reduction over "
+    "all values"
+)
+"""The advice that follows a difference."""
+
+_HOOKS = (
+    "_get_inputs",
+    "_update",
+    "_is_done",
+    "_is_truncated",
+    "_reward_policy",
+    "_get_observation",
+    "_get_info",
+)
+_READ_ONLY = ("state", "previous_state", "inputs", "action", "previous_action", "_values")
+
+_EPISODES, _STEPS = 2, 3
+"""How many states of the FMU are tried; each is tried at other magnitudes, too."""
+
+_TOLERANCE = 1e-6
+"""numpy's results on arrays may differ from those on scalars in the last bit of a float32."""
+
+_SCALES = (1.0, -0.3, 10.0)
+_WILD_SCALES = (300.0, -1e5)
+"""Hooks may fail at these. They reach limits that the FMU's own states are far from."""
+
+
+def find_difference(env: FMUEnv) -> str | None:
+    """Look for a reason to call hooks one environment at a time.
+
+    Args:
+        env: A prototype whose pool has not been used yet.
+
+    Returns:
+        The hook and how it differs on arrays, or None if all hooks work on arrays.
+    """
+    cls = type(env)
+    for method in ("step", "reset"):
+        if getattr(cls, method) is not getattr(FMUEnv, method):
+            return f"{method} is overridden, which is for one environment only"
+    if not is_array_space(env.action_space):
+        return f"actions of {env.action_space} do not make one array"
+    if not _makes_arrays(env.observation_space):
+        return f"observations of {env.observation_space} do not make arrays"
+    scales = (_SCALES[:1], _SCALES[1:], _WILD_SCALES)
+    kinds = [sample_states(env, some) for some in scales]
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in filter(lambda hook: _does_something(cls, hook), _HOOKS):
+            for index, batch in enumerate(kinds):
+                difference = _compare(name, batch, is_natural=index == 0)
+                if difference is not None:
+                    return f"{name} {difference}"
+    return None
+
+
+def _does_something(cls: type[FMUEnv], hook: str) -> bool:
+    idle = hook in {"_update", "_is_truncated", "_get_info"}
+    return not idle or getattr(cls, hook) is not getattr(FMUEnv, hook)
+
+
+def _makes_arrays(space: spaces.Space[Any]) -> bool:
+    """Whether observations of N environments are an array, or a dict of arrays."""
+    if isinstance(space, spaces.Dict):
+        return all(map(_makes_arrays, space.values()))
+    return is_array_space(space)
+
+
+def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> FMUEnv:
+    """Make a batch of states that the FMU takes, each in several magnitudes.
+
+    Args:
+        env: A prototype; the first instance of its pool is used.
+        scales: The factors of the states, each with some noise.
+
+    Returns:
+        A copy of the prototype for calling its hooks on arrays.
+    """
+    rng = np.random.default_rng(0)
+    visited = _visit_states(env, rng)
+    count = len(visited) * len(scales)
+    batch = light_copy(env)
+    batch.__dict__.update(copied_attributes(env))
+    batched(batch, count)
+    rows: dict[str, list[Any]] = {}
+    for index in range(count):
+        _place_sample(batch, index, visited[index // len(scales)], rng, rows)
+        scale = scales[index % len(scales)]
+        if scale != 1.0:
+            batch._values[:, index] *= scale * rng.uniform(0.5, 1.5, size=len(batch._values))
+            batch.previous_state[:, index] *= scale
+    for name, values in rows.items():
+        if name in batch.variables:
+            batch.variables[name] = np.array(values)
+    batch.parameters = {n: np.array(v) for n, v in rows.items() if n not in batch.variables}
+    batch._in_hooks = True
+    return batch
+
+
+_Visited = tuple[FloatArray, FloatArray, FloatArray]
+"""The outputs before a step, those after it, and the inputs."""
+
+
+def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
+    """Run short episodes with small inputs; a slow FMU would take long for more."""
+    pool, plan = env._open_pool("the hook check"), env._plan
+    if pool.is_real:
+        return _imagine_states(pool, rng)
+    mask = np.zeros(pool.num_instances, np.bool_)
+    mask[0] = True
+    visited: list[_Visited] = []
+    for _ in range(_EPISODES):
+        start_values = plan.draw(rng).start_values
+        pool.reset(plan.model_variables, np.repeat(start_values, len(mask), axis=1), mask)
+        for _ in range(_STEPS):
+            before = pool.outputs[:, 0].copy()
+            pool.inputs[:, 0] = 0.1 * rng.uniform(size=len(pool.inputs))
+            if pool.statuses[0] <= Status.WARNING:
+                pool.step(None, ~mask)
+            visited.append((before, pool.outputs[:, 0].copy(), pool.inputs[:, 0].copy()))
+    return visited
+
+
+def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[_Visited]:
+    """Draw states: the check must not move anything real."""
+    sizes = (len(pool.outputs), len(pool.outputs), len(pool.inputs))
+    return [
+        (rng.normal(size=sizes[0]), rng.normal(size=sizes[1]), rng.normal(size=sizes[2]))
+        for _ in range(_EPISODES * _STEPS)
+    ]
+
+
+def _place_sample(
+    batch: FMUEnv,
+    index: int,
+    visited: _Visited,
+    rng: np.random.Generator,
+    rows: dict[str, list[Any]],
+) -> None:
+    before, batch._values[:, index], batch.inputs[:, index] = visited
+    batch.previous_state[:, index] = before[: batch._output_count]
+    batch.step_count[index] = 1 + index
+    batch.done[index] = bool(rng.integers(2))
+    for actions in (batch.action, batch.previous_action):
+        actions[..., index] = _sample(batch.action_space, rng)
+    episode = batch._plan.draw(rng)
+    for name, value in {**episode.parameters, **episode.variables}.items():
+        rows.setdefault(name, []).append(value)
+
+
+def _sample(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
+    """Sample without touching the space's own generator."""
+    own, space._np_random = space._np_random, rng
+    try:
+        return space.sample()
+    finally:
+        space._np_random = own
+
+
+def _compare(name: str, batch: FMUEnv, is_natural: bool) -> str | None:
+    """Say how a hook's results on arrays differ from those of single environments, or None."""
+    count = len(batch.step_count)
+    singles = [_single(batch, index) for index in range(count)]
+    before = [single.__dict__ | copied_attributes(single) for single in singles if is_natural]
+    one_by_one = [_call(single, name) for single in singles]
+    failures = sum(type(result) is _Failure for result in one_by_one)
+    if failures == count or (failures and not is_natural):
+        return None  # it fails either way: the first step will tell
+    for single, attributes in zip(singles, before, strict=is_natural):
+        changed = _changed(attributes, single)
+        if changed:
+            return f"changes self.{changed}, which belongs in 'episode_variables'"
+    many = _independent(batch)
+    together = _call(many, name)
+    for attribute in _READ_ONLY:
+        if differs(getattr(batch, attribute), getattr(many, attribute)):
+            shown = "out" if attribute == "_values" else attribute
+            return f"changes the arrays in self.{shown} in place"
+    if type(together) is _Failure:
+        return f"fails on arrays ({together.text})"
+    for index, expected in enumerate(one_by_one):
+        if type(expected) is not _Failure and not _same(expected, together, index, count):
+            return "gives other values on arrays than one environment at a time"
+    return None
+
+
+def _single(batch: FMUEnv, index: int) -> FMUEnv:
+    single = column(batch, index)
+    attributes = copied_attributes(single)
+    del attributes["variables"]  # these are its own already
+    single.__dict__.update(attributes)
+    return single
+
+
+def _independent(batch: FMUEnv) -> FMUEnv:
+    """A copy whose variables and attributes a hook may change."""
+    copied = light_copy(batch)
+    copied.__dict__.update(copied_attributes(batch))
+    copied.variables = EpisodeVariables(batch.variables)
+    copied.variables.update({name: np.copy(value) for name, value in batch.variables.items()})
+    return copied
+
+
+def _changed(before: Mapping[str, Any], single: FMUEnv) -> str | None:
+    """The name of an attribute that a hook has changed."""
+    for name, value in single.__dict__.items():
+        if name != "variables" and (name not in before or differs(before[name], value)):
+            return name
+    return None
+
+
+class _Failure(NamedTuple):
+    """Stands for the result of a hook that has raised an exception."""
+
+    text: str
+
+
+def _call(env: FMUEnv, name: str) -> Any:
+    try:
+        result = getattr(env, name)()
+    except Exception as error:
+        return _Failure(f"{type(error).__name__}: {error}")
+    return dict(env.variables) if name == "_update" else result
+
+
+def _same(expected: Any, together: Any, index: int, count: int) -> bool:
+    """Whether one environment's part of a result on arrays is its result alone; NaNs are equal."""
+    try:
+        return _equal(expected, together, index, count)
+    except Exception:  # the results are the user's, and may be anything
+        return False
+
+
+def _equal(expected: Any, together: Any, index: int, count: int) -> bool:
+    if isinstance(expected, Mapping):
+        if not isinstance(together, Mapping) or expected.keys() != together.keys():
+            return False
+        return all(_same(expected[k], together[k], index, count) for k in expected)
+    if isinstance(expected, list | tuple) and isinstance(together, list | tuple):
+        return len(expected) == len(together) and all(
+            _same(a, b, index, count) for a, b in zip(expected, together, strict=True)
+        )
+    alone, batch = np.asarray(expected), np.asarray(together)
+    if isinstance(together, np.bool_) or (isinstance(together, np.ndarray) and batch.ndim == 0):
+        return False  # numpy has reduced the array: this is no constant
+    if batch.ndim == 0:  # a constant, the same for all
+        part = batch[()]
+    elif batch.shape[-1] != count:
+        return False
+    else:
+        part = batch[..., index]
+    if np.shape(part) != alone.shape and np.size(part) != alone.size:
+        return False
+    if alone.dtype.kind not in "biuf" or np.asarray(part).dtype.kind not in "biuf":
+        return bool(np.array_equal(alone, part))
+    same = np.isclose(np.ravel(alone), np.ravel(part), rtol=_TOLERANCE, atol=1e-9, equal_nan=True)
+    return bool(np.all(same))

@@ -1,0 +1,190 @@
+"""What hooks return for N environments at once, checked and turned into arrays.
+
+Each function raises a ``ConfigError`` that names the hook, the expected and the actual value, if
+the hook returned something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.checks import check_mapping, number_of
+from fmugym.errors import ConfigError, FMUGymError, shown
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.results import given
+from fmugym.vector.infos import within
+
+__all__ = [
+    "flags",
+    "info_arrays",
+    "observations",
+    "restore_variable",
+    "rewards",
+    "variable",
+    "write_inputs",
+]
+
+_NUMBERS: Final = "biuf"
+"""The kinds of numpy's types that are numbers: Booleans, integers with and without sign, floats."""
+
+_BOOL, _FLOAT = np.dtype(np.bool_), np.dtype(np.float64)
+
+
+def flags(hook: str, value: Any, count: int) -> MaskArray:
+    """Turn the result of ``_is_done`` or ``_is_truncated`` into new Booleans of shape (N,)."""
+    if type(value) is np.ndarray and value.dtype == _BOOL and value.shape == (count,):
+        return value.copy()
+    wanted = f"True or False, or an array of {count} of them"
+    array = _numbers(hook, value, count, wanted)
+    if array.dtype.kind != "b" and not np.isin(array, (0, 1)).all():
+        raise _mismatch(hook, value, wanted)
+    return np.array(array, np.bool_)
+
+
+def rewards(value: Any, count: int) -> FloatArray:
+    """Turn the result of ``_reward_policy`` into new rewards of shape (N,), finite or not."""
+    if type(value) is np.ndarray and value.dtype == _FLOAT and value.shape == (count,):
+        return value.copy()
+    wanted = f"a number, or an array of {count} of them"
+    return np.array(_numbers("_reward_policy", value, count, wanted), np.float64)
+
+
+def write_inputs(value: Any, inputs: FloatArray) -> None:
+    """Write the result of ``_get_inputs`` to the inputs of the FMUs, shape (k, N)."""
+    if type(value) is np.ndarray and value.shape == inputs.shape and value.dtype == _FLOAT:
+        inputs[:] = value
+        return
+    given(value, "_get_inputs")
+    length, count = inputs.shape
+    wanted = f"{length} numbers, or arrays of {count}"
+    with _expected("_get_inputs", value, wanted):
+        rows = value if isinstance(value, list | tuple) else _rows_of(value, length)
+        if len(rows) != length:
+            raise ConfigError(f"_get_inputs returned {len(rows)} values, expected {length}")
+        for row, part in zip(inputs, rows, strict=True):
+            row[:] = _numbers("_get_inputs", part, count, wanted)
+
+
+def _rows_of(value: Any, length: int) -> Any:
+    """The rows of an array; an array for a single input may be that row itself."""
+    array = value if isinstance(value, np.ndarray) else np.asarray(value)
+    return array if array.ndim >= (2 if length == 1 else 1) else [array]
+
+
+def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]:
+    """Turn a number, or an array of N numbers, into an array of shape (N,); it may be a view."""
+    given(value, hook)
+    with _expected(hook, value, wanted):
+        array = np.asarray(value)
+        if array.dtype == object:  # decimals, fractions and the like
+            array = np.array([number_of(hook, one) for one in array.flat]).reshape(array.shape)
+        if array.dtype.kind not in _NUMBERS:
+            raise _mismatch(hook, value, wanted)
+        if array.ndim > 1 and array.size == count:
+            array = array.reshape(count)
+        return np.broadcast_to(array, (count,))
+
+
+@contextmanager
+def _expected(hook: str, value: Any, wanted: str) -> Iterator[None]:
+    """Refuse a value that makes no array, or whose own methods fail."""
+    try:
+        yield
+    except FMUGymError:
+        raise
+    except Exception:
+        raise _mismatch(hook, value, wanted) from None
+
+
+def _mismatch(hook: str, value: Any, wanted: str) -> ConfigError:
+    what = shown(value)
+    if type(value) is np.ndarray:
+        what = f"an array of type {value.dtype} and shape {value.shape}"
+    return ConfigError(f"{hook} returned {what}, expected {wanted}")
+
+
+def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
+    """Turn the result of ``_get_observation`` into new arrays with environments first, not last."""
+    hook = "_get_observation"
+    given(value, hook)
+    if isinstance(space, spaces.Dict):
+        wanted = "a dict of " + ", ".join(map(repr, space.spaces))
+        with _expected(hook, value, wanted):
+            if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():
+                raise _mismatch(hook, value, wanted)
+            return {name: observations(value[name], space[name], count) for name in space.spaces}
+    wanted = f"an array of numbers of shape {(*_shape_of(space), count)}"
+    with _expected(hook, value, wanted):
+        array = np.asarray(value)
+        if array.dtype.kind not in _NUMBERS or array.shape != (*_shape_of(space), count):
+            raise _mismatch(hook, value, wanted)
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite is a fault, and found later
+            return np.array(np.moveaxis(array, -1, 0), space.dtype, order="C")
+
+
+def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:
+    return space.shape or ()
+
+
+def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
+    """Copy what a hook has assigned to an episode variable; the last axis becomes (N,)."""
+    try:
+        array = np.array(value)
+        fits = array.dtype.kind in _NUMBERS and array.shape[-1:] in {(), (count,)}
+    except Exception:  # lists that make no array, or objects whose own methods fail
+        fits = False
+    if not fits:
+        raise ConfigError(
+            f"a hook has set the episode variable {name!r} to {shown(value)}, expected a number, "
+            f"or {count} numbers in the last axis"
+        )
+    return array if array.ndim else np.full(count, array)
+
+
+def restore_variable(
+    name: str, row: npt.NDArray[Any], mask: MaskArray, values: npt.NDArray[Any]
+) -> None:
+    """Undo what ``_update`` has assigned to an episode variable of the environments in a mask."""
+    try:
+        row[..., mask] = values
+    except ValueError:
+        raise ConfigError(
+            f"a hook has given the episode variable {name!r} the shape {row.shape}, where it had "
+            f"{(*values.shape[:-1], len(mask))}"
+        ) from None
+
+
+def info_arrays(info: Any, mask: MaskArray) -> dict[str, Any]:
+    """Turn the result of ``_get_info``, environments last, into infos of those in a mask."""
+    given(info, "_get_info")
+    named = check_mapping("what _get_info returned", info)
+    values = {name: _info_array(name, value, mask) for name, value in named.items()}
+    return values | {f"_{name}": mask.copy() for name in values}
+
+
+def _info_array(name: str, value: Any, mask: MaskArray) -> Any:
+    count = len(mask)
+    wanted = f"as {name!r} one value, or an array with {count} elements in the last axis"
+    with _expected("_get_info", value, wanted):
+        if isinstance(value, Mapping):
+            return info_arrays(value, mask)
+        array = np.asarray(value)
+        if array.ndim and array.shape[-1] != count:
+            raise _mismatch("_get_info", value, wanted)
+        rows = np.moveaxis(array, -1, 0) if array.ndim else _everywhere(value, array, count)
+        return within(mask, rows)
+
+
+def _everywhere(value: Any, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
+    """The same value for all environments; text and objects stay what they are."""
+    if array.dtype.kind in "bifc" or array.dtype.kind == "u":
+        return np.full(count, array[()])
+    objects = np.empty(count, object)
+    objects[:] = [value] * count
+    return objects

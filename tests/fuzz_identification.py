@@ -1,0 +1,106 @@
+"""Odd arguments of ``fmugym.identification``: each call ends well or in an error of the package.
+
+    python tests/fuzz_identification.py --count 2000 --seed 0
+
+A case calls one public function, class or method with one or two arguments of a wrong type, range
+or shape. Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
+"""
+
+import functools
+import sys
+
+import numpy as np
+from fuzz_tools import check_text, main, odd, run_cases, spoil
+
+from fmugym import FMUGymError, FMULoadError, bundled_fmu
+from fmugym.identification import Trajectory, fit_parameters, fit_swing, plot_comparison
+
+TIME = np.arange(0.0, 0.4, 0.02)
+SWING = {"q": np.cos(9.9 * TIME), "q_dot": -9.9 * np.sin(9.9 * TIME)}
+FIT = {
+    "fmu": str(bundled_fmu("Pendulum")),
+    "parameters": {"l": (0.05, 0.2)},
+    "trajectories": [Trajectory(TIME, SWING)] * 3,
+    "initial_states": {"q_0": "q"},
+    "fit_initial_states": False,
+    "fixed": {"g": 9.81},
+    "scales": {"q": 1.0},
+    "time_step": 0.02,
+    "clustered": False,
+    "drop_repeats": True,
+    "max_evaluations": 2,
+    "backend": "auto",
+}
+INSIDE = ("parameters", "initial_states", "fixed", "scales")
+
+
+@functools.cache
+def fitted():
+    return fit_parameters(**FIT)
+
+
+@functools.cache
+def swung():
+    return fit_swing(0.02, **SWING)
+
+
+def fit(rng):
+    """Fit with odd arguments, or with odd values in a dict of them."""
+    arguments = spoil(rng, FIT)
+    if rng.random() < 0.5:
+        name = rng.choice(INSIDE)
+        arguments = FIT | {name: {rng.choice(("l", "m", "q", "q_0", "zzz")): odd(rng)}}
+    return lambda: fit_parameters(**arguments)
+
+
+def trajectory(rng):
+    arguments = {"time": TIME, "outputs": SWING, "inputs": {"tau": 0.0}, "label": "x"}
+    if rng.random() < 0.5:
+        name = rng.choice(("outputs", "inputs"))
+        return lambda: Trajectory(**arguments | {name: {"q": odd(rng)}})
+    spoiled = spoil(rng, arguments)
+    return lambda: Trajectory(**spoiled)
+
+
+def swing(rng):
+    arguments = {"time": 0.02, **SWING, "coulomb": True, "v_c": 0.05, "g": 9.81}
+    spoiled = spoil(rng, arguments | {"correlation_time": 0.1})
+    return lambda: fit_swing(**spoiled)
+
+
+def method(rng):
+    """Call a method of a result or of a trajectory with one odd argument."""
+    made, value = FIT["trajectories"][0], odd(rng)
+    calls = (
+        *(made.select, made.windows, lambda x: made.between(x, 1.0), fitted().confidence_intervals),
+        *(lambda x: made.between(0.0, x), fitted().rms, fitted().predict, swung().distributions),
+        *(lambda x: fitted().predict([made], lead_in=x), fitted().comparison.residuals),
+        *(lambda x: fitted().predict([made], refit_initial_states=x), swung().parameters),
+        *(swung().confidence_intervals, lambda x: fitted().comparison.rms_interval("q", x)),
+        *(lambda x: fitted().comparison.rms_interval("q", seed=x), plot_comparison),
+        *(lambda x: plot_comparison(fitted().comparison, x),),
+        *(lambda x: plot_comparison(fitted().comparison, labels=x),),
+    )
+    call = rng.choice(calls)
+    return lambda: call(value)
+
+
+def case(rng, folder):
+    """Run one case; see the top of this file."""
+    use = rng.choice((fit, trajectory, swing, method, method))(rng)
+    try:
+        use()
+    except FMULoadError:
+        return "refused", ""  # its text has the path as it was given
+    except FMUGymError as error:
+        return "refused", check_text(error)
+    return "accepted", ""
+
+
+def run(count, seed, first=0, report=lambda line: None):
+    """Run cases; see ``fuzz_tools.run_cases``."""
+    return run_cases(case, count, seed, first, report)
+
+
+if __name__ == "__main__":
+    sys.exit(main(run, __doc__))

@@ -1,0 +1,114 @@
+"""Actions of vector environments: what is taken, what is refused, and what a refusal leaves."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from vector_tools import (
+    CART_POLE,
+    Drawing,
+    Remembering,
+    each_backend,
+    each_way,
+    make_pair,
+    require_equal,
+    require_same_infos,
+    sampled_actions,
+)
+
+from fmugym import ConfigError
+from fmugym.vector import FMUVectorEnv
+
+
+def test_actions_may_be_lists_and_any_integers():
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2)
+    given = ([1, 0], np.array([1, 0], np.uint8), np.array([True, False]), np.arange(4)[1:-4:-1])
+    results = []
+    for actions in (*given, np.array([1, 0])):
+        vector.reset(seed=0)
+        results.append(vector.step(actions)[0].tolist() if len(actions) == 2 else results[0])
+    assert results == [results[-1]] * 5
+    vector.close()
+
+
+@each_way
+def test_actions_that_do_not_fit(backend, hooks):
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    for actions in ([0], [0, 1, 1], [0, 2], [-1, 0]):
+        with pytest.raises(ConfigError, match="action"):
+            vector.step(np.array(actions))
+    if hooks != "per_env":
+        for actions in (1, [0.0, 1.0], [None, 1], [[0], [1]], "01", [[0, 1], 0]):
+            with pytest.raises(ConfigError, match="action"):
+                vector.step(actions)
+    vector.step(np.array([0, 1]))
+    vector.close()
+
+
+@each_backend
+def test_a_bad_action_is_forgotten(backend):
+    vector, theirs = make_pair(Remembering, backend=backend, num_envs=2)
+    vector.reset(seed=0)
+    theirs.reset(seed=0)
+    good, better = sampled_actions(vector, 2)
+    vector.step(good)
+    theirs.step(good)
+    for bad in (np.full((2, 1), np.nan), np.array([[0.0], [np.inf]]), np.zeros((2, 2))):
+        with pytest.raises(ConfigError):
+            vector.step(bad)
+    first, second = vector.step(better), theirs.step(better)
+    require_equal(first[1], second[1])
+    require_same_infos(first[4], second[4])
+    vector.close()
+    theirs.close()
+
+
+@each_way
+def test_an_action_that_does_not_fit_changes_nothing(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    first = vector.reset(seed=0)[0]
+    with pytest.raises(ConfigError, match=r"environment 2.* is not in Discrete"):
+        vector.step(np.array([0, 1, 7]))
+    assert vector.get_attr("step_count") == (0, 0, 0)
+    assert vector.get_attr("action") == (0, 0, 0)
+    np.testing.assert_array_equal(np.array(vector.get_attr("state"), np.float32), first)
+    twin = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    twin.reset(seed=0)
+    for actions in sampled_actions(vector, 20):
+        require_equal(vector.step(actions)[0], twin.step(actions)[0])
+    vector.close()
+    twin.close()
+
+
+@each_way
+@pytest.mark.parametrize("env_id", ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"])
+def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, backend, hooks):
+    """In the third step environment 1 starts its second episode."""
+    ways = {"hooks": hooks, "backend": backend}
+    vector = gym.make_vec(env_id, num_envs=3, max_episode_steps=3, **ways)
+    vector.reset(seed=0)
+    good = np.zeros(vector.action_space.shape, vector.action_space.dtype)
+    vector.step(good)
+    vector.reset(options={"reset_mask": np.array([True, False, True])})
+    vector.step(good)
+    assert vector.step(good)[3].tolist() == [False, True, False]
+    bad = good.copy()
+    bad[1] = 7 if bad.dtype.kind == "i" else np.nan
+    with pytest.raises(ConfigError, match="environment 1"):
+        vector.step(bad)
+    assert vector.step(good)[3].tolist() == [True, False, True]
+    assert vector.get_attr("step_count") == (3, 0, 3)
+    vector.close()
+
+
+@each_way
+def test_a_nan_is_refused_even_where_no_hook_reads_it(backend, hooks):
+    class Deaf(Drawing):
+        def _get_inputs(self):
+            return 0.0 * self.step_count
+
+    vector = FMUVectorEnv(Deaf, 2, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    with pytest.raises(ConfigError, match="environment 1"):
+        vector.step(np.array([[0.0], [np.nan]], np.float32))
+    vector.close()

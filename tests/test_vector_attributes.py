@@ -1,0 +1,242 @@
+"""Attributes, parameters and methods of the single environments of a vector environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from vector_tools import CART_POLE, Drawing, each_way, require_equal, run_side_by_side
+
+from fmugym import ConfigError, Uniform
+from fmugym.vector import FMUVectorEnv
+
+
+def cart_pole_with(attributes=None, **parameters):
+    env = CART_POLE(model_parameters=parameters)
+    for name, value in (attributes or {}).items():
+        setattr(env, name, value)
+    return env
+
+
+@each_way
+def test_attributes_for_each_environment(backend, hooks):
+    forces, limits = [5.0, 10.0, 15.0], [0.1, 2.4, 0.2]
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    vector.set_attr("force_mag", forces)
+    vector.set_attr("x_threshold", np.array(limits))
+    vector.set_attr("sutton_barto_reward", True)
+    assert vector.get_attr("force_mag") == tuple(forces)
+    assert vector.get_attr("sutton_barto_reward") == (True,) * 3
+    theirs = SyncVectorEnv(
+        [
+            lambda f=force, x=limit: cart_pole_with(
+                {"force_mag": f, "x_threshold": x, "sutton_barto_reward": True}
+            )
+            for force, limit in zip(forces, limits, strict=True)
+        ]
+    )
+    assert run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 100) > 5
+    vector.close()
+    theirs.close()
+
+
+@each_way
+def test_parameters_for_each_environment(backend, hooks):
+    """They hold from the next episode on, several at a time, and options come before them."""
+    masses, frictions = [0.05, 0.1, 0.2], [0.0, 0.5, 1.0]
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    vector.reset(seed=8)
+    vector.set_attr("m_pole", masses)
+    vector.set_attr("m_cart", 0.9)
+    vector.set_attr("g", frictions)
+    assert [p["m_pole"] for p in vector.get_attr("parameters")] == [0.1] * 3
+    theirs = SyncVectorEnv(
+        [
+            lambda m=m, g=g: cart_pole_with(m_pole=m, m_cart=0.9, g=g)
+            for m, g in zip(masses, frictions, strict=True)
+        ]
+    )
+    assert run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 100) > 5
+    assert [p["m_pole"] for p in vector.get_attr("parameters")] == masses
+    options = {"model_parameters": {"m_pole": 0.3}}
+    require_equal(vector.reset(options=options)[0], theirs.reset(options=dict(options))[0])
+    assert [p["m_pole"] for p in vector.get_attr("parameters")] == [0.3] * 3
+    vector.close()
+    theirs.close()
+
+
+@each_way
+def test_parameters_that_the_config_does_not_name_or_draws(backend, hooks):
+    vector = FMUVectorEnv(Drawing, 3, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    vector.set_attr("b", [0.0, 1e-4, 2e-4])
+    vector.set_attr("q_0", [0.1, 0.2, 0.3])
+    theirs = SyncVectorEnv(
+        [
+            lambda b=b, q=q: Drawing(
+                model_parameters={"q_0": q, "q_dot_0": Uniform(-0.5, 0.5), "b": b}
+            )
+            for b, q in ((0.0, 0.1), (1e-4, 0.2), (2e-4, 0.3))
+        ]
+    )
+    run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 20)
+    vector.close()
+    theirs.close()
+
+
+@each_way
+def test_values_that_do_not_fit(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    with pytest.raises(ConfigError, match="there are 2 values of 'force_mag', expected 3"):
+        vector.set_attr("force_mag", [1.0, 2.0])
+    for values in (["a", 1.0, 1.0], [1.0, 1.0, np.nan]):
+        with pytest.raises(ConfigError, match="m_pole"):
+            vector.set_attr("m_pole", values)
+    if hooks != "per_env":
+        with pytest.raises(ConfigError, match="one number for each environment"):
+            vector.set_attr("force_mag", np.ones((3, 2)))
+    vector.close()
+
+
+@each_way
+def test_misspelt_attributes_and_parameters(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    for misspelt, meant in (("force_magg", "force_mag"), ("m_poles", "m_pole")):
+        with pytest.raises(ConfigError, match=f"{misspelt!r}; did you mean {meant!r}"):
+            vector.set_attr(misspelt, [1.0, 2.0, 3.0])
+        with pytest.raises(ConfigError, match="unknown attribute or parameter"):
+            vector.set_attr(misspelt, 1.0)
+        with pytest.raises(AttributeError):
+            vector.get_attr(misspelt)
+    vector.close()
+
+
+@each_way
+def test_methods_are_called_for_each_environment(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+    observations, _ = vector.reset(seed=0)
+    read = vector.call("read_variables", "x")
+    if hooks == "per_env":
+        assert [np.float32(values["x"]) for values in read] == observations[:, 0].tolist()
+    assert vector.call("force_mag") == (10.0, 10.0)
+    assert vector.call("_describe_action") == ("+0.0 N", "+0.0 N")
+    assert vector.get_attr("time") == (0.0, 0.0)
+    vector.close()
+
+
+def test_single_environments_are_read_one_by_one():
+    envs = gym.make_vec("fmugym/CartPole-v0", num_envs=3)
+    envs.reset(seed=1)
+    envs.set_attr("m_pole", [0.1, 0.2, 0.3])
+    envs.reset(seed=1)
+    assert envs.get_attr("m_pole") == (0.1, 0.2, 0.3)
+    assert [read["m_pole"] for read in envs.call("read_variables", "m_pole")] == [0.1, 0.2, 0.3]
+    envs.close()
+
+
+class Limited(CART_POLE):
+    """Its methods write what its hooks read."""
+
+    def __init__(self):
+        super().__init__()
+        self.limit = 2.4
+        self.marks = [0.0]
+
+    def set_limit(self, limit):
+        self.limit = limit
+        return self.limit
+
+    def halve_and_stop(self):
+        self.limit = self.limit / 2
+        self.step_count = 0
+
+    def mark(self, value):
+        self.marks.append(value)
+
+    def name_it(self, name):
+        self.name = name
+
+    def scatter(self):
+        self.limit = 0.01 * self.parameters["m_pole"] + abs(self.state[0])
+
+    def _is_done(self):
+        return abs(self.state[0]) >= self.limit
+
+
+@each_way
+def test_what_a_method_assigns_takes_effect(backend, hooks):
+    vector = FMUVectorEnv(Limited, 3, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    assert vector.step(np.zeros(3, np.int64))[2].tolist() == [False] * 3
+    assert vector.call("set_limit", 0.0) == (0.0,) * 3
+    assert vector.get_attr("limit") == (0.0,) * 3
+    assert vector.step(np.zeros(3, np.int64))[2].tolist() == [True] * 3
+    vector.reset(seed=0)
+    vector.call("set_limit", limit=2.4)
+    assert vector.step(np.zeros(3, np.int64))[2].tolist() == [False] * 3
+    vector.call("scatter")
+    limits = vector.get_attr("limit")
+    assert len(set(limits)) == 3
+    expected = [abs(np.float64(state[0])) + 0.001 for state in vector.get_attr("state")]
+    np.testing.assert_allclose(limits, expected)
+    vector.close()
+
+
+def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing():
+    vector = FMUVectorEnv(Limited, 3, hooks="array")
+    vector.reset(seed=0)
+    vector.step(np.zeros(3, np.int64))
+    with pytest.raises(ConfigError, match="'step_count' cannot be set"):
+        vector.call("halve_and_stop")
+    with pytest.raises(ConfigError, match=r"self\.marks in place"):
+        vector.call("mark", 1.0)
+    assert vector.get_attr("limit") == (2.4,) * 3
+    assert vector.get_attr("marks") == ([0.0],) * 3
+    vector.call("name_it", "trolley")
+    assert vector.get_attr("name") == ("trolley",) * 3
+    vector.close()
+
+
+@each_way
+def test_methods_that_no_environment_can_do_alone(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    for method in ("reset", "step", "close"):
+        with pytest.raises(ConfigError, match=f"{method!r} cannot be called on single"):
+            vector.call(method)
+    assert vector.call("render") == (None, None)
+    for odd in (3, None, ["x"], np.ones(2)):
+        with pytest.raises(ConfigError, match="the name of an attribute must be text"):
+            vector.get_attr(odd)
+    vector.close()
+
+
+ODD_VALUES = (
+    [1.0, [2.0, 3.0], 4.0],
+    [None, 1.0, 2.0],
+    ["a", "b", "c"],
+    [{}, 1.0, 2.0],
+    [1j, 2j, 0],
+)
+
+
+@pytest.mark.parametrize("values", ODD_VALUES, ids=str)
+@each_way
+def test_values_that_are_no_numbers(values, backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    with pytest.raises(ConfigError, match="m_pole"):
+        vector.set_attr("m_pole", values)
+    if hooks != "per_env":
+        with pytest.raises(ConfigError, match="'force_mag' can hold one number"):
+            vector.set_attr("force_mag", values)
+    vector.reset(seed=0)
+    vector.step(np.zeros(3, np.int64))
+    vector.close()
+
+
+@each_way
+def test_what_the_environments_keep_themselves_cannot_be_set(backend, hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+    for name in ("state", "step_count", "time", "action_space", "_pool", "step", "_is_done", "fmu"):
+        with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
+            vector.set_attr(name, 1.0)
+    vector.close()

@@ -1,0 +1,96 @@
+"""Resets of some environments, the modes of autoreset, and limits of episodes."""
+
+import numpy as np
+import pytest
+from vector_tools import Drawing, each_way, sampled_actions
+
+from fmugym import ConfigError, SimulationError
+from fmugym.vector import FMUVectorEnv
+
+
+@each_way
+def test_a_partial_reset_leaves_the_others_alone(backend, hooks):
+    vector, untouched = (FMUVectorEnv(Drawing, 3, hooks=hooks, backend=backend) for _ in range(2))
+    vector.reset(seed=0)
+    untouched.reset(seed=0)
+    actions = sampled_actions(vector, 3)
+    vector.step(actions[0])
+    last = untouched.step(actions[0])[0]
+    mask = np.array([False, True, False])
+    options = {"reset_mask": mask, "model_parameters": {"q_0": 0.5}}
+    observations, infos = vector.reset(options=options)
+    assert observations[[0, 2]].tolist() == last[[0, 2]].tolist()
+    assert observations[1, 0] == np.float32(0.5)
+    assert options.keys() == {"reset_mask", "model_parameters"}
+    assert mask.tolist() == infos["_drawn"].tolist() == [False, True, False]
+    mask[:] = True
+    assert infos["_drawn"].tolist() == [False, True, False]
+    for action in actions[1:]:
+        first, second = vector.step(action), untouched.step(action)
+        assert first[0][[0, 2]].tolist() == second[0][[0, 2]].tolist()
+        assert first[3][[0, 2]].tolist() == second[3][[0, 2]].tolist()
+    assert first[3].tolist() == [True, False, True]
+    vector.close()
+    untouched.close()
+
+
+def test_the_first_reset_is_of_all():
+    vector = FMUVectorEnv(Drawing, 2)
+    with pytest.raises(ConfigError, match="first reset must be of all"):
+        vector.reset(options={"reset_mask": np.array([True, False])})
+    vector.close()
+
+
+@each_way
+def test_disabled_autoreset_wants_a_reset(backend, hooks):
+    vector = FMUVectorEnv(Drawing, 2, autoreset_mode="disabled", hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    actions = sampled_actions(vector, 4)
+    for action in actions[:3]:
+        vector.step(action)
+    with pytest.raises(SimulationError, match="environment 0 has ended"):
+        vector.step(actions[3])
+    vector.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(SimulationError, match="environment 1 has ended"):
+        vector.step(actions[3])
+    vector.reset(options={"reset_mask": np.array([False, True])})
+    vector.step(actions[3])
+    vector.close()
+
+
+@each_way
+@pytest.mark.parametrize(("own", "given", "expected"), [(3, None, 3), (8, 4, 4), (2, 9, 2)])
+def test_truncation_at_the_smaller_limit(own, given, expected, backend, hooks):
+    vector = FMUVectorEnv(
+        lambda: Drawing(max_episode_steps=own),
+        3,
+        max_episode_steps=given,
+        hooks=hooks,
+        backend=backend,
+    )
+    vector.reset(seed=0)
+    for _ in range(3):  # episodes
+        said = [vector.step(action)[3].tolist() for action in sampled_actions(vector, expected)]
+        assert said == [[False] * 3] * (expected - 1) + [[True] * 3]
+        vector.step(sampled_actions(vector, 1)[0])
+    vector.close()
+
+
+@each_way
+def test_the_reset_step_does_not_step_the_fmu(backend, hooks, make_env):
+    """The probe FMU counts its steps."""
+    vector = FMUVectorEnv(
+        lambda: make_env(model_output_names=["steps", "sum"], max_episode_steps=2),
+        2,
+        hooks=hooks,
+        backend=backend,
+    )
+    vector.reset()
+    counts, rewards = [], []
+    for _ in range(7):
+        observations, reward, *_ = vector.step(np.ones((2, 1), np.float32))
+        counts.append(observations[1, 0])
+        rewards.append(reward[1])
+    assert counts == [1, 2, 0, 1, 2, 0, 1]
+    assert rewards == [1, 1, 0, 1, 1, 0, 1]
+    vector.close()

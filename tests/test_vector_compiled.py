@@ -1,0 +1,259 @@
+"""Compiled hooks of vector environments are those of numbers, or are not compiled."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from vector_tools import (
+    CART_POLE,
+    Drawing,
+    PushedCart,
+    each_backend,
+    each_mode,
+    each_way,
+    require_equal,
+    require_pair_equal,
+    require_same_infos,
+    run_side_by_side,
+    sampled_actions,
+)
+
+import fmugym
+from fmugym import ConfigError, Normal, Uniform
+from fmugym.pool import has_native_pool
+from fmugym.vector import FMUVectorEnv
+from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.hooks.program import is_always_finite
+from fmugym.vector.hooks.trace import trace_hooks
+
+needs_native = pytest.mark.skipif(
+    not has_native_pool(), reason="hooks are compiled for the native pool"
+)
+
+
+class Powers(Drawing):
+    """Arithmetic that only numbers and arrays can do: it is not compiled, and no mistake."""
+
+    def _reward_policy(self):
+        q, q_dot = self.state
+        return -(q**2) - abs(q_dot) % 0.1 + float(len(self.state)) // 2
+
+
+@each_backend
+def test_what_cannot_be_compiled_is_left_to_numpy(backend):
+    require_pair_equal(Powers, hooks="auto", backend=backend, rtol=1e-12)
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        FMUVectorEnv(Powers, 2, hooks="compiled", backend=backend)
+
+
+@needs_native
+def test_plain_arithmetic_is_compiled():
+    for cls in (fmugym.envs.CartPoleEnv, fmugym.envs.ModelicaCartPoleEnv, PushedCart):
+        FMUVectorEnv(cls, 2, hooks="compiled").close()
+    with pytest.raises(ConfigError, match="the pool is not the native one"):
+        FMUVectorEnv(fmugym.envs.CartPoleEnv, 2, hooks="compiled", backend="python")
+
+
+class Arithmetic(Drawing):
+    """All that is compiled."""
+
+    def __init__(self, **changes):
+        parameters = {"q_0": Uniform(-1.0, 1.0), "q_dot_0": 0.3, "m": Uniform(0.05, 0.07)}
+        super().__init__(model_parameters=parameters, max_episode_steps=20, start_time=1.0)
+
+    def _get_action_space(self):
+        return gym.spaces.Discrete(3, start=-1)
+
+    def _get_inputs(self):
+        return [np.where(self.action == 1, 0.004, 0.01) * np.minimum(self.action, 0.5)]
+
+    def _is_done(self):
+        q, q_dot = self.state
+        near, slow = (abs(q) > 0.9) & np.logical_not(q_dot < -1.0), np.less_equal(q_dot, 0.2)
+        return near | np.logical_and(q > 0.5, slow) | np.logical_or(q == 0.25, q_dot >= 8.0)
+
+    def _is_truncated(self):
+        return (self.time > 1.2) & (self.step_count != 12) & np.not_equal(self.step_count, 13)
+
+    def _reward_policy(self):
+        q, q_dot = self.state
+        first = np.sqrt(np.abs(q)) + np.square(q_dot) / (1.0 + np.fabs(self.inputs[0]))
+        second = np.maximum(2 * q, -0.1) * np.negative(self.out["q_dot"]) - self.parameters["m"]
+        return first - second + np.where(self.done, -1.0, -0.0) * (0.5 - self.action)
+
+
+class MoreArithmetic(Arithmetic):
+    def _is_done(self):
+        return self.state[0] > 0.9
+
+    def _is_truncated(self):
+        return np.equal(self.step_count, 7)
+
+    def _reward_policy(self):
+        q, q_dot = self.state
+        first = np.true_divide(np.add(q, 1), 3) + np.multiply(q, np.subtract(2.0, q_dot))
+        second = np.where(np.greater(q, 0.3) | np.greater_equal(q_dot, 1.0), -first, 4.0 / (5 + q))
+        return first + second - 1
+
+
+@each_way
+@each_mode
+@pytest.mark.parametrize("cls", [Arithmetic, MoreArithmetic])
+def test_compiled_arithmetic_is_that_of_numbers(cls, mode, backend, hooks):
+    ways = {"backend": backend, "hooks": hooks if hooks != "auto" else "compiled"}
+    assert require_pair_equal(cls, steps=150, mode=mode, num_envs=7, **ways) > 20
+
+
+def many_operations(env):
+    total = env.state[0]
+    for _ in range(100):
+        total = 0.5 * total + env.state[1]
+    return total
+
+
+NOT_COMPILED = {
+    "it uses numpy.sin": lambda env: np.sin(env.state[0]),
+    "it uses numpy.clip": lambda env: np.clip(env.state[0], -1, 1),
+    "it uses numpy.stack": lambda env: np.stack([env.state[0]])[0],
+    "it looks at the step before": lambda env: env.previous_state[0],
+    "it does arithmetic with Booleans": lambda env: (env.state[0] > 0) * (env.state[1] > 0),
+    "it does bit arithmetic": lambda env: 1.0 * (env.action & 1),
+    "values of different types": lambda env: np.where(env.done, True, 0.0),
+    "it computes with float32": lambda env: env.state[0] * np.float32(0.1),
+    r"more than \d+ operations": many_operations,
+    "unsupported operand": lambda env: env.state[0] ** 2,
+}
+
+
+@needs_native
+@pytest.mark.parametrize("reason", NOT_COMPILED)
+def test_reasons_against_compiling(reason):
+    class Other(Arithmetic):
+        def _reward_policy(self):
+            return NOT_COMPILED[reason](self)
+
+    with pytest.raises(ConfigError, match=f"Other cannot be compiled: .*{reason}"):
+        FMUVectorEnv(Other, 2, hooks="compiled")
+    require_pair_equal(Other, steps=20, hooks="auto", rtol=1e-6)
+
+
+CHANGES = {
+    "options": lambda vector: vector.reset(
+        options={
+            "model_parameters": {"m_pole": 0.3},
+            "reset_mask": np.array([True, False, False]),
+        }
+    ),
+    "parameters": lambda vector: vector.set_attr("m_pole", [0.05, 0.2, 0.3]),
+    "another parameter": lambda vector: vector.set_attr("theta_dot_0", [0.01, 0.02, 0.03]),
+    "an attribute": lambda vector: vector.set_attr("x_threshold", 0.05),
+}
+
+
+@needs_native
+@pytest.mark.parametrize("change", CHANGES)
+def test_compiled_hooks_after_a_change(change, monkeypatch):
+    """Once the episodes from before have ended, steps are as fast as before."""
+    on_arrays = []
+    step = BatchEngine.step
+    monkeypatch.setattr(
+        BatchEngine, "step", lambda engine, *given: on_arrays.append(1) or step(engine, *given)
+    )
+    ours, theirs = (
+        FMUVectorEnv(CART_POLE, 3, hooks=hooks, max_episode_steps=12)
+        for hooks in ("compiled", "per_env")
+    )
+    run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 7)
+    assert not on_arrays
+    first, second = CHANGES[change](ours), CHANGES[change](theirs)
+    if first is not None:
+        require_equal(first[0], second[0])
+    for actions in sampled_actions(ours, 60):
+        already = len(on_arrays)
+        first, second = ours.step(actions), theirs.step(actions)
+        for ours_said, theirs_said in zip(first[:4], second[:4], strict=True):
+            require_equal(ours_said, theirs_said)
+        require_same_infos(first[4], second[4])
+    assert len(on_arrays) == already < 30
+    ours.close()
+    theirs.close()
+
+
+def normal_swing():
+    return PushedCart(model_parameters={"x_0": Normal(0.0, 0.1)})
+
+
+@needs_native
+def test_draws_that_the_pool_cannot_make_are_a_reason_against_compiling():
+    with pytest.raises(ConfigError, match=r"draws other than uniform ones.*'x_0'"):
+        FMUVectorEnv(normal_swing, 2, hooks="compiled")
+    FMUVectorEnv(normal_swing, 2, hooks="auto").close()
+
+
+class NotANumber(Arithmetic):
+    """Its reward is NaN where the pendulum swings one way."""
+
+    def _reward_policy(self):
+        return np.sqrt(self.state[1])
+
+
+@needs_native
+def test_programs_whose_results_are_nan_are_the_hooks():
+    FMUVectorEnv(NotANumber, 2, hooks="compiled").close()
+
+
+def constant(env):
+    return np.where(env.done, -1.0, np.minimum(2.0, 1.0))
+
+
+def loaded(env):
+    return np.maximum(abs(env.state[0]), -env.parameters["m"])
+
+
+def overflowing(env):
+    return np.where(env.done, 1.0, env.state[0] * env.state[0])
+
+
+def dividing(env):
+    return 1.0 / env.state[0]
+
+
+@needs_native
+@pytest.mark.parametrize(
+    ("reward", "is_finite"),
+    [(constant, True), (loaded, True), (overflowing, False), (dividing, False)],
+)
+def test_which_rewards_are_always_finite(reward, is_finite):
+    env = type("Other", (Arithmetic,), {"_reward_policy": reward})()
+    _, judgement = trace_hooks(env)
+    assert is_always_finite(judgement, 2) is is_finite
+    env.close()
+
+
+class Unattended(Arithmetic):
+    """It has no inputs."""
+
+    def __init__(self):
+        fmugym.FMUEnv.__init__(
+            self,
+            fmugym.bundled_fmu("Pendulum"),
+            {"model_input_names": [], "model_output_names": ["q", "q_dot"], "time_step": 0.02},
+        )
+
+    def _get_inputs(self):
+        return []
+
+    def _is_done(self):
+        return self.state[0] > 0.9
+
+    def _is_truncated(self):
+        return self.step_count > 8
+
+    def _reward_policy(self):
+        return -self.state[0]
+
+
+def test_an_environment_without_inputs():
+    require_pair_equal(Unattended, steps=20, hooks="auto")
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        FMUVectorEnv(Unattended, 2, hooks="compiled")

@@ -1,0 +1,208 @@
+"""Hooks read and return in a vector environment what they do in a single one."""
+
+import fmu_tools
+import numpy as np
+import pytest
+from vector_tools import (
+    CART_POLE,
+    POOLS,
+    Drawing,
+    Historic,
+    Reaching,
+    Remembering,
+    Shifted,
+    each_backend,
+    each_mode,
+    each_way,
+    require_pair_equal,
+    sampled_actions,
+)
+
+import fmugym
+from fmugym import ConfigError, SimulationError, Uniform
+from fmugym.vector import FMUVectorEnv
+
+
+@each_way
+@each_mode
+def test_hooks_read_what_they_read_in_a_single_environment(mode, backend, hooks):
+    ends = require_pair_equal(
+        Remembering, mode=mode, hooks=hooks, backend=backend, substeps=2, warm_up=0.04
+    )
+    assert ends > 10
+
+
+class Imprecise(Drawing):
+    def _get_observation(self):
+        return np.array(self.state)  # float64
+
+
+@each_way
+def test_observations_have_the_type_of_the_space(backend, hooks):
+    require_pair_equal(Imprecise, hooks=hooks, backend=backend)
+
+
+@each_way
+def test_goal_tasks(backend, hooks):
+    require_pair_equal(Reaching, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(Reaching, 3, hooks=hooks, backend=backend)
+    vector.reset(seed=0)
+    observations, rewards, *_, infos = vector.step(sampled_actions(vector, 1)[0])
+    goals = observations["achieved_goal"], observations["desired_goal"]
+    assert vector.call("compute_reward", *goals, infos)[0].tolist() == rewards.tolist()
+    vector.close()
+
+
+@each_way
+def test_an_episode_variable_may_hold_several_numbers(backend, hooks):
+    require_pair_equal(Historic, hooks=hooks, backend=backend)
+
+
+@each_way
+def test_discrete_actions_with_another_start(backend, hooks):
+    require_pair_equal(Shifted, hooks=hooks, backend=backend)
+
+
+@each_way
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"model_input_names": ["c", "a", "b"], "model_output_names": ["mix", "sum"]},
+        {"model_input_names": ["a", "n", "on"], "model_output_names": ["n_out", "on_out", "sum"]},
+        {"model_input_names": "n", "model_output_names": ["n_out", "steps"]},
+        {"model_input_names": "mode", "model_output_names": ["mode_out", "mix"]},
+        {"model_input_names": "on", "model_output_names": "on_out"},
+        {"model_input_names": ["on", "trim"], "model_output_names": ["on_out", "mix"]},
+        {"model_parameters": {"a": 0.5, "trim": Uniform(0, 1)}, "monitor_names": "steps"},
+    ],
+    ids=["reals", "mixed", "integer", "enumeration", "boolean", "tunable", "start"],
+)
+def test_types_of_inputs_and_outputs(config, backend, hooks, probe):
+    class Typed(fmu_tools.PlainEnv):
+        def __init__(self):
+            defaults = {"max_episode_steps": 4, "episode_variables": {"x": Uniform(0, 1)}}
+            super().__init__(probe(), fmu_tools.probe_config(**defaults | config))
+
+        def _get_info(self):
+            return {"inputs": np.array(self.inputs), "x": self.variables["x"]}
+
+    require_pair_equal(Typed, steps=30, hooks=hooks, backend=backend)
+
+
+@each_backend
+def test_discrete_observations(backend, make_env):
+    """The default hook looks a value up, which takes one environment at a time."""
+    vector = FMUVectorEnv(lambda: make_env(model_output_names="mode_out"), 3, backend=backend)
+    observations, _ = vector.reset()
+    assert observations.dtype == np.int64
+    assert observations.tolist() == [0, 0, 0]
+    vector.close()
+
+
+class NoInputs(Drawing):
+    def _get_inputs(self):
+        return None
+
+
+class NoReward(Drawing):
+    def _reward_policy(self):
+        return None
+
+
+class NoDone(Drawing):
+    def _is_done(self):
+        return None
+
+
+class NoObservation(Drawing):
+    def _get_observation(self):
+        return None
+
+
+class TooManyInputs(Drawing):
+    def _get_inputs(self):
+        return [self.action[0], self.action[0]]
+
+
+class RandomHook(Drawing):
+    def _reward_policy(self):
+        return self.np_random.random()
+
+
+def reset_and_step(vector):
+    vector.reset(seed=0)
+    vector.step(np.zeros((2, 1), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("cls", "error", "text"),
+    [
+        (NoInputs, ConfigError, "_get_inputs returned None"),
+        (NoReward, ConfigError, "_reward_policy returned None"),
+        (NoDone, ConfigError, "_is_done returned None"),
+        (NoObservation, ConfigError, "_get_observation returned None"),
+        (TooManyInputs, ConfigError, "2 values, expected 1"),
+        (RandomHook, SimulationError, "a hook drew random numbers"),
+    ],
+)
+@each_way
+def test_mistakes_in_hooks(cls, error, text, backend, hooks):
+    vector = FMUVectorEnv(cls, 2, hooks=hooks, backend=backend)
+    with pytest.raises(error, match=text):
+        reset_and_step(vector)
+    vector.close()
+
+
+class Delegating(fmugym.envs.CartPoleEnv):
+    """Keeps bound methods of its own in attributes."""
+
+    def __init__(self):
+        super().__init__()
+        self.judge = self._lean
+
+    def _lean(self):
+        return 1.0 - abs(self.state[2])
+
+    def _reward_policy(self):
+        return self.judge()
+
+
+@each_way
+def test_bound_methods_in_attributes(backend, hooks):
+    require_pair_equal(Delegating, hooks=hooks, backend=backend)
+
+
+class OwnStep(CART_POLE):
+    """Its hooks branch, and its ``step`` does more than the inherited one."""
+
+    def _is_done(self):
+        return True if abs(self.out["x"]) > 0.1 else super()._is_done()
+
+    def step(self, action):
+        *result, info = super().step(action)
+        return *result, info | {"force": self.inputs[0]}
+
+
+class Branching(CART_POLE):
+    def _is_done(self):
+        return True if abs(self.out["x"]) > 0.1 else super()._is_done()
+
+
+@pytest.mark.parametrize("cls", [OwnStep, Branching])
+@each_backend
+@each_mode
+def test_hooks_that_branch(cls, backend, mode):
+    assert require_pair_equal(cls, mode=mode, hooks="per_env", backend=backend) > 5
+
+
+@each_backend
+def test_fmus_step_together_whatever_the_hooks_are(backend, monkeypatch):
+    vector = FMUVectorEnv(Branching, 5, hooks="per_env", backend=backend)
+    vector.reset(seed=0)
+    calls, pool = [], POOLS[backend]
+    step = pool.step
+    monkeypatch.setattr(pool, "step", lambda *given: calls.append(1) or step(*given))
+    for actions in sampled_actions(vector, 30):
+        vector.step(actions)
+    assert len(calls) == 30
+    vector.close()

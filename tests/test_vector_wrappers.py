@@ -1,0 +1,126 @@
+"""Vector environments in Gymnasium's wrappers, pictures, videos and specs."""
+
+import json
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from vector_tools import IDS, Drawing, each_way, require_equal, sampled_actions
+
+import fmugym
+from fmugym import SimulationError, Uniform
+from fmugym.vector import FMUVectorEnv
+
+
+def test_wrappers_for_statistics_and_normalization():
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=4)
+    wrapped = gym.wrappers.vector.RecordEpisodeStatistics(vector)
+    wrapped = gym.wrappers.vector.NormalizeObservation(wrapped)
+    wrapped = gym.wrappers.vector.ClipReward(wrapped, 0.0, 0.5)
+    wrapped = gym.wrappers.vector.NormalizeReward(wrapped)
+    wrapped.reset(seed=0)
+    lengths = []
+    for actions in sampled_actions(vector, 300):
+        observations, rewards, _, _, infos = wrapped.step(actions)
+        assert np.isfinite(observations).all()
+        assert np.isfinite(rewards).all()
+        if "episode" in infos:
+            mask = infos["_episode"]
+            assert infos["episode"]["r"][mask].tolist() == infos["episode"]["l"][mask].tolist()
+            lengths += infos["episode"]["l"][mask].tolist()
+    assert len(lengths) > 20
+    assert 8 < np.mean(lengths) < 60
+    wrapped.close()
+
+
+def test_statistics_of_partial_resets():
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, autoreset_mode="disabled")
+    wrapped = gym.wrappers.vector.RecordEpisodeStatistics(vector)
+    wrapped.reset(seed=0)
+    for _ in range(5):
+        wrapped.step(np.array([0, 1]))
+    wrapped.reset(options={"reset_mask": np.array([True, False])})
+    assert wrapped.episode_lengths.tolist() == list(vector.get_attr("step_count")) == [0, 5]
+    wrapped.close()
+
+
+def test_array_wrappers_over_single_transforms():
+    vector = gym.make_vec("fmugym/Pendulum-v0", num_envs=3)
+    wrapped = gym.wrappers.vector.RescaleAction(vector, np.float32(-1), np.float32(1))
+    wrapped = gym.wrappers.vector.FlattenObservation(wrapped)
+    wrapped.reset(seed=0)
+    observations, *_ = wrapped.step(np.ones((3, 1), np.float32))
+    assert observations.shape == (3, 3)
+    assert vector.unwrapped.get_attr("inputs") == ((2.0,),) * 3
+    wrapped.close()
+
+
+@each_way
+def test_pictures_of_all(backend, hooks):
+    vector = gym.make_vec(
+        "fmugym/ModelicaCartPole-v0",
+        num_envs=3,
+        render_mode="rgb_array",
+        hooks=hooks,
+        backend=backend,
+        theta_0=Uniform(1.4, 1.7),
+    )
+    with pytest.raises(SimulationError, match="before the first reset"):
+        vector.render()
+    vector.reset(seed=0)
+    pictures = vector.render()
+    assert [picture.shape for picture in pictures] == [(400, 600, 3)] * 3
+    assert not np.array_equal(pictures[0], pictures[1])
+    kept = pictures[0].copy()
+    vector.step(np.array([0, 1, 1]))
+    assert not np.array_equal(vector.render()[0], kept)
+    assert np.array_equal(pictures[0], kept)
+    vector.close()
+    with pytest.raises(SimulationError, match="closed"):
+        vector.render()
+
+
+def test_no_pictures_without_a_render_mode():
+    vector = FMUVectorEnv(Drawing, 2)
+    assert vector.render() is None
+    assert vector.render_mode is None
+    vector.close()
+
+
+def test_videos(tmp_path):
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # moviepy's own
+        recorder = gym.wrappers.vector.RecordVideo(
+            vector, str(tmp_path), video_length=5, step_trigger=lambda step: step == 0
+        )
+        recorder.reset(seed=0)
+        for actions in sampled_actions(vector, 7):
+            recorder.step(actions)
+        recorder.close()
+    (video,) = tmp_path.glob("*.mp4")
+    assert video.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_specs(env_id):
+    vector = gym.make_vec(env_id, num_envs=2, max_episode_steps=11, hooks="array")
+    spec = json.loads(vector.spec.to_json())
+    assert spec["id"] == env_id
+    assert spec["kwargs"]["max_episode_steps"] == 11
+    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(vector.spec.to_json()), num_envs=2)
+    require_equal(vector.reset(seed=0)[0], again.reset(seed=0)[0])
+    assert repr(vector.unwrapped) == f"FMUVectorEnv({env_id[7:-3]}Env, num_envs=2)"
+    vector.close()
+    again.close()
+
+
+def test_registered_classes_of_ones_own():
+    fmugym.register("tests/Drawing-v0", Drawing)
+    vector = gym.make_vec("tests/Drawing-v0", num_envs=2, time_step=0.05)
+    vector.reset(seed=0)
+    vector.step(np.zeros((2, 1), np.float32))
+    assert vector.get_attr("time") == (0.05, 0.05)
+    vector.close()
+    del gym.registry["tests/Drawing-v0"]

@@ -1,0 +1,51 @@
+"""FMUs without inputs run in every setting; a task may choose parameters instead."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym.pool import has_native_pool
+
+SETTINGS = [
+    (hooks, isolation)
+    for hooks in ("array", "per_env", "auto")
+    for isolation in ("none", "process")
+] + ([("compiled", "none")] if has_native_pool() else [])
+
+
+class FallingEnv(fmugym.FMI2CSEnv):
+    """A pendulum that nobody drives."""
+
+    def __init__(self, **options):
+        config = {
+            "model_input_names": [],
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"q_0": fmugym.Uniform(0.1, 1.0)},
+            "time_step": 0.02,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum"), config, **options)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.Discrete(1)
+
+    def _get_inputs(self):
+        return ()
+
+    def _is_done(self):
+        return abs(self.out["q"]) > 2.0
+
+
+@pytest.mark.parametrize(("hooks", "isolation"), SETTINGS)
+def test_vector_equals_single(hooks, isolation):
+    envs = fmugym.FMUVectorEnv(FallingEnv, 3, hooks=hooks, isolation=isolation)
+    singles = [FallingEnv(isolation=isolation) for _ in range(3)]
+    observations, _ = envs.reset(seed=1)
+    expected = [single.reset(seed=1 + i)[0] for i, single in enumerate(singles)]
+    np.testing.assert_array_equal(observations, expected)
+    for _ in range(5):
+        observations = envs.step(np.zeros(3, np.int64))[0]
+        expected = [single.step(0)[0] for single in singles]
+        np.testing.assert_array_equal(observations, expected)
+    for env in (envs, *singles):
+        env.close()

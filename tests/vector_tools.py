@@ -1,0 +1,275 @@
+"""What the tests of vector environments share: comparisons with Gymnasium's own, and classes."""
+
+from collections.abc import Mapping
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import fmugym
+from fmugym import Uniform
+from fmugym.pool import has_native_pool
+from fmugym.pool.python import PythonPool
+from fmugym.vector import FMUVectorEnv
+
+BACKENDS = ("python", "native") if has_native_pool() else ("python",)
+POOLS = {"python": PythonPool}
+if has_native_pool():
+    from fmugym.pool.native import NativePool
+
+    POOLS["native"] = NativePool
+WAYS = [(backend, hooks) for backend in BACKENDS for hooks in ("array", "per_env")]
+WAYS += [("native", "auto")] if has_native_pool() else []  # compiled, where that is possible
+IDS = (
+    "fmugym/CartPole-v0",
+    "fmugym/Pendulum-v0",
+    "fmugym/ModelicaCartPole-v0",
+    "fmugym/CloudPendulum-v0",
+)
+MODES = tuple(AutoresetMode)
+ABSURD = 1e308
+each_backend = pytest.mark.parametrize("backend", BACKENDS)
+each_way = pytest.mark.parametrize(("backend", "hooks"), WAYS)
+each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+CART_POLE = fmugym.envs.CartPoleEnv
+
+
+def require_equal(first, second, rtol=0.0):
+    """Same types, shapes and values; dicts and arrays of objects element by element."""
+    if isinstance(first, Mapping):
+        assert first.keys() == second.keys()
+        for key in first:
+            require_equal(first[key], second[key], rtol)
+        return
+    first, second = np.asarray(first), np.asarray(second)
+    assert (first.dtype, first.shape) == (second.dtype, second.shape)
+    if rtol:
+        np.testing.assert_allclose(first, second, rtol=rtol, atol=0)
+    else:
+        np.testing.assert_array_equal(first, second)
+
+
+def require_same_infos(first, second):
+    """What counts of an entry is only what its mask says."""
+    assert first.keys() == second.keys()
+    for key in first:
+        if f"_{key}" not in first:
+            continue
+        mask = first[f"_{key}"]
+        assert mask.dtype == second[f"_{key}"].dtype == np.bool_
+        assert mask.tolist() == second[f"_{key}"].tolist(), key
+        if isinstance(first[key], Mapping):
+            require_same_infos(first[key], second[key])
+            continue
+        for left, right in zip(first[key][mask], second[key][mask], strict=True):
+            require_equal(left, right)
+
+
+def sampled_actions(env, count, seed=0):
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(count)]
+
+
+def run_side_by_side(ours, theirs, mode, steps, seed=3, rtol=0.0):
+    """Step both with the same actions; returns how many episodes have ended."""
+    first, second = ours.reset(seed=seed), theirs.reset(seed=seed)
+    require_equal(first[0], second[0])
+    require_same_infos(first[1], second[1])
+    ends = 0
+    for actions in sampled_actions(ours, steps):
+        a, b = ours.step(actions), theirs.step(actions)
+        require_equal(a[0], b[0])
+        require_equal(a[1], b[1], rtol)
+        require_equal(a[2], b[2])
+        require_equal(a[3], b[3])
+        require_same_infos(a[4], b[4])
+        ended = a[2] | a[3]
+        ends += int(ended.sum())
+        if mode is AutoresetMode.DISABLED and ended.any():
+            first = ours.reset(options={"reset_mask": ended})
+            second = theirs.reset(options={"reset_mask": ended.copy()})
+            require_equal(first[0], second[0])
+            require_same_infos(first[1], second[1])
+    return ends
+
+
+def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, hooks="array", backend="auto", **kw):
+    ours = FMUVectorEnv(
+        lambda: cls(**kw), num_envs, autoreset_mode=mode, hooks=hooks, backend=backend
+    )
+    theirs = SyncVectorEnv([lambda: cls(**kw)] * num_envs, autoreset_mode=mode)
+    return ours, theirs
+
+
+def require_pair_equal(cls, steps=60, mode=AutoresetMode.NEXT_STEP, rtol=0.0, **keywords):
+    ours, theirs = make_pair(cls, mode, **keywords)
+    ends = run_side_by_side(ours, theirs, mode, steps, rtol=rtol)
+    ours.close()
+    theirs.close()
+    return ends
+
+
+class Drawing(fmugym.FMUEnv):
+    """All start values drawn; what is drawn is up to the config."""
+
+    def __init__(self, **changes):
+        config = {
+            "model_input_names": ["tau"],
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"q_0": Uniform(-1.0, 1.0), "q_dot_0": Uniform(-0.5, 0.5)},
+            "bounds": {"tau": (-0.01, 0.01)},
+            "time_step": 0.02,
+            "max_episode_steps": 3,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum"), config | changes)
+
+    def _is_done(self):
+        return self.state[0] != self.state[0]
+
+
+class Remembering(Drawing):
+    """Reads everything that a hook may read, with arithmetic that is exact in numpy."""
+
+    def __init__(self, **changes):
+        config = {
+            "model_parameters": {"q_0": Uniform(-1.0, 1.0), "m": Uniform(0.05, 0.07)},
+            "episode_variables": {"target": Uniform(-1.0, 1.0), "sum": 0.0, "last": 5.0, "pace": 0},
+            "monitor_names": ["theta_ddot"],
+            "max_episode_steps": 7,
+        }
+        super().__init__(**(config | changes))
+
+    def _update(self):
+        self.variables["pace"] = self.out["q"] - self.variables["last"]
+        self.variables["last"] = self.out["q"]
+        self.variables["sum"] += self.variables["target"] - self.out["q"]
+
+    def _is_done(self):
+        return abs(self.variables["sum"]) > 4.0
+
+    def _is_truncated(self):
+        return (self.time > 0.11) & (self.out["theta_ddot"] > 0)
+
+    def _reward_policy(self):
+        q, q_dot = self.previous_state
+        effort = self.action[0] - 0.5 * self.previous_action[0]
+        reward = -abs(q) - q_dot * q_dot - np.float64(effort) - self.parameters["m"]
+        return np.where(self.done, -10.0, reward)
+
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        return gym.spaces.Dict({"plant": box, "task": gym.spaces.Box(-np.inf, np.inf, (2,))})
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        plant = np.array([q, q_dot, self.previous_state[0]], np.float32)
+        task = np.array([self.variables["sum"], self.variables["pace"]], np.float32)
+        return {"plant": plant, "task": task}
+
+    def _get_info(self):
+        return {
+            "acceleration": self.out["theta_ddot"],
+            "input": self.inputs[0],
+            "before": self.previous_action,
+            "time": self.time,
+            "steps": self.step_count,
+            "last": self.variables["last"],
+            "done": self.done,
+            "kind": "brake",
+            "nested": {"target": self.variables["target"]},
+        }
+
+
+class Cart(fmugym.FMUEnv):
+    """A cart-pole that fails (Discard) under an absurd force."""
+
+    def __init__(self, **config):
+        defaults = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot"],
+            "model_parameters": {"x_0": Uniform(-1.0, 1.0)},
+            "time_step": 0.02,
+            "fault_reward": -7.0,
+            "episode_variables": {"steps": 0.0},
+            "max_episode_steps": 9,
+        }
+        super().__init__(fmugym.bundled_fmu("CartPole"), defaults | config)
+
+    def _update(self):
+        self.variables["steps"] = self.variables["steps"] + 1.0
+
+    def _get_action_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def _get_info(self):
+        return {"steps": self.variables["steps"]}
+
+    def _is_done(self):
+        return abs(self.state[0]) > 5.0
+
+
+class PushedCart(Cart):
+    """The same with two actions and plain hooks, which can be compiled."""
+
+    _update = fmugym.FMUEnv._update
+    _get_info = fmugym.FMUEnv._get_info
+
+    def __init__(self, **config):
+        super().__init__(episode_variables={}, **config)
+
+    def _get_action_space(self):
+        return gym.spaces.Discrete(2)
+
+    def _get_inputs(self):
+        return self.action * ABSURD
+
+
+class Reaching(Drawing):
+    """A goal task."""
+
+    def __init__(self, **changes):
+        super().__init__(episode_variables={"goal": Uniform(-1.0, 1.0)}, **changes)
+
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+        return gym.spaces.Dict({"achieved_goal": box, "desired_goal": box, "observation": box})
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        goal = self.variables["goal"]
+        parts = {"achieved_goal": q, "desired_goal": goal, "observation": q_dot}
+        return {name: np.array([part]) for name, part in parts.items()}
+
+    def _goal_reward(self, achieved_goal, desired_goal):
+        return -(np.abs(achieved_goal - desired_goal)[..., 0] > 0.5).astype(np.float64)
+
+
+class Historic(Drawing):
+    """Keeps several numbers in one episode variable."""
+
+    def __init__(self):
+        super().__init__(episode_variables={"history": 0.0})
+
+    def _update(self):
+        q, q_dot = self.state
+        self.variables["history"] = np.array([q, q_dot]) + 0.5 * self.variables["history"]
+
+    def _reward_policy(self):
+        return self.variables["history"][0] + self.variables["history"][1]
+
+
+class Shifted(Drawing):
+    """A ``Discrete`` that does not begin with 0; what was before the first action is its start."""
+
+    def _get_action_space(self):
+        return gym.spaces.Discrete(3, start=-1)
+
+    def _get_inputs(self):
+        return 0.01 * self.action
+
+    def _reward_policy(self):
+        return self.action + 10 * self.previous_action
+
+    def _get_info(self):
+        return {"action": self.action, "before": self.previous_action}
