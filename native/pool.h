@@ -30,7 +30,8 @@ typedef struct {
     bool private_libraries;   /* whether there is one for each instance */
     bool logging;
     bool can_save;
-    bool restores; /* whether episodes begin by a restored state where the start values are the same */
+    bool restores; /* whether episodes begin by a restored state where the start values are the same
+                    */
     bool rebuilds; /* whether each episode begins with a new instance, */
     bool reloads;  /* and with its private library loaded anew */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */

@@ -13,7 +13,7 @@ enum {
     PROGRAM_RESULTS = 16  /* results, at most */
 };
 
-/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order, which is compared
+/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order. They are compared
  * when that is imported. */
 typedef enum {
     LOAD_OUTPUT,

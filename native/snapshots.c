@@ -77,9 +77,10 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
     const size_t index = index_of(pool, me);
 
     if (me->phase != PHASE_STEPPING) {
-        return instance_refuse(me, me->phase == PHASE_INSTANTIATED
-                              ? "cannot save the FMU state before the first reset"
-                              : "the instance needs a reset before its FMU state can be saved");
+        return instance_refuse(
+            me, me->phase == PHASE_INSTANTIATED
+                    ? "cannot save the FMU state before the first reset"
+                    : "the instance needs a reset before its FMU state can be saved");
     }
     snapshot->generations[index] = me->generation;
     snapshot->steps[index] = me->steps;

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from fmugym.pool import has_native_pool
-from fmugym.vector.hooks import program as trace
+from fmugym.vector.hooks import program
 
 pytest.importorskip("ziglang")
 
@@ -78,19 +78,19 @@ def test_free_threaded_python_is_refused(tmp_path):
 def test_the_table_of_operations_is_that_of_the_extension():
     from fmugym import _native
 
-    trace.require_same_table(_native)
-    assert _native.operations() == trace.OPERATIONS
+    program.require_same_table(_native)
+    assert _native.operations() == program.OPERATIONS
 
 
 @pytest.mark.parametrize(
     "stale",
     [
         SimpleNamespace(),
-        SimpleNamespace(operations=lambda: trace.OPERATIONS, MOST_INSTRUCTIONS=64),
-        SimpleNamespace(operations=lambda: trace.OPERATIONS[:-1], MOST_INSTRUCTIONS=128),
-        SimpleNamespace(operations=lambda: trace.OPERATIONS[::-1], MOST_INSTRUCTIONS=128),
+        SimpleNamespace(operations=lambda: program.OPERATIONS, MOST_INSTRUCTIONS=64),
+        SimpleNamespace(operations=lambda: program.OPERATIONS[:-1], MOST_INSTRUCTIONS=128),
+        SimpleNamespace(operations=lambda: program.OPERATIONS[::-1], MOST_INSTRUCTIONS=128),
     ],
 )
 def test_a_stale_extension_is_refused_with_the_cure(stale):
     with pytest.raises(ImportError, match="pip install"):
-        trace.require_same_table(stale)
+        program.require_same_table(stale)

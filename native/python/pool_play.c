@@ -179,8 +179,7 @@ static void settle_play(PyPool *self, Playing *playing) {
 }
 
 static bool is_sound(const Play *play) {
-    bool sound = play->judgement.length > 0 &&
-                 program_is_sound(&play->inputs, &play->source) &&
+    bool sound = play->judgement.length > 0 && program_is_sound(&play->inputs, &play->source) &&
                  program_is_sound(&play->judgement, &play->source) &&
                  play->inputs.number_of_results == play->source.number_of_inputs &&
                  play->judgement.number_of_results == 3;

@@ -191,8 +191,8 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
                             "rebuilds",   "reloads",       NULL};
     Settings *s = &self->pool.settings;
     return parse_group(group, "$dOOdLLLppp:experiment", names, &s->experiment.start_time,
-                       &a->stop_time, &a->tolerance, &s->time_step, &a->substeps,
-                       &a->warm_up_steps, &a->retries, &a->restores, &a->rebuilds, &a->reloads);
+                       &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
+                       &a->retries, &a->restores, &a->rebuilds, &a->reloads);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
