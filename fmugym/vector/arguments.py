@@ -106,6 +106,7 @@ def autoreset_mode_of(mode: Any) -> AutoresetMode:
     by_name = {m.name.lower(): m for m in AutoresetMode}
     by_value = {m.value: m for m in AutoresetMode}
     if isinstance(mode, str):
+        mode = str.__str__(mode)  # a subclass may have odd methods
         known = by_value.get(mode) or by_name.get(mode.lower().replace("-", "_"))
         if known is not None:
             return known
