@@ -7,6 +7,7 @@ import tempfile
 
 import fmu_tools
 import pytest
+import tiers
 
 # Nearly every test makes an FMU that nobody has met; test_trial.py turns their trials on.
 os.environ["FMUGYM_PROBE"] = "off"
@@ -16,14 +17,12 @@ os.environ["FMUGYM_CACHE_DIR"] = _cache.name
 
 @pytest.hookimpl(tryfirst=True)  # before pytest looks at -m
 def pytest_collection_modifyitems(items):
-    """Mark as slow what the marker ``sampled`` leaves out of the default run."""
+    """Mark as slow what ``tiers.py`` leaves out of the default run."""
     seen = collections.Counter()
     for item in items:
-        marker = item.get_closest_marker("sampled")
-        if marker is None:
-            continue
-        test = item.nodeid.partition("[")[0]
-        if seen[test] % marker.kwargs["every"]:
+        node_id = item.nodeid.removeprefix("tests/")
+        test = node_id.partition("[")[0]
+        if tiers.is_slow(node_id, seen[test]):
             item.add_marker(pytest.mark.slow)
         seen[test] += 1
 
