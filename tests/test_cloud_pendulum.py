@@ -40,12 +40,6 @@ def fixture_make_lab():
         lab.close()
 
 
-def sessions(lab):
-    """What runs in a lab: leases, experiments and episodes."""
-    lab._bookings.settle(lab.clock.time())
-    return sorted(owner.kind for owner in lab._bookings._live.values())
-
-
 def swings(count, amplitude=0.1, seed=0):
     """Random actions, each kept for a fifth of a second, that pass no limit of the platform."""
     values = np.random.default_rng(seed).uniform(-amplitude, amplitude, -(-count // 10))
@@ -233,10 +227,10 @@ class TestOnTheLab:
         lab = make_lab()
         env = gym.make(ID, backend=Client(lab))
         _, info = env.reset(seed=1)
-        assert sessions(lab) == ["experiment"]
+        assert lab.running == ["experiment"]
         assert (info["sample_age"], info["deadline_misses"]) == (0.0, 0)
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_tokens_of_users(self, make_lab):
         lab = make_lab(users={"ada": User(), "bob": User(gym=False)})
@@ -247,7 +241,7 @@ class TestOnTheLab:
         env.close()
         with pytest.raises(SimulationError, match="has no gym permission"):
             gym.make(ID, backend=lab, user_token="bob", gym_time=60).reset()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_a_lease_of_ones_own_serves_all_episodes(self, make_lab):
         lab = make_lab()
@@ -255,20 +249,20 @@ class TestOnTheLab:
         for _ in range(3):
             env.reset()
             env.step(np.zeros(1, np.float32))
-            assert sessions(lab) == ["episode", "gym"]
+            assert lab.running == ["episode", "gym"]
         assert Client(lab).get_user_info("ada").gym_bucket_size == 19
         assert Client(lab).get_user_info("ada").number_of_attempts == 1000
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_a_lease_that_is_there_is_used_and_left(self, make_lab):
         lab = make_lab()
         token = Client(lab).start_gym("ada", 100.0, [CellType.SINGLE])
         env = gym.make(ID, backend=lab, gym_token=token)
         env.reset()
-        assert sessions(lab) == ["episode", "gym"]
+        assert lab.running == ["episode", "gym"]
         env.close()
-        assert sessions(lab) == ["gym"]
+        assert lab.running == ["gym"]
 
     @pytest.mark.parametrize("names", [{"q_dot_0": 1.0}, {"l": 0.12}, {"q_0": 0.1, "c": 0.0}])
     def test_what_the_lab_cannot_set_is_refused(self, make_lab, names):
@@ -346,7 +340,7 @@ class TestOnTheLab:
         assert info["deadline_misses"] == 1
         assert info["worst_lateness"] == pytest.approx(5.98)
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_without_a_keeper_the_session_is_lost(self, make_lab):
         lab = make_lab()
@@ -361,7 +355,7 @@ class TestOnTheLab:
         env.reset()
         assert "fault" not in env.step(np.zeros(1, np.float32))[4]
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_an_expired_lease(self, make_lab):
         lab = make_lab()
@@ -370,10 +364,10 @@ class TestOnTheLab:
         assert "the lease of its gym is over" in last(env, swings(160))["fault"]
         with pytest.raises(SimulationError, match="the gym has ended"):
             env.reset()
-        assert sessions(lab) == []
+        assert lab.running == []
         env.reset()  # takes a new lease
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_the_session_time(self, make_lab):
         lab = make_lab()
@@ -393,7 +387,7 @@ class TestCells:
         alone = gym.make_vec(ID, num_envs=4, autoreset_mode=mode, max_episode_steps=20)
         for each in (env, alone):
             each.reset(seed=5)
-        assert sessions(lab) == ["episode"] * 4 + ["gym"]
+        assert lab.running == ["episode"] * 4 + ["gym"]
         for action in swings(50):
             actions = np.tile(action, (4, 1))
             got, expected = env.step(actions), alone.step(actions)
@@ -403,7 +397,7 @@ class TestCells:
         assert Client(lab).get_user_info("fmugym").gym_bucket_size == 19
         env.close()
         alone.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_cells_keep_the_same_time(self, make_lab):
         lab = make_lab()
@@ -425,7 +419,7 @@ class TestCells:
         assert lab.clock.time() == pytest.approx(2.0, abs=0.05)
         assert infos["deadline_misses"].tolist() == [0] * 4
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_programs_of_several_threads(self, make_lab):
         """Two programs, each with a lease of its own; time waits for both."""
@@ -448,7 +442,7 @@ class TestCells:
             assert duration == pytest.approx(2.0, abs=0.05)
             assert misses == 0
         assert len(ends) == 2
-        assert sessions(lab) == []
+        assert lab.running == []
 
     def test_more_cells_than_there_are(self, make_lab):
         env = gym.make_vec(ID, num_envs=5, backend=make_lab())
@@ -474,7 +468,7 @@ class TestCells:
         assert "was stopped" in infos["final_info"]["fault"][index]
         assert not env.step(zeros)[3].any()
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
     @pytest.mark.parametrize("vectorization_mode", ["sync", "vector_entry_point"])
     def test_ways_to_vectorize(self, make_lab, vectorization_mode):
@@ -485,7 +479,7 @@ class TestCells:
         env.reset(seed=0)
         assert env.step(np.zeros((2, 1), np.float32))[0].shape == (2, 3)
         env.close()
-        assert sessions(lab) == []
+        assert lab.running == []
 
 
 class Published:

@@ -392,7 +392,7 @@ class TestNothingLeaks:
             assert resources() == before
             assert memory() - before_memory < 5.0
             assert len(list(temp_root.iterdir())) == 2  # the FMU, once for each of two cells
-            assert len(lab._bookings._live) <= 3
+            assert len(lab.running) <= 3
         assert list(temp_root.iterdir()) == []
         assert threading.active_count() == before[0]
 

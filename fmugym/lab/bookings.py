@@ -63,6 +63,11 @@ class Bookings:
             )
         return owner
 
+    @property
+    def kinds(self) -> list[str]:
+        """What runs: the kind of each lease, experiment and episode, in alphabetical order."""
+        return sorted(owner.kind for owner in self._live.values())
+
     def settle(self, now: float) -> None:
         """Bring everything to the present, and remove what has ended.
 

@@ -84,6 +84,13 @@ class Service:
         """Whether `close` was called."""
         return self._is_closed
 
+    @property
+    def running(self) -> list[str]:
+        """What runs now: the kind of each lease, experiment and episode, in alphabetical order."""
+        with self._lock:
+            self._bookings.settle(self.clock.time())
+            return self._bookings.kinds
+
     def close(self) -> None:
         """End all sessions, free the cells and remove temporary videos; twice is fine."""
         with self._lock:
