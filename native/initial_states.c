@@ -105,6 +105,11 @@ static double *start_values_of(const Pool *pool, const Instance *me) {
     return pool->starts + index_of(pool, me) * pool->start_width;
 }
 
+/* The outputs of the start that the saved state belongs to. */
+static double *first_outputs_of(const Pool *pool, const Instance *me) {
+    return pool->first_outputs + index_of(pool, me) * pool->settings.outputs->count;
+}
+
 static bool starts_as_before(const Pool *pool, const Instance *me, const Access *start,
                              const double *values) {
     const size_t size = start->count * sizeof *values;
@@ -135,19 +140,39 @@ static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Sc
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
     instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    return instance_read_outputs(pool, me, scratch);
+    const Status got = instance_read_outputs(pool, me, scratch);
+    if (got == STATUS_OK && me->saved != NULL) {
+        instance_copy_outputs(pool, me, first_outputs_of(pool, me));
+    }
+    return got;
+}
+
+/* Parameters of which the trial knew nothing may change what a restore does. */
+static bool starts_like_the_saved_one(Pool *pool, Instance *me, Scratch scratch) {
+    const size_t size = pool->settings.outputs->count * sizeof(double);
+
+    instance_copy_outputs(pool, me, scratch.values);
+    return memcmp(scratch.values, first_outputs_of(pool, me), size) == 0;
+}
+
+static void give_state_up(Pool *pool, Instance *me) {
+    instance_free_state(pool, me, &me->saved);
+    me->unsavable = true;
 }
 
 static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
     const Status status = instance_restore(pool, me, me->saved);
 
     if (status > STATUS_WARNING) {
-        instance_free_state(pool, me, &me->saved);
-        me->unsavable = true;
+        give_state_up(pool, me);
         return status;
     }
     instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    return instance_read_outputs(pool, me, scratch);
+    const Status got = instance_read_outputs(pool, me, scratch);
+    if (got == STATUS_OK && !starts_like_the_saved_one(pool, me, scratch)) {
+        give_state_up(pool, me);
+    }
+    return got;
 }
 
 Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
@@ -171,6 +196,6 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     if (me->saved != NULL) {
         return status;
     }
-    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* it refused */
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* it did not work */
     return restart(pool, me, call, again, scratch);
 }

@@ -52,8 +52,10 @@ static bool allocate(Pool *pool) {
     pool->names = calloc(s->count, pool->name_size);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
+    pool->first_outputs = calloc(s->restores ? s->count * s->outputs->count + 1 : 1,
+                                 sizeof *pool->first_outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
-           pool->chosen != NULL && pool->starts != NULL;
+           pool->chosen != NULL && pool->starts != NULL && pool->first_outputs != NULL;
 }
 
 static void prepare_instance(Pool *pool, size_t index) {
@@ -134,6 +136,7 @@ void pool_close(Pool *pool) {
     free(pool->libraries);
     free(pool->instance_memory);
     free(pool->starts);
+    free(pool->first_outputs);
     free(pool->names);
     free(pool->chosen);
     unlink_pool(pool);

@@ -140,6 +140,7 @@ typedef struct Pool {
     void *instance_memory;
     double *starts; /* start values of the last initialization, start_width for each instance */
     size_t start_width;
+    double *first_outputs; /* after the initialization whose state was saved, where it restores */
     char *names;
     size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */

@@ -198,8 +198,10 @@ class TestBadArchives:
     def test_limits_in_a_config(self, make_env):
         with pytest.raises(FMULoadError, match="the limit is 1; if you trust it, raise max_entr"):
             make_env(archive_limits=ArchiveLimits(max_entries=1))
-        with pytest.raises(ConfigError, match="limits must be ArchiveLimits, got "):
+        with pytest.raises(FMULoadError, match="the limit is 1; if you trust it, raise max_entr"):
             make_env(archive_limits={"max_entries": 1})
+        with pytest.raises(ConfigError, match="archive_limits"):
+            make_env(archive_limits=[1])
 
     def test_preload_is_a_list(self, fmu_path):
         with pytest.raises(ConfigError, match="preload must be a list of paths, got 'libm"):

@@ -244,9 +244,8 @@ def test_an_exception_in_a_hook_stops_the_rig(kind):
     with pytest.raises(ZeroDivisionError):
         env.step(push(0.0))
     assert rig.calls == ["reset", "step", "step", "stop"]
-    *_, truncated, info = env.step(push(0.0))
-    assert truncated
-    assert "it was not started by a reset" in info["fault"]
+    with pytest.raises(SimulationError, match="after the end of the episode"):
+        env.step(push(0.0))
     env.reset()
     env.close()
     assert rig.calls[4:] == ["reset", "stop"]
@@ -295,7 +294,7 @@ def test_nothing_is_left_behind(kind, temp_root):
         gc.collect()
         for rig in rigs:
             assert rig.calls[-1] == "stop"
-    assert threading.enumerate() == before
+    assert [thread for thread in threading.enumerate() if thread.is_alive()] == before
     assert list(temp_root.iterdir()) == []
 
 

@@ -57,7 +57,7 @@ import sys
 sys.path.insert(0, {str(HERE)!r})
 import fmugym
 from fmu_tools import PlainEnv, probe_config
-from fmugym.env import request_pool
+from fmugym.task.opening import request_pool
 try:
     with request_pool(1, backend={backend!r}):
         env = PlainEnv({str(fmu_path)!r}, probe_config(**{config!r}))

@@ -82,6 +82,7 @@ class Slot:
         self._input_row, self._output_row = input_row, output_row
         self._step_size = spec.communication_step_size
         self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
+        self._first_outputs = b""
         self._build()
 
     def _build(self) -> None:
@@ -114,7 +115,9 @@ class Slot:
         except FMUGymError as error:
             return self._failed(str(error))
         self._begin_counting_at(self._spec.warm_up_steps * self._spec.substeps)
-        return self._read_outputs(Status.OK)
+        status = self._read_outputs(Status.OK)
+        self._first_outputs = self._output_row.tobytes()
+        return status
 
     def count_steps(self) -> None:
         """Add the steps until now to the counts."""
@@ -140,8 +143,11 @@ class Slot:
             return False
         try:
             self._instance.restore_state(self._saved)
+            got = self._outputs.get()
         except SimulationError:  # a reset and an initialization may still work
-            self._saved = None
+            got = Status.ERROR
+        if not _is_fine(got) or self._output_row.tobytes() != self._first_outputs:
+            self._saved, self._restores = None, False  # whatever the trial has found
         return self._saved is not None
 
     def _keep_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> None:

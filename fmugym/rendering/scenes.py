@@ -65,11 +65,10 @@ class CartPoleScene:
     force_scale: float = 10.0
 
     def __post_init__(self) -> None:
-        check_number("x_threshold", self.x_threshold, positive=True)
-        check_number("pole_length", self.pole_length, positive=True)
-        check_number("force_scale", self.force_scale, positive=True)
-        if self.angle_threshold is not None:
-            check_number("angle_threshold", self.angle_threshold, positive=True)
+        for name in ("x_threshold", "pole_length", "force_scale", "angle_threshold"):
+            value = getattr(self, name)
+            if value is not None or name != "angle_threshold":
+                object.__setattr__(self, name, check_number(name, value, positive=True))
 
     @property
     def world(self) -> World:
@@ -166,7 +165,8 @@ class PendulumScene:
     torque_limit: float
 
     def __post_init__(self) -> None:
-        check_number("torque_limit", self.torque_limit, positive=True)
+        limit = check_number("torque_limit", self.torque_limit, positive=True)
+        object.__setattr__(self, "torque_limit", limit)
 
     @property
     def world(self) -> World:

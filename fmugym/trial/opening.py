@@ -164,7 +164,9 @@ class _Plan:
         elif neighbours is not Neighbours.ONE_THREAD:
             workers = self.workers or num_instances
             plan, what = replace(self, isolation="process", workers=workers), "each gets a process"
-        log.warning("the instances of %s disturb each other: %s", fmu.path.name, what)
+        asked_for = self.isolation == "process"
+        level = logging.INFO if asked_for else logging.WARNING
+        log.log(level, "the instances of %s disturb each other: %s", fmu.path.name, what)
         return plan
 
     @property
