@@ -36,7 +36,6 @@ typedef struct Log {
     size_t queued;
     size_t dropped;
     Atomic pending; /* whether there is anything to drain */
-    Atomic muted;   /* number of an instance + 1 whose messages are dropped, or 0 */
 } Log;
 
 bool log_open(Log *log, size_t count);
