@@ -45,8 +45,8 @@ LENGTHS = (3, 12, 12, 5)
 
 METHODS = {
     "well behaved": "restore",
-    "restore forgets": "reset",
-    "restore keeps the time": "reset",
+    "restore forgets": "restore",  # found at the first restore, and given up
+    "restore keeps the time": "restore",  # likewise
     "reset does nothing": "instance",
     "reset keeps the state": "instance",
     "reset keeps inputs": "restore",
