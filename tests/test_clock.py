@@ -37,7 +37,7 @@ class TestManualClock:
     def test_impossible_times(self, time):
         clock = ManualClock()
         for use in (ManualClock, clock.advance, clock.sleep):
-            with pytest.raises(ConfigError, match="must be (a number|finite)"):
+            with pytest.raises(ConfigError, match=r"must be (a number|finite)"):
                 use(time)
         assert clock.time() == 0.0
 
