@@ -6,53 +6,55 @@ default run: of a test with many combinations of parameters, it takes every n-th
 
 SLOW_MODULES = {
     "test_benchmarks",
+    "test_call_order",
     "test_examples",
+    "test_fuzz",
+    "test_fuzz_face",
+    "test_fuzz_hooks",
+    "test_lab_fuzz",
     "test_lab_programs",
+    "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
     "test_soak",
     "test_stand_in",
     "test_without_native",
 }
-"""Programs that train, build wheels or measure."""
+"""Programs that train, build, measure, or make cases by the hundred."""
 
 EVERY = {
-    "test_call_order": 6,
-    "test_cli": 3,
-    "test_equal_to_gymnasium": 2,
-    "test_fmi": 3,
-    "test_hooks": 6,
-    "test_hostile_archive": 3,
-    "test_lab_cells": 2,
-    "test_lab_sessions": 2,
-    "test_lifecycle": 3,
-    "test_native_build": 12,
-    "test_native_pool": 5,
-    "test_number_types": 5,
-    "test_pool": 5,
-    "test_quirks": 9,
-    "test_reproducibility": 5,
-    "test_resources": 4,
-    "test_trial": 2,
-    "test_untidy_archives": 4,
-    "test_user_mistakes": 2,
-    "test_zoo": 11,
+    "test_hostile_archive": 9,
+    "test_pool": 8,
+    "test_quirks": 13,
+    "test_zoo": 29,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""
 
-EVERY_OF_OTHERS = {"test_vector": 6}
-"""By the beginning of a module's name."""
+EVERY_OF_OTHERS = 12
+"""For the modules that are not in ``EVERY``."""
 
-SLOW_TESTS = {
+SLOW_TESTS = (
+    "test_cli.py::TestSkeleton::test_runs_for",
     "test_cloud_pendulum.py::TestExits",
-    "test_fuzz.py",
+    "test_executable.py::TestMissingLibraries::test_beside",
+    "test_guards.py::TestLeaks",
+    "test_hostile_archive.py::TestMemory",
     "test_identification.py::TestOutputError",
     "test_identification.py::test_example",
+    "test_identification.py::test_odd",
+    "test_lab_recording.py::test_temporary_videos",
+    "test_lab_sessions.py::TestNothingLeaks",
     "test_lifecycle.py::TestManyLives",
+    "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
     "test_native_threads.py::test_stress",
+    "test_native_guards.py::test_want_of_memory",
     "test_process_pool.py::TestEndOfParent",
-}
+    "test_process_pool.py::TestChoice",
+    "test_quirks.py::TestVerdict::test_a_damaged_cache",
+    "test_resources.py::test_linux_libraries",
+    "test_specs.py::test_a_class_of_a_script",
+)
 """Others, by the beginning of their node ids."""
 
 
@@ -64,10 +66,6 @@ def is_slow(node_id, number):
         number: How many combinations of the same test came before.
     """
     module = node_id.partition(".py")[0]
-    if module in SLOW_MODULES or node_id.startswith(tuple(SLOW_TESTS)):
+    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS):
         return True
-    every = EVERY.get(module)
-    if every is None:
-        starts = (n for name, n in EVERY_OF_OTHERS.items() if module.startswith(name))
-        every = next(starts, 1)
-    return number % every > 0
+    return number % EVERY.get(module, EVERY_OF_OTHERS) > 0
