@@ -25,20 +25,20 @@
 #if defined FMUGYM_FLOATS_X86
 
 typedef struct {
-    uint32_t sums[4]; /* what the processor makes of sums that every mode rounds in another way */
+    uint32_t sums[4]; /* results of sums that each rounding mode rounds differently */
     uint32_t sse;
     uint16_t x87;
 } Floats;
 
-#define FLOATS_STICKY ((uint32_t)0x3f) /* exceptions seen, which are no modes */
+#define FLOATS_STICKY ((uint32_t)0x3f) /* exception flags, which are not modes */
 
-/* Sums that come out differently rounded upwards (the first) and downwards or towards zero (the
- * second), and where denormal numbers count as zero (the others). */
+/* Computes sums that reveal the modes. The first differs when rounding upwards, the second when
+ * rounding downwards or towards zero, and the others when denormal numbers count as zero. */
 static inline __m128i floats_sums(void) {
     __m128 a = _mm_set_ps(0x1p-140f, 0x1p-140f, 1.0f, 1.0f);
     __m128 b = _mm_set_ps(0x1p-140f, 0x1p-141f, 0x1.8p-24f, 0x1p-26f);
 #if defined __GNUC__
-    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* here and now */
+    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* not evaluated at compile time */
 #else
     volatile __m128 first = a;
     a = _mm_add_ps(first, b);
@@ -114,7 +114,7 @@ static inline Floats floats_now(void) {
     return now;
 }
 
-/* As much as the language can tell without a look at the whole environment. */
+/* Standard C can compare only the rounding mode without reading the whole environment. */
 static inline bool floats_seem_same(const Floats *before) {
     return fegetround() == before->rounding;
 }
