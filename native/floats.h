@@ -1,10 +1,11 @@
 /* The floating-point environment: rounding mode, treatment of denormal numbers, traps.
  *
- * An FMU that leaves another one behind would change the last bits of whatever its thread computes
- * next. So it is restored before the next instance has its turn. Reading the control register takes a
- * tenth of a small FMU's step, because the processor finishes all pending arithmetic first. After a
- * step it is therefore enough to see that sums are rounded as before. What no sum can tell (traps, the
- * control word of the x87) is restored at the end of each chunk of work. */
+ * An FMU that changes the environment would alter the last bits of whatever its thread computes
+ * next. So the pool restores it before the next instance runs. Reading the control register
+ * takes a tenth of a small FMU's step, because the processor first finishes all pending
+ * arithmetic. After a step the pool therefore only checks that sums are rounded as before. Sums
+ * cannot reveal traps or the control word of the x87. Those are restored at the end of each
+ * chunk of work. */
 
 #ifndef FMUGYM_FLOATS_H
 #define FMUGYM_FLOATS_H
@@ -38,7 +39,7 @@ static inline __m128i floats_sums(void) {
     __m128 a = _mm_set_ps(0x1p-140f, 0x1p-140f, 1.0f, 1.0f);
     __m128 b = _mm_set_ps(0x1p-140f, 0x1p-141f, 0x1.8p-24f, 0x1p-26f);
 #if defined __GNUC__
-    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* not evaluated at compile time */
+    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* neither precomputed nor moved */
 #else
     volatile __m128 first = a;
     a = _mm_add_ps(first, b);

@@ -165,7 +165,7 @@ typedef struct {
 
 /* What to do in a call. Fields that the call does not need may be zero. */
 typedef struct {
-    Matrix inputs; /* inputs of this step or, in a reset, of the last one */
+    Matrix inputs; /* inputs of this step, or of the last one */
     Mask mask;
     const Access *start; /* the variables set before initialization */
     Matrix start_values;
@@ -202,7 +202,7 @@ void pool_leave(Pool *pool);
 /* Frees all instances. The pool is then closed to every later caller. */
 void pool_close(Pool *pool);
 
-/* Whether a call is known to be so short that a caller can wait while holding the GIL. */
+/* Whether a call is known to be so short that others can wait for it. */
 bool pool_is_quick(const Pool *pool, int operation);
 
 /* Copies the last failure of an instance. Returns whether there is one. The caller frees said

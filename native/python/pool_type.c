@@ -32,7 +32,9 @@ static bool report_dropped(PyPool *self) {
     return report(self, &message);
 }
 
-/* If an exception interrupts this, the next call reports the remaining messages. */
+/* If an exception interrupts this, the next call reports the remaining messages. Signals are
+ * checked before each message. Otherwise the exception of a signal handler would count as the
+ * receiver's. */
 static bool drain(PyPool *self) {
     size_t dropped;
     Message *left = log_take(&self->pool.log, &dropped);
