@@ -28,7 +28,7 @@ static void assign_memory(Access *access) {
         group->references = place;
         group->positions = place + group->count;
         place += 2 * group->count;
-        group->count = 0; /* counted anew while filling */
+        group->count = 0; /* the loop below counts again */
     }
 }
 
@@ -60,8 +60,8 @@ void access_close(Access *access) {
     access->memory = NULL;
 }
 
-/* Conversions. A float64 outside of the range of an integer type takes the nearest value that the
- * type has, and NaN takes 0: plain casts would be undefined. */
+/* Conversions. A float64 outside the range of an integer type becomes the nearest value of that
+ * type, and NaN becomes 0. Plain casts would be undefined behaviour. */
 
 static double clamp(double value, double low, double high) {
     if (value != value) {

@@ -1,4 +1,4 @@
-/* A list of variables, got or set by one call per C type and instance. */
+/* A list of variables. One call per C type and instance gets or sets them. */
 
 #ifndef FMUGYM_ACCESS_H
 #define FMUGYM_ACCESS_H
@@ -9,7 +9,7 @@ typedef struct {
     Type type;
     size_t count;
     uint32_t *references;
-    uint32_t *positions; /* of the values in the list */
+    uint32_t *positions; /* positions of the values in the list */
 } Group;
 
 typedef struct {
@@ -23,14 +23,14 @@ typedef struct {
 } Access;
 
 /* Groups the variables by type, in the order in which the types first appear. The references are
- * numbers of 32 bits at any address. Returns whether there was enough memory. */
+ * 32-bit numbers and need not be aligned. Returns whether there was enough memory. */
 bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const char *references,
                  size_t count);
 void access_close(Access *access);
 
-/* Both use typed as scratch memory, of access_scratch bytes, and return the worst status; after one
- * worse than a warning no other type is asked. After
- * each call into the FMU the floating-point environment is restored. */
+/* Both functions use typed as scratch memory of access_scratch bytes and return the worst
+ * status. They stop after the first type whose status is worse than a warning. They restore the
+ * floating-point environment after each call into the FMU. */
 static inline size_t access_scratch(const Access *access) {
     return access->count * sizeof(double);
 }

@@ -7,7 +7,7 @@
 #include "failures.h"
 #include "instances.h"
 
-/* Other start variables than before: what was kept of them is of no use any more. */
+/* Makes room for wider rows of start values. The values kept so far no longer apply. */
 static bool make_room_for_starts(Pool *pool, const Access *start) {
     const size_t count = pool->settings.count;
 
@@ -27,7 +27,7 @@ static bool make_room_for_starts(Pool *pool, const Access *start) {
     return true;
 }
 
-/* The new start values may need more room than there is. */
+/* The new start values may need more memory than the pool has. */
 static size_t run_with_starts(Task *task, size_t count) {
     return make_room_for_starts(task->pool, task->call->start) ? schedule_run(task, count)
                                                                : task_give_up(task, 0, count);
@@ -56,7 +56,7 @@ size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
     return troubled;
 }
 
-/* Reads variables of one instance to a column of values. */
+/* Reads variables of one instance into a column of values. */
 static Status read_instance(Pool *pool, Instance *me, const Access *access, double *memory,
                             double *column) {
     if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {

@@ -33,8 +33,9 @@ void pool_leave(Pool *pool) {
     mutex_unlock(&pool->lock);
 }
 
-/* Who is inside may have looked for abandoned ones just before: so a second try. After that, the
- * next one inside finds it. */
+/* The thread inside the pool may have checked for abandoned snapshots just before, so this
+ * thread tries to enter and free the snapshot. If it cannot, the next thread to leave the pool
+ * frees it. */
 void pool_abandon(Pool *pool, Snapshot *snapshot) {
     atomic_set(&snapshot->abandoned, 1);
     atomic_set(&pool->abandoned, 1);

@@ -1,4 +1,5 @@
-/* Why the last status of an instance was worse than a warning, and what is counted of it. */
+/* Failures: why the last status of an instance was worse than a warning. Also the health
+ * counters. */
 
 #ifndef FMUGYM_FAILURES_H
 #define FMUGYM_FAILURES_H
@@ -13,21 +14,22 @@ static inline int64_t *health_of(const Pool *pool, const Instance *me) {
     return pool->settings.health + index_of(pool, me) * HEALTH_COUNTS;
 }
 
-/* Notes a failure and returns it; NULL without memory: then there is a status and no reason. */
+/* Records a failure and returns it. Returns NULL if memory runs out; the status then has no
+ * reason. */
 Failure *failure_note(Instance *me, const char *doing, int status);
 void failure_drop(Instance *me);
 
-/* Notes which calls are still legal after a status. */
+/* Records which calls are still legal after a status. */
 Status instance_judge(Instance *me, Status status);
-/* A call returned a bad status: notes which calls are still legal, and why. */
+/* Handles a bad status of a call: records the reason and which calls are still legal. */
 Status instance_fail(Pool *pool, Instance *me, const char *doing, Status status);
-/* A call was not even made. */
+/* Handles a call that was refused before it reached the FMU. */
 Status instance_refuse(Instance *me, const char *reason);
-/* Values that are not finite are the reason. */
+/* Records values that are not finite as the reason of the failure. */
 Status instance_note_not_finite(Instance *me, const char *what, const double *values, size_t count);
 
 void health_count_fault(const Pool *pool, const Instance *me, Status status);
-/* Adds the steps since the last time; steps count themselves. */
+/* Adds the steps since the last call to the health counters. Instances count their own steps. */
 void health_count_steps(const Pool *pool, Instance *me);
 
 #endif

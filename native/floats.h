@@ -1,10 +1,11 @@
 /* The floating-point environment: rounding mode, treatment of denormal numbers, traps.
  *
- * An FMU that leaves another one behind would change the last bits of whatever its thread computes
- * next. So it is restored before the next instance has its turn. Reading the control register takes a
- * tenth of a small FMU's step, because the processor finishes all pending arithmetic first. After a
- * step it is therefore enough to see that sums are rounded as before. What no sum can tell (traps, the
- * control word of the x87) is restored at the end of each chunk of work. */
+ * An FMU that changes the environment would alter the last bits of whatever its thread computes
+ * next. So the pool restores it before the next instance runs. Reading the control register
+ * takes a tenth of a small FMU's step, because the processor first finishes all pending
+ * arithmetic. After a step the pool therefore only checks that sums are rounded as before. Sums
+ * cannot reveal traps or the control word of the x87. Those are restored at the end of each
+ * chunk of work. */
 
 #ifndef FMUGYM_FLOATS_H
 #define FMUGYM_FLOATS_H
@@ -25,20 +26,20 @@
 #if defined FMUGYM_FLOATS_X86
 
 typedef struct {
-    uint32_t sums[4]; /* what the processor makes of sums that every mode rounds in another way */
+    uint32_t sums[4]; /* results of sums that each rounding mode rounds differently */
     uint32_t sse;
     uint16_t x87;
 } Floats;
 
-#define FLOATS_STICKY ((uint32_t)0x3f) /* exceptions seen, which are no modes */
+#define FLOATS_STICKY ((uint32_t)0x3f) /* exception flags, which are not modes */
 
-/* Sums that come out differently rounded upwards (the first) and downwards or towards zero (the
- * second), and where denormal numbers count as zero (the others). */
+/* Computes sums that reveal the modes. The first differs when rounding upwards, the second when
+ * rounding downwards or towards zero, and the others when denormal numbers count as zero. */
 static inline __m128i floats_sums(void) {
     __m128 a = _mm_set_ps(0x1p-140f, 0x1p-140f, 1.0f, 1.0f);
     __m128 b = _mm_set_ps(0x1p-140f, 0x1p-141f, 0x1.8p-24f, 0x1p-26f);
 #if defined __GNUC__
-    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* here and now */
+    __asm__ volatile("addps %1, %0" : "+x"(a) : "x"(b)); /* neither precomputed nor moved */
 #else
     volatile __m128 first = a;
     a = _mm_add_ps(first, b);
@@ -114,7 +115,7 @@ static inline Floats floats_now(void) {
     return now;
 }
 
-/* As much as the language can tell without a look at the whole environment. */
+/* Standard C can compare only the rounding mode without reading the whole environment. */
 static inline bool floats_seem_same(const Floats *before) {
     return fegetround() == before->rounding;
 }

@@ -1,4 +1,4 @@
-/* The FMI versions behind one table of functions: what the pool needs of co-simulation. */
+/* One table of functions for all FMI versions: what the pool needs for co-simulation. */
 
 #ifndef FMUGYM_FMI_H
 #define FMUGYM_FMI_H
@@ -10,7 +10,7 @@
 #include "floats.h"
 #include "library.h"
 
-/* FMI's own codes, and two of ours; the same values as fmugym.fmi.instance.Status. */
+/* FMI's own codes and two additional ones. fmugym.fmi.instance.Status has the same values. */
 typedef enum {
     STATUS_OK = 0,
     STATUS_WARNING = 1,
@@ -21,8 +21,8 @@ typedef enum {
     STATUS_NOT_FINITE = 7  /* an output is NaN or infinite */
 } Status;
 
-/* The C types of values, as module.c and fmugym/pool/native.py number them. FMI 1.0 and 2.0 have
- * only FLOAT64 (Real), INT32 (Integer) and BOOLEAN. */
+/* The C types of values. module.c and fmugym/pool/native.py use the same numbers. FMI 1.0 and
+ * 2.0 have only FLOAT64 (Real), INT32 (Integer) and BOOLEAN. */
 typedef enum {
     TYPE_FLOAT64,
     TYPE_FLOAT32,
@@ -55,7 +55,7 @@ typedef struct {
     bool has_tolerance;
 } Experiment;
 
-/* Called where start values are due; returns a status. */
+/* A callback that sets the start values and returns a status. */
 typedef struct {
     Status (*set)(void *context);
     void *context;
@@ -65,11 +65,11 @@ typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
 
 typedef struct {
     Status status;
-    Stage stage; /* the call that the status is of */
+    Stage stage; /* the call that returned the status */
 } Outcome;
 
-/* A step of each of several instances, with the setting of its inputs and the getting of its
- * outputs; place says which row of either is its. */
+/* One step for each of several instances. The step sets the inputs before and gets the outputs
+ * after. place gives the row of an instance in the inputs and outputs. */
 typedef struct {
     const uint32_t *input_references, *output_references;
     size_t number_of_inputs, number_of_outputs;
@@ -79,30 +79,29 @@ typedef struct {
     void *const *components;
     const uint32_t *places;
     const double *times;
-    const Floats *floats; /* the environment that each instance shall find */
+    const Floats *floats; /* the environment that each instance must find */
     const double *inputs;
     double *outputs;
     Outcome *outcomes;
 } Exchange;
 
-/* One FMI version. Every function returns one of FMI's own codes, PENDING and unknown ones turned
- * into ERROR; a function that the FMU does not export gives ERROR. */
+/* One FMI version. Every function returns one of FMI's own codes. PENDING and unknown codes
+ * become ERROR. A function that the FMU does not export returns ERROR. */
 typedef struct Fmi {
     size_t boolean_size;
 
-    /* Looks up all functions. Returns whether those are there that nothing can do without; if not,
-     * error tells why. */
+    /* Looks up all functions. Returns whether the required ones exist; if not, error says why. */
     bool (*bind)(Library *library, char *error, size_t size);
 
     void *(*instantiate)(const Library *library, const Identity *identity);
-    /* doing is set to the call that failed. */
+    /* Sets doing to the name of the call that failed. */
     Status (*initialize)(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing);
     /* no_return promises that no state from before this time will be restored. */
     Status (*do_step)(const Library *library, void *component, double time, double step,
                       bool no_return);
-    /* Does steps with inputs and outputs that are all FLOAT64; what exchange_by makes of the
-     * version. Returns whether all of them are OK. */
+    /* Does steps whose inputs and outputs are all FLOAT64. Each version implements it with
+     * exchange_by. Returns whether all steps are OK. */
     bool (*exchange)(const Library *library, const Exchange *exchange);
     Status (*get)(const Library *library, void *component, Type type, const uint32_t *references,
                   size_t count, void *values);
@@ -118,7 +117,7 @@ typedef struct Fmi {
     Status (*get_state)(const Library *library, void *component, void **state);
     Status (*set_state)(const Library *library, void *component, void *state);
     Status (*free_state)(const Library *library, void *component, void **state);
-    /* The serialized size, 0 if the FMU does not tell. */
+    /* The serialized size, or 0 if the FMU does not report it. */
     size_t (*state_size)(const Library *library, void *component, void *state);
 } Fmi;
 
@@ -150,9 +149,10 @@ static inline Outcome exchange_once(const Fmi *fmi, const Library *library, cons
     return outcome;
 }
 
-/* For the versions' own files: with a table that the compiler sees, calls become direct ones. */
+/* For the source files of the FMI versions. The compiler sees their tables there and turns the
+ * calls into direct ones. */
 static inline bool exchange_by(const Fmi *fmi, const Library *library, const Exchange *exchange) {
-    const Exchange e = *exchange; /* which no FMU can change behind the compiler's back */
+    const Exchange e = *exchange; /* a local copy, so the compiler knows that no FMU changes it */
     bool good = true;
 
     for (size_t i = 0; i < e.count; i++) {

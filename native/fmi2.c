@@ -68,7 +68,7 @@ static const Binding bindings[] = {
     {"SerializedFMUstateSize", offsetof(Functions, state_size), false},
 };
 
-/* FMUs keep the pointer: it must be valid as long as any instance. */
+/* FMUs keep the pointer, so it must stay valid as long as any instance exists. */
 static const Callbacks callbacks = {log_message_fmi2, calloc, free, NULL, NULL};
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -108,7 +108,8 @@ static Status initialize(const Library *library, void *component, const Experime
     return status;
 }
 
-/* What a discarded step comes to. Whoever cannot tell why has discarded it. */
+/* Finds out what a discarded step means. An FMU that cannot report the reason counts as
+ * discarding. */
 static Status judge_discard(const Functions *f, void *component) {
     int terminated = 0;
 

@@ -111,7 +111,7 @@ static Status do_step(const Library *library, void *instance, double time, doubl
     if (status <= STATUS_WARNING && terminate) {
         return STATUS_TERMINATED;
     }
-    if (status <= STATUS_WARNING && early_return) { /* it was not allowed */
+    if (status <= STATUS_WARNING && early_return) { /* early return was not allowed */
         return STATUS_DISCARD;
     }
     return status;

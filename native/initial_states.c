@@ -5,7 +5,7 @@
 
 #include "instances.h"
 
-static const size_t STATES_LIMIT = (size_t)256 << 20; /* bytes of initial states of one pool */
+static const size_t STATES_LIMIT = (size_t)256 << 20; /* total bytes of one pool's initial states */
 
 /* Initialization */
 
@@ -14,7 +14,7 @@ typedef struct {
     Instance *me;
     const Access *start;
     Scratch scratch;  /* holds the start values */
-    uint32_t refused; /* the String that could not be set */
+    uint32_t refused; /* value reference of the String that could not be set */
 } StartContext;
 
 static Status set_start_values(void *context) {
@@ -40,7 +40,7 @@ static Status fail_initialization(Pool *pool, Instance *me, const StartContext *
         me->failure->string_reference = context->refused;
     }
     if (me->phase == PHASE_INSTANTIATED) {
-        me->phase = PHASE_FAILED; /* somewhere in the middle of it: a reset is due */
+        me->phase = PHASE_FAILED; /* initialization stopped halfway, so a reset is necessary */
     }
     return status;
 }
@@ -79,8 +79,8 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     return warm_up(pool, me);
 }
 
-/* Initial states: kept once the same start values come a second time, after an episode with steps,
- * and restored from then on. */
+/* Initial states. The pool saves one when the same start values occur a second time, after an
+ * episode with steps. From then on it restores the saved state. */
 
 static bool states_are_of_use(Pool *pool, const Instance *me) {
     return pool->settings.restores && !me->unsavable && !atomic_get(&pool->states_too_large);
@@ -105,7 +105,7 @@ static double *start_values_of(const Pool *pool, const Instance *me) {
     return pool->starts + index_of(pool, me) * pool->start_width;
 }
 
-/* The outputs of the start that the saved state belongs to. */
+/* The outputs just after the initialization whose state was saved. */
 static double *first_outputs_of(const Pool *pool, const Instance *me) {
     return pool->first_outputs + index_of(pool, me) * pool->settings.outputs->count;
 }
@@ -124,7 +124,7 @@ static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
     if (status > STATUS_WARNING) {
         return status;
     }
-    again = again && me->start_id == start->id; /* it may have been replaced */
+    again = again && me->start_id == start->id; /* the instance may have been replaced */
     me->start_id = start->id;
     memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
     if (again && states_are_of_use(pool, me)) {
@@ -147,7 +147,7 @@ static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Sc
     return got;
 }
 
-/* Parameters of which the trial knew nothing may change what a restore does. */
+/* A restore may behave differently if parameters change that the trial did not know about. */
 static bool starts_like_the_saved_one(Pool *pool, Instance *me, Scratch scratch) {
     const size_t size = pool->settings.outputs->count * sizeof(double);
 
@@ -196,6 +196,6 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     if (me->saved != NULL) {
         return status;
     }
-    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* it did not work */
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* restore failed */
     return restart(pool, me, call, again, scratch);
 }

@@ -1,9 +1,9 @@
 #include "inside.h"
 
-/* Which pools a thread is inside of: an FMU written in Python that calls its own pool gets an error
- * instead of waiting for itself. */
+/* The pools that a thread is inside. An FMU written in Python may call its own pool. It gets an
+ * error instead of a deadlock. */
 
-enum { NESTED = 8 }; /* deeper ones are not noticed */
+enum { NESTED = 8 }; /* deeper nesting is not noticed */
 
 static THREAD_LOCAL struct {
     const Pool *pools[NESTED];

@@ -1,11 +1,11 @@
-/* Which pools a thread is inside of. */
+/* The pools that a thread is inside. */
 
 #ifndef FMUGYM_INSIDE_H
 #define FMUGYM_INSIDE_H
 
 #include "pool.h"
 
-/* Notes that this thread is inside a pool, until it is no more. */
+/* begin_inside records that this thread is inside a pool; end_inside ends that. */
 void begin_inside(const Pool *pool);
 void end_inside(void);
 

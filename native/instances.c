@@ -29,12 +29,12 @@ Status instance_free_state(const Pool *pool, Instance *me, void **state) {
             instance_judge(me, pool->settings.fmi->free_state(me->library, me->component, state));
         floats_restore_if_seen(&pool->floats);
     }
-    *state = NULL; /* after Fatal the standard forbids to free it: the memory is given up */
+    *state = NULL; /* FMI forbids freeing the state after Fatal, so its memory is lost */
     return status;
 }
 
-/* Snapshots are linked and unlinked under the pool's lock, but instances are replaced by several
- * threads; each of these touches only what is its own instance's. */
+/* Several threads may replace instances at the same time. Each of them touches only the states
+ * of its own instance. Snapshots are linked and unlinked under the pool's lock. */
 static void free_states(Pool *pool, Instance *me) {
     const size_t index = index_of(pool, me);
 
@@ -67,7 +67,7 @@ void instance_discard(Pool *pool, Instance *me) {
     log_forget(&pool->log, index_of(pool, me));
 }
 
-/* A private library may be loaded anew: whatever Fatal left in its globals is gone then. */
+/* A private library may be loaded again. This clears whatever Fatal left in its globals. */
 static void reload_private_library(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
     char unused[256];
@@ -79,7 +79,7 @@ static void reload_private_library(Pool *pool, Instance *me) {
             library_close(me->library);
         }
     }
-    floats_restore(&pool->floats); /* code runs when a library is loaded, too */
+    floats_restore(&pool->floats); /* loading a library runs code, too */
 }
 
 static Status rebuild(Pool *pool, Instance *me) {
@@ -122,8 +122,8 @@ Status instance_renew_if_due(Pool *pool, Instance *me) {
     return pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
 }
 
-/* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
- * reset. */
+/* Returns an instance to the state just after instantiation. Replaces the instance if it refuses
+ * a reset or can no longer be reset. */
 Status instance_return_to_start(Pool *pool, Instance *me) {
     if (me->phase == PHASE_INSTANTIATED) {
         return STATUS_OK;

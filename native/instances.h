@@ -1,4 +1,4 @@
-/* Instances: made, freed, replaced, their states saved and restored. */
+/* Instances: creating, freeing and replacing them, and saving and restoring their states. */
 
 #ifndef FMUGYM_INSTANCES_H
 #define FMUGYM_INSTANCES_H
@@ -7,12 +7,13 @@
 
 /* Returns whether the FMU could be instantiated. */
 bool instance_build(Pool *pool, Instance *me);
-/* Frees an instance and its states, as far as the standard allows it. */
+/* Frees an instance and its states, as far as FMI allows it. */
 void instance_discard(Pool *pool, Instance *me);
-/* Returns to the state just after instantiation: resets, or replaces what refuses or is past any
- * reset. */
+/* Returns an instance to the state just after instantiation. Replaces the instance if it refuses
+ * a reset or can no longer be reset. */
 Status instance_return_to_start(Pool *pool, Instance *me);
-/* Replaces an instance that is to be recycled because of leaks, or that no reset makes as new. */
+/* Replaces an instance that must be recycled because of leaks, or that a reset does not fully
+ * restore. */
 Status instance_renew_if_due(Pool *pool, Instance *me);
 
 Status instance_save(Pool *pool, Instance *me, void **state);

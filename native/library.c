@@ -1,4 +1,4 @@
-/* Loading of shared libraries, and finding functions in them. */
+/* Loads shared libraries and finds functions in them. */
 
 #include "library.h"
 
@@ -20,7 +20,7 @@ static void *open_handle(const char *path, char *error, size_t size) {
     HMODULE handle = NULL;
 
     if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) != 0) {
-        /* libraries that the FMU's needs are looked for in its own folder */
+        /* searches the FMU's own folder for the libraries that it depends on */
         handle = LoadLibraryExW(wide, NULL, LOAD_WITH_ALTERED_SEARCH_PATH);
     }
     if (handle == NULL) {

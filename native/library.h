@@ -14,7 +14,7 @@ typedef struct {
     void *functions;        /* the table of the FMI version */
 } Library;
 
-/* Returns whether the library was loaded; if not, error tells why. */
+/* Returns whether the library was loaded; if not, error says why. */
 bool library_open(Library *library, const char *path, char *error, size_t size);
 void library_close(Library *library);
 
@@ -25,8 +25,8 @@ typedef struct {
     bool required;
 } Binding;
 
-/* Makes the table of functions, in which NULL stands for what the library does not export. Returns
- * false if a required one is missing; error tells which. */
+/* Fills the table of functions. Functions that the library does not export are NULL. Returns
+ * false if a required one is missing; error says which. */
 bool library_bind(Library *library, const char *prefix, const Binding *bindings, size_t count,
                   size_t table_size, char *error, size_t size);
 

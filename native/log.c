@@ -1,7 +1,7 @@
 /* The logger callbacks of the FMI versions, and the queues behind them.
  *
- * An FMU may log from any thread, its own included. One lock guards everything here: logging is
- * rare, and nothing waits while holding it. */
+ * An FMU may log from any thread, including its own threads. One lock guards everything here.
+ * Logging is rare, and no thread waits while it holds the lock. */
 
 #include "log.h"
 
@@ -127,7 +127,7 @@ static char *duplicate(const char *text) {
     return copy;
 }
 
-/* Receiving, under the lock. A message for which there is no memory is lost. */
+/* Receiving messages. The caller holds the lock. A message is lost if there is no memory for it. */
 
 static void enqueue(Log *log, Message *message) {
     if (log->first == NULL) {
@@ -184,7 +184,7 @@ void log_echo_to(char *memory, size_t size) {
     mutex_unlock(&lock);
 }
 
-/* The oldest makes room for the newest, of which the end is kept. */
+/* The newest message replaces the oldest ones. If it is too long, only its end is kept. */
 static void append_to_echo(const char *category, const char *text) {
     char room[TEXT_SIZE + 64];
     const char *line = room;
@@ -230,7 +230,7 @@ static void deliver(uint64_t environment, int status, const char *category, char
     mutex_unlock(&lock);
 }
 
-/* What was said */
+/* Recent messages */
 
 static char *join(const Recent *recent) {
     size_t size = 1;
@@ -276,9 +276,9 @@ void log_after_fork_in_child(void) {
     mutex_reset(&lock);
 }
 
-/* Callbacks. FMI 1.0 and 2.0 name the instance by its name, which ends in the number of the log and
- * that of the instance, "..._12_3": FMI 1.0 has no other way, and FMUs of FMI 2.0 have been seen to
- * pass anything as the environment. */
+/* Callbacks. FMI 1.0 and 2.0 identify the instance by its name. The name ends in the numbers of
+ * the log and of the instance, "..._12_3". FMI 1.0 offers no other way, and some FMUs of FMI 2.0
+ * pass a wrong environment. */
 
 static uint64_t environment_of(const char *name) {
     const char *last = name == NULL ? NULL : strrchr(name, '_');

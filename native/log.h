@@ -1,4 +1,5 @@
-/* Messages of FMUs: formatted in C, queued per pool, handed to Python by the calling thread. */
+/* Messages of FMUs. C code formats them and queues them per pool. The calling thread passes them
+ * to Python. */
 
 #ifndef FMUGYM_LOG_H
 #define FMUGYM_LOG_H
@@ -13,53 +14,56 @@ enum { LOG_RECENT = 10, LOG_QUEUE_LIMIT = 1000 };
 
 typedef struct Message {
     struct Message *next;
-    size_t index; /* of the instance in its pool */
+    size_t index; /* index of the instance in its pool */
     int status;
     char *category;
     char *text;
 } Message;
 
-/* The last messages of one instance, for the text of failures. */
+/* The last messages of one instance. The texts of failures include them. */
 typedef struct {
     char *texts[LOG_RECENT]; /* a ring; unused places are NULL */
     size_t next;
 } Recent;
 
-/* The receiver of one pool's messages. FMUs name it by number, never by pointer, so a message of an
- * instance that lives longer than its pool finds nobody instead of freed memory. */
+/* The receiver of one pool's messages. FMUs identify it by a number, not by a pointer. If an
+ * instance outlives its pool, its messages find no receiver and touch no freed memory. */
 typedef struct Log {
     struct Log *next;
     uint32_t id;
     size_t count;
-    Recent **recent; /* one place per instance, NULL as long as it said nothing */
+    Recent **recent; /* one entry per instance, NULL until it logs something */
     Message *first, *last;
     size_t queued;
     size_t dropped;
-    Atomic pending; /* whether there is anything to drain */
+    Atomic pending; /* whether messages are queued */
 } Log;
 
 bool log_open(Log *log, size_t count);
 void log_close(Log *log);
 
-/* The number of an instance for FMUs: log and instance in one. */
+/* The number that identifies an instance to FMUs: it combines log and instance. */
 uint64_t log_environment(const Log *log, size_t index);
 
-/* Takes all queued messages; the caller frees each. Also tells how many did not fit. */
+/* Takes all queued messages; the caller frees each. Sets dropped to the number that did not fit. */
 Message *log_take(Log *log, size_t *dropped);
 void message_free(Message *message);
 void messages_free(Message *first);
-/* Puts messages that were taken, and the number of those that did not fit, before the others. */
+/* Puts messages that were taken back in front of the others. Also adds the number of dropped
+ * ones. */
 void log_give_back(Log *log, Message *first, size_t dropped);
 
-/* The recent messages of an instance joined by " | ", to be freed by the caller; NULL if none. */
+/* The recent messages of an instance joined by " | ", or NULL if there are none. The caller
+ * frees them. */
 char *log_said(Log *log, size_t index);
 void log_forget(Log *log, size_t index);
 
-/* From now on the ends of all messages, a line each, are also written to this memory, as a text of
- * less than size bytes, before the FMU goes on: the process may not survive what it does next. */
+/* Also writes the end of every later message to this memory, one line each. The text stays
+ * shorter than size bytes. The FMU continues only after the write, because it may crash the
+ * process next. */
 void log_echo_to(char *memory, size_t size);
 
-/* Fork: the lock is held while it happens, so that the child finds no half-done change. */
+/* Fork. The lock is held during a fork, so that the child finds no unfinished change. */
 void log_before_fork(void);
 void log_after_fork_in_parent(void);
 void log_after_fork_in_child(void);

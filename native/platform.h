@@ -22,18 +22,19 @@
 #include <stdatomic.h>
 #endif
 
-/* In bytes. What several threads write lies on lines of its own. */
+/* In bytes. Data that several threads write gets its own cache lines. */
 enum { CACHE_LINE = 64 };
 
-/* For loops that gain by wider vector instructions, where the processor has them; what they compute is
- * the same, as nothing is fused. */
+/* For loops that run faster with wider vector instructions, where the processor has them. The
+ * results are the same because no operations are fused. */
 #if defined __x86_64__ && defined __linux__ && defined __GLIBC__
 #define WIDE __attribute__((target_clones("avx2", "default")))
 #else
 #define WIDE
 #endif
 
-/* Atomics, all of them sequentially consistent: none is touched more than once per chunk of work. */
+/* Atomics. All are sequentially consistent. That costs little, because each is used at most once
+ * per chunk of work. */
 
 #if defined FMUGYM_STDATOMIC
 
@@ -54,7 +55,8 @@ static inline uint64_t atomic_or_bits(Atomic *a, uint64_t bits) {
 static inline uint64_t atomic_and_bits(Atomic *a, uint64_t bits) {
     return atomic_fetch_and(a, bits);
 }
-/* Returns whether the value was the expected one and was replaced; else expected is updated. */
+/* Replaces the value if it equals the expected one, and returns whether it did. Otherwise stores
+ * the present value in expected. */
 static inline bool atomic_replace(Atomic *a, uint64_t *expected, uint64_t value) {
     return atomic_compare_exchange_strong(a, expected, value);
 }
@@ -87,7 +89,7 @@ static inline bool atomic_replace(Atomic *a, uint64_t *expected, uint64_t value)
 
 #endif
 
-/* The model of few instructions is fine for a few bytes of a library that is loaded late. */
+/* This thread-local storage model suits small data in a library that is loaded late. */
 #if defined _MSC_VER
 #define THREAD_LOCAL __declspec(thread)
 #elif defined __linux__
@@ -182,7 +184,7 @@ static inline uint64_t clock_now(void) {
 #endif
 }
 
-/* Asks for memory that will be read soon, and is nowhere near. */
+/* Prefetches memory that will be read soon and is probably not in the cache. */
 static inline void prefetch(const void *place) {
 #if defined __GNUC__
     __builtin_prefetch(place);

@@ -6,7 +6,7 @@ enum { DONE, TRUNCATED, REWARD };
 
 WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t lowest,
                                 int64_t highest) {
-    int64_t outside = 0; /* as wide as the values, for the compiler's sake */
+    int64_t outside = 0; /* as wide as the values, so that the compiler can vectorize */
 
     for (size_t i = 0; i < count; i++) {
         outside |= (values[i] < lowest) | (values[i] > highest);
@@ -23,8 +23,8 @@ static double *block_of(const Draws *d, size_t index) {
     return d->block + index * d->episodes * d->draws;
 }
 
-/* How many episodes of its block an environment has used; all where there is no such number, as the
- * memory is the owner's. */
+/* How many episodes of its block an environment has used. The owner can write to this memory, so
+ * an invalid number counts as all of them. */
 static size_t used_by(const Draws *d, size_t index) {
     const uint64_t used = (uint64_t)d->used[index];
     return used < d->episodes ? (size_t)used : d->episodes;
@@ -43,7 +43,7 @@ static void draw_ahead(const Draws *d, const Stream *stream, size_t index) {
     }
 }
 
-/* The same arithmetic as that of EpisodePlan.scaled: no fused operations. */
+/* Uses the same arithmetic as EpisodePlan.scaled, without fused operations. */
 void play_draw(const Turn *turn, size_t index) {
     const Play *play = turn->play;
     const Draws *d = &play->draws;
@@ -94,7 +94,8 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     }
 }
 
-/* Without branches, which nobody could foresee; wide values first, then what is left in bytes. */
+/* Avoids branches, because the processor could not predict them. Handles the wide values first,
+ * then the bytes. */
 WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const double *dones,
                          const double *cuts, const double *rewards) {
     const Play *play = turn->play;

@@ -18,39 +18,39 @@ typedef struct {
     uint64_t (*next_raw)(void *state);
 } Stream;
 
-/* The draws of an episode: uniform numbers of [0, 1), drawn ahead for each environment. */
+/* The draws of an episode: uniform numbers in [0, 1), drawn in advance for each environment. */
 typedef struct {
-    size_t draws;    /* of one episode */
-    size_t episodes; /* drawn ahead for one environment */
-    double *block;   /* draws for each episode of each environment */
+    size_t draws;    /* draws of one episode */
+    size_t episodes; /* episodes drawn in advance for one environment */
+    double *block;   /* the draws of each episode of each environment */
     int64_t *used;   /* episodes of its block that an environment has used */
     const double *low, *width;
-    const int64_t *rows; /* of the start values, one for each draw */
+    const int64_t *rows; /* the start value that each draw sets */
 } Draws;
 
-/* What stays the same from step to step; all memory is the owner's. */
+/* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
     size_t count;
     Program inputs;    /* results: the inputs */
     Program judgement; /* results: done, truncated, reward */
-    Source source;     /* but for the actions */
+    Source source;     /* everything except the actions */
     int64_t lowest_action, highest_action;
     double *input_rows;
     double *start_values; /* a row for each start variable */
     Draws draws;
     int64_t *step_counts;
     int64_t limit;  /* steps after which an episode is truncated */
-    uint8_t *ended; /* which environments start an episode instead of a step */
+    uint8_t *ended; /* which environments start an episode instead of taking a step */
 } Play;
 
-/* One step of all environments: where its results go. */
+/* One step of all environments, and where its results go. */
 typedef struct {
     const Play *play;
-    const Stream *const *streams; /* of each environment */
+    const Stream *const *streams; /* the stream of each environment */
     const int64_t *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
-    double *drawn; /* a row for each draw, of which only what is drawn now is written */
+    double *drawn; /* a row for each draw; only the values drawn in this step are written */
 } Turn;
 
 /* Whether an action is out of range. */
@@ -63,15 +63,16 @@ typedef struct {
 
 void play_open(const Turn *turn, PlayScratch *scratch);
 
-/* Both for a run of at most PROGRAM_WIDTH environments: before their instances are reset or
- * stepped, and after; the second returns how many episodes have ended now. */
+/* Both handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
+ * are reset or stepped, the second afterwards. The second returns how many episodes have just
+ * ended. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 
-/* For an environment that is neither reset nor stepped for want of memory. */
+/* For an environment that is neither reset nor stepped because memory ran out. */
 void play_skip(const Turn *turn, size_t index);
 
-/* Asks for the memory that play_draw will read. */
+/* Prefetches the memory that play_draw will read. */
 void play_foresee(const Play *play, size_t index);
 
 /* Draws the start values of an episode, before its instance is reset. */

@@ -36,7 +36,7 @@ static size_t number_of_libraries(const Settings *s) {
     return s->private_libraries ? s->count : 1;
 }
 
-/* The memory is a line longer than needed. */
+/* The memory is one cache line longer than needed, so the start can move to the next line. */
 static void *at_cache_line(void *memory) {
     const uintptr_t rest = (uintptr_t)memory % CACHE_LINE;
     return memory == NULL || rest == 0 ? memory : (char *)memory + (CACHE_LINE - rest);
@@ -51,7 +51,7 @@ static bool allocate(Pool *pool) {
     pool->instances = at_cache_line(pool->instance_memory);
     pool->names = calloc(s->count, pool->name_size);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
-    pool->starts = calloc(1, sizeof *pool->starts); /* of no width yet */
+    pool->starts = calloc(1, sizeof *pool->starts); /* the width is still 0 */
     pool->first_outputs = calloc(s->restores ? s->count * s->outputs->count + 1 : 1,
                                  sizeof *pool->first_outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
@@ -115,7 +115,7 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     return load_libraries(pool, error, size) && build_all(pool, error, size);
 }
 
-/* As many as were made before memory ran out. */
+/* Frees the instances that exist. Memory may have run out before all were made. */
 static void free_instances(Pool *pool) {
     const Settings *s = &pool->settings;
 
@@ -147,7 +147,7 @@ void pool_dispose(Pool *pool) {
     mutex_destroy(&pool->lock);
     mutex_destroy(&pool->making);
 }
-/* Fork: only the forking thread lives on in the child, so what others had locked is free there. */
+/* Fork. Only the forking thread exists in the child, so locks of other threads are free there. */
 
 #if !defined _WIN32
 

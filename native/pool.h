@@ -1,9 +1,9 @@
 /* N instances of one FMU: stepped, reset, saved and restored without Python.
  *
- * The pool writes outputs and statuses into memory of its owner. Calls may come from any thread:
- * each begins with pool_enter or pool_try_enter and ends with pool_leave, so that the calls for one
- * pool take turns. Whoever holds the GIL must not wait for a pool, as the thread inside may need
- * it; that is what pool_try_enter is for. */
+ * The pool writes outputs and statuses into memory of its owner. Any thread may call a pool.
+ * Each call begins with pool_enter or pool_try_enter and ends with pool_leave, so that only one
+ * thread at a time is inside. A thread that holds the GIL must not wait for a pool, because the
+ * thread inside may need the GIL. Such a thread uses pool_try_enter. */
 
 #ifndef FMUGYM_POOL_H
 #define FMUGYM_POOL_H
@@ -20,20 +20,21 @@ typedef struct {
     const char *text;
 } StringValue;
 
-/* What a pool is made from; it must all stay in place as long as the pool does. */
+/* The settings of a pool. Everything they point to must stay in place as long as the pool
+ * exists. */
 typedef struct {
     const Fmi *fmi;
     const char *model; /* the model identifier */
     const char *token;
     const char *resources;
-    const char *const *paths; /* of the library, or of one private copy per instance */
-    bool private_libraries;   /* whether there is one for each instance */
+    const char *const *paths; /* path of the library, or of one private copy per instance */
+    bool private_libraries;   /* whether each instance has its own library */
     bool logging;
     bool can_save;
     bool restores; /* whether episodes begin by a restored state where the start values are the same
                     */
-    bool rebuilds; /* whether each episode begins with a new instance, */
-    bool reloads;  /* and with its private library loaded anew */
+    bool rebuilds; /* whether each episode begins with a new instance */
+    bool reloads;  /* whether a new instance also reloads its private library */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -50,7 +51,7 @@ typedef struct {
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
 } Settings;
 
-/* What is counted of each instance; fugym/pool/base.py has the names in this order. */
+/* The health counters of each instance. fmugym/pool/base.py lists their names in this order. */
 enum {
     RESETS,
     STEPS, /* communication steps until the last reset */
@@ -61,28 +62,28 @@ enum {
     RETRIES,
     REPLACEMENTS,
     RECYCLINGS,
-    DEATHS,  /* of processes; not counted here */
-    RETRIED, /* in the last step */
+    DEATHS,  /* deaths of processes; not counted here */
+    RETRIED, /* retries in the last step */
     HEALTH_COUNTS
 };
 
 typedef enum {
-    PHASE_DEAD, /* after Fatal, or where there is no instance: no call is legal */
+    PHASE_DEAD, /* after Fatal, or if there is no instance: no call is legal */
     PHASE_INSTANTIATED,
     PHASE_STEPPING,
-    PHASE_ENDED, /* after a step that was not done: reading and a reset are legal */
+    PHASE_ENDED, /* after a step that failed: reading and a reset are legal */
     PHASE_FAILED /* after Error: a reset is legal */
 } Phase;
 
 /* Why the last status was worse than a warning. */
 typedef struct {
-    const char *doing; /* what failed; with the status -1 a whole sentence */
+    const char *doing; /* what failed; a whole sentence if the status is -1 */
     int status;
     bool in_warm_up;
-    double time;               /* of a step, NaN for other calls */
-    uint32_t string_reference; /* of the String that could not be set, or UINT32_MAX */
+    double time;               /* time of the step, NaN for other calls */
+    uint32_t string_reference; /* the String that could not be set, or UINT32_MAX */
     char *said;                /* what the FMU logged, or NULL */
-    double *values;            /* the inputs or outputs if these are the reason, or NULL */
+    double *values;            /* the inputs or outputs if they caused the failure, or NULL */
     size_t number_of_values;
 } Failure;
 
@@ -92,20 +93,20 @@ typedef struct {
     void *saved;       /* the FMU state after initialization with the start values, or NULL */
     uint64_t start_id; /* of the list of start variables of the last initialization, or 0 */
     int64_t steps;     /* communication steps done */
-    int64_t counted;   /* of these, those that are in its health */
+    int64_t counted;   /* those steps that are already in its health counters */
     Failure *failure;
-    uint32_t generation; /* goes up whenever the instance is replaced */
+    uint32_t generation; /* increases whenever the instance is replaced */
     uint8_t phase;
-    bool unsavable; /* it refused once */
-    bool due;       /* to be replaced at its next reset */
+    bool unsavable; /* the FMU once refused to save its state */
+    bool due;       /* whether the next reset replaces it */
 } Instance;
 
-/* Threads that work on neighbours do not write to the same line of the cache. */
+/* Threads that work on neighbouring instances must not write to the same cache line. */
 _Static_assert(sizeof(void *) != 8 || sizeof(Instance) == CACHE_LINE, "an instance fills a line");
 
 typedef struct Snapshot {
-    struct Snapshot *next; /* in the list of the pool's snapshots */
-    Atomic abandoned;      /* whether the pool is to free it */
+    struct Snapshot *next; /* next in the list of the pool's snapshots */
+    Atomic abandoned;      /* whether the pool must free it */
     void **states;
     int64_t *steps;
     uint32_t *generations;
@@ -113,10 +114,10 @@ typedef struct Snapshot {
 
 enum { SAMPLES = 8 };
 
-/* The measured cost of an operation: a low quantile of the last samples. What else the machine does
- * makes some samples many times too high, and none too low. */
+/* The measured cost of an operation: a low quantile of the last samples. Other load on the
+ * machine makes some samples much too high, but none too low. */
 typedef struct {
-    double low; /* ns per instance; 0 as long as it is unknown */
+    double low; /* ns per instance; 0 until it is known */
     double samples[SAMPLES];
     uint32_t taken;
     uint32_t calls;
@@ -125,27 +126,27 @@ typedef struct {
 enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
 
 typedef struct Pool {
-    struct Pool *next; /* in the list of all pools */
+    struct Pool *next; /* next in the list of all pools */
     Settings settings;
-    double step_size; /* of a communication step */
+    double step_size; /* communication step size */
     bool no_return;   /* whether no state will ever be restored */
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
-    Floats floats; /* of the thread inside: the environment that FMUs shall find */
-    Mutex making;  /* held while an instance is made or freed: FMUs keep lists of theirs */
+    Floats floats; /* environment of the thread inside, which FMUs must find */
+    Mutex making;  /* held while an instance is made or freed: FMUs may keep lists of them */
     bool open;
     Log log;
     Library *libraries;
-    Instance *instances; /* in instance_memory, at the beginning of a line of the cache */
+    Instance *instances; /* in instance_memory, aligned to a cache line */
     void *instance_memory;
     double *starts; /* start values of the last initialization, start_width for each instance */
     size_t start_width;
-    double *first_outputs; /* after the initialization whose state was saved, where it restores */
+    double *first_outputs; /* outputs of the start whose state was saved, if it restores */
     char *names;
     size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
-    Atomic abandoned; /* whether any of these has been abandoned */
+    Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Atomic states_too_large;
 } Pool;
@@ -162,87 +163,87 @@ typedef struct {
     ptrdiff_t stride;
 } Mask;
 
-/* What to do in a call; what is not needed for it may be zero. */
+/* What to do in a call. Fields that the call does not need may be zero. */
 typedef struct {
-    Matrix inputs; /* of this step, or those of the last one */
+    Matrix inputs; /* inputs of this step, or of the last one */
     Mask mask;
     const Access *start; /* the variables set before initialization */
     Matrix start_values;
     float *observations; /* one row of num_observed for each instance, or NULL */
-    const Turn *turn;    /* what surrounds the steps, or NULL */
+    const Turn *turn;    /* what runs before and after the steps, or NULL */
     bool alone;          /* whether no other thread may help */
 } Call;
 
 /* To be called once per process. */
 void pool_prepare_process(void);
 
-/* Returns whether all could be loaded and instantiated; if not, error tells why, and the pool must
- * be closed. Only pool_open and pool_dispose need no pool_enter. */
+/* Loads and instantiates everything. Returns whether that worked; if not, error says why, and
+ * the caller must still close the pool. Only pool_open and pool_dispose do not need pool_enter. */
 bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size);
 
-/* Frees what a closed pool still has. Nobody may use it any more. */
+/* Frees what a closed pool still holds. Nobody may use the pool afterwards. */
 void pool_dispose(Pool *pool);
 
 typedef enum {
-    ENTRY_ENTERED, /* pool_leave is due */
+    ENTRY_ENTERED, /* the caller must call pool_leave */
     ENTRY_BUSY,    /* another thread is inside */
     ENTRY_CLOSED,
     ENTRY_INSIDE /* this thread is inside: an FMU has called its own pool */
 } Entry;
 
-/* Waits for its turn, so never returns ENTRY_BUSY. */
+/* Waits for its turn, so it never returns ENTRY_BUSY. */
 Entry pool_enter(Pool *pool);
 /* Returns at once. */
 Entry pool_try_enter(Pool *pool);
 void pool_leave(Pool *pool);
 
-/* All functions from here on are for those inside. */
+/* Callers of all functions below must be inside the pool. */
 
-/* Frees all instances; the pool is closed for everyone who enters later. */
+/* Frees all instances. The pool is then closed to every later caller. */
 void pool_close(Pool *pool);
 
-/* Whether a call is known to be so short that nobody will mind waiting for it. */
+/* Whether a call is known to be so short that others can wait for it. */
 bool pool_is_quick(const Pool *pool, int operation);
 
-/* Copies the last failure of an instance. Returns whether there is one, of which the caller frees
- * said and values. */
+/* Copies the last failure of an instance. Returns whether there is one. The caller frees said
+ * and values. */
 bool pool_failure(Pool *pool, size_t index, Failure *copy);
 
-/* Lets the health have all steps until now. */
+/* Adds all steps so far to the health counters. */
 void pool_count_steps(Pool *pool);
 
-/* Lets each instance be replaced by a new one at its next reset. */
+/* Marks each instance for replacement by a new one at its next reset. */
 void pool_recycle(Pool *pool);
 
-/* These return how many of the instances have a status worse than a warning now. */
+/* The following functions return how many instances now have a status worse than a warning. */
 
-/* Steps all instances but those in the mask; writes all observations. */
+/* Steps all instances except those in the mask. Writes all observations. */
 size_t pool_step(Pool *pool, const Call *call);
-/* Starts the instances in the mask (all if there is none) anew; writes their observations. */
+/* Resets the instances in the mask, or all if there is no mask. Writes their observations. */
 size_t pool_reset(Pool *pool, const Call *call);
-/* Starts those in the mask anew and steps the others; writes all observations. */
+/* Resets the instances in the mask and steps the others. Writes all observations. */
 size_t pool_step_or_reset(Pool *pool, const Call *call);
-/* Starts those anew whose episode has ended and steps the others, with the turn's programs before
- * and after; writes all observations and how many episodes have ended now. */
+/* Resets the instances whose episode has ended and steps the others. Runs the programs of the
+ * turn before and after. Writes all observations and how many episodes have just ended. */
 size_t pool_play(Pool *pool, const Call *call, size_t *ended);
 
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 
-/* Snapshots. A new one belongs to the pool that saves its states to it. */
+/* Snapshots. A new snapshot belongs to the pool that saves its states in it. */
 
-Snapshot *snapshot_new(size_t count); /* NULL without memory */
-/* For one that no pool has. */
+Snapshot *snapshot_new(size_t count); /* NULL if memory runs out */
+/* Only for a snapshot that belongs to no pool. */
 void snapshot_free(Snapshot *snapshot);
-/* Returns the index of the first instance that fails, or -1; then the snapshot has been freed or
- * belongs to the pool. */
+/* Returns the index of the first instance that fails, or -1. Afterwards the snapshot has been
+ * freed or belongs to the pool. */
 ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);
-/* Returns whether all instances in the mask are those that were saved, and how many of them have a
- * status worse than a warning now. */
+/* Returns whether all instances in the mask are the ones that were saved. Sets troubled to how
+ * many of them now have a status worse than a warning. */
 bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled);
 
-/* Frees a pool's snapshot, now or once the thread inside the pool leaves. Waits for nobody and may
- * be called from anywhere, so also inside. */
+/* Frees a pool's snapshot, either now or when the thread inside the pool leaves. It never waits
+ * and may be called from anywhere, even from inside the pool. */
 void pool_abandon(Pool *pool, Snapshot *snapshot);
 
 #endif

@@ -33,7 +33,7 @@ const char *const operation_names[NUMBER_OF_OPERATIONS] = {
     [OP_WHERE] = "where",
 };
 
-/* Those that are registers. */
+/* The number of operands that are registers. */
 static size_t number_of_operands(uint16_t operation) {
     if (operation <= LOAD_CONSTANT) {
         return 0;
@@ -64,7 +64,7 @@ static bool load_is_sound(const Program *program, const Source *source, Instruct
     }
 }
 
-/* Operands that an operation does not have are 0, so that they name a register that is there. */
+/* Unused operands must be 0, so that they refer to an existing register. */
 static bool rest_is_zero(Instruction i) {
     const size_t used = i.operation <= LOAD_CONSTANT ? 1 : number_of_operands(i.operation);
     uint16_t rest = 0;
@@ -133,7 +133,7 @@ static void load(const Source *s, Instruction i, size_t begin, size_t count, dou
     case LOAD_STEP_COUNT:
         convert(to, s->step_counts + begin, count);
         break;
-    default: /* a constant, which is there already */
+    default: /* a constant, which program_prepare has written */
         break;
     }
 }

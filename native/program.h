@@ -1,4 +1,5 @@
-/* Programs: the arithmetic of an environment's hooks, evaluated on a run of instances at a time. */
+/* Programs: the arithmetic of an environment's hooks, evaluated for a run of instances at a
+ * time. */
 
 #ifndef FMUGYM_PROGRAM_H
 #define FMUGYM_PROGRAM_H
@@ -8,13 +9,13 @@
 #include <stdint.h>
 
 enum {
-    PROGRAM_WIDTH = 32,   /* instances evaluated together */
-    PROGRAM_LENGTH = 128, /* instructions, and so registers, at most */
-    PROGRAM_RESULTS = 16  /* results, at most */
+    PROGRAM_WIDTH = 32,   /* instances evaluated at the same time */
+    PROGRAM_LENGTH = 128, /* maximum number of instructions and of registers */
+    PROGRAM_RESULTS = 16  /* maximum number of results */
 };
 
-/* OPERATIONS in fmugym/vector/hooks/program.py has their names in the same order. They are compared
- * when that is imported. */
+/* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
+ * that module compares the two. */
 typedef enum {
     LOAD_OUTPUT,
     LOAD_INPUT,
@@ -71,15 +72,15 @@ typedef struct {
 
 typedef double Registers[PROGRAM_LENGTH][PROGRAM_WIDTH];
 
-/* Once before the first run with these registers: constants stay in their place, and where there
- * are fewer instances than a register is wide, the rest is 0. */
+/* Must be called once before the first run with these registers. Writes the constants, which
+ * stay in place. Sets the unused rest to 0 if there are fewer instances than a register is wide. */
 void program_prepare(const Program *program, Registers registers);
 
-/* Whether every operand refers to something that there is. */
+/* Whether every operand refers to something that exists. */
 bool program_is_sound(const Program *program, const Source *source);
 
-/* Evaluates for the instances from begin on, at most PROGRAM_WIDTH of them. Registers are computed
- * in their full width, as loops of a known length become vector instructions. */
+/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Registers are
+ * always computed in full width, because loops of a fixed length become vector instructions. */
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers registers);
 

@@ -71,7 +71,8 @@ static void gather_inputs(const Task *task, size_t begin, size_t count, double *
     }
 }
 
-/* Those that cannot be left as they are: their outputs stay as before. */
+/* Handles outputs that are not finite: the instance fails, and its outputs keep their old
+ * values. */
 static size_t take_not_finite(Task *task, size_t begin, size_t count, double *outputs) {
     Pool *pool = task->pool;
     const size_t width = pool->settings.outputs->count;
@@ -89,7 +90,7 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
     return troubled;
 }
 
-/* One value of each of count rows; four at a time, as there are many. */
+/* Takes one value from each of count rows. Takes four at a time for speed. */
 static void take_column(const double *rows, size_t width, size_t count, double *column) {
     size_t j = 0;
 
@@ -134,14 +135,14 @@ static void write_observations(const Task *task, size_t begin, size_t count,
     }
 }
 
-/* The same scratch memory, without the first instances of its run. */
+/* The same scratch memory, starting at a later instance of the run. */
 static Scratch scratch_from(const Pool *pool, Scratch scratch, size_t place) {
     scratch.inputs += place * pool->settings.inputs->count;
     scratch.outputs += place * pool->settings.outputs->count;
     return scratch;
 }
 
-/* Where a step has given no outputs, those from before are handed out. */
+/* If a step has produced no outputs, hands out the previous ones. */
 static size_t conclude_step(Task *task, size_t index, Status status, double *outputs) {
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         instance_copy_outputs(task->pool, &task->pool->instances[index], outputs);
@@ -149,7 +150,8 @@ static size_t conclude_step(Task *task, size_t index, Status status, double *out
     return note_status(task, index, status);
 }
 
-/* Resets an instance in the mask, or steps another; a plain step leaves those in the mask. */
+/* Resets an instance in the mask and steps any other. A plain step does not touch those in the
+ * mask. */
 static size_t do_one(Task *task, size_t index, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;
@@ -169,8 +171,8 @@ static size_t do_one(Task *task, size_t index, Scratch scratch) {
     return troubled;
 }
 
-/* Those of a run that are stepped together, by one call of the FMI version, and the others; by
- * their places in the run. */
+/* Splits a run into the instances that one call of the FMI version steps together, and the
+ * others. Both lists hold places in the run. */
 typedef struct {
     size_t count, others;
     uint32_t places[RUN], other_places[RUN];
@@ -179,7 +181,8 @@ typedef struct {
     Outcome outcomes[RUN];
 } LineUp;
 
-/* Takes the steps for done. Without branches: nobody can foresee which episodes have ended. */
+/* Counts the steps as done before they happen. Avoids branches, because the processor cannot
+ * predict which episodes have ended. */
 static void line_up(const Task *task, size_t begin, size_t count, bool together, LineUp *line) {
     const Pool *pool = task->pool;
     const Library *library = pool->instances[begin].library;
@@ -201,7 +204,8 @@ static void line_up(const Task *task, size_t begin, size_t count, bool together,
     line->others = others;
 }
 
-/* Asks for the memory that a reset will read, if there is one: many places, far from each other. */
+/* Prefetches the memory that a reset will read, if there is a reset. It is spread over many
+ * places. */
 static void foresee_reset(const Task *task, size_t index) {
     const Call *call = task->call;
     const Matrix *values = &call->start_values;

@@ -1,5 +1,5 @@
-/* Runs: neighbours whose inputs and outputs are moved together, in loops that become vector
- * instructions. */
+/* Runs: neighbouring instances whose inputs and outputs are moved together, in loops that become
+ * vector instructions. */
 
 #ifndef FMUGYM_RUNS_H
 #define FMUGYM_RUNS_H
@@ -7,19 +7,19 @@
 #include "pool.h"
 #include "steps.h"
 
-enum { RUN = PROGRAM_WIDTH /* instances of a run */ };
+enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
 
 /* What a call does; all threads that work on it write to its last fields. */
 typedef struct {
     Pool *pool;
     const Call *call;
     int operation;
-    const Snapshot *snapshot; /* to be restored */
-    bool listed;              /* whether the items are places in pool->chosen, or instances */
+    const Snapshot *snapshot; /* the snapshot to restore */
+    bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
-    Atomic ended;                         /* episodes, when playing */
-    Atomic time;                          /* ns, of all threads together, if measured */
+    Atomic ended;                         /* episodes that have ended, when playing */
+    Atomic time;                          /* total ns of all threads, if measured */
 } Task;
 
 static inline bool is_in(Mask mask, size_t index) {
@@ -30,12 +30,12 @@ static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;
 }
 
-/* All three work on items from begin to end and return how many instances have a status worse than
- * a warning. Resets or restores instances that need not be neighbours: */
+/* All three work on the items from begin to end and return how many instances have a status
+ * worse than a warning. This one resets or restores instances that need not be neighbours: */
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);
-/* Steps or resets: */
+/* This one steps or resets: */
 size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch);
-/* The same with programs before and after: */
+/* This one does the same and runs the programs before and after: */
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch);
 
 /* Writes the first outputs of an instance. */

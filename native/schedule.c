@@ -7,19 +7,19 @@
 #include "threads.h"
 
 /* All in ns. */
-static const double QUICK = 10e3; /* for which others may wait */
+static const double QUICK = 10e3; /* calls this short may block other threads */
 static const double SMALLEST_CHUNK = 2e3;
 static const double LARGEST_CHUNK = 50e3;
-static const double WORTH_A_THREAD = 10e3; /* of work, for which waking another one pays */
+static const double WORTH_A_THREAD = 10e3; /* amount of work that justifies waking another thread */
 
 enum {
     STACK_VALUES = 512,
-    MANY = 64,         /* instances from which on every call is measured */
-    MEASURE_EVERY = 16 /* calls with fewer */
+    MANY = 64,         /* with this many instances or more, every call is measured */
+    MEASURE_EVERY = 16 /* with fewer instances, one call in this many is measured */
 };
 
-/* Without 16 bytes per value nothing else will work either. The caller's arrays are filled all the
- * same: with what was there before. */
+/* If even this little memory is missing, nothing else will work either. The caller's arrays are
+ * still filled, with the previous values. */
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 
@@ -72,7 +72,7 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     return troubled;
 }
 
-/* A chunk of the work, on any thread. */
+/* Works on a chunk, on any thread. */
 static void work(void *context, size_t begin, size_t end) {
     Task *task = context;
     const uint64_t began = task->measured ? clock_now() : 0;
@@ -89,7 +89,7 @@ static void work(void *context, size_t begin, size_t end) {
     }
 }
 
-/* The second smallest of the last samples; the smallest while there are few. */
+/* The second smallest of the last samples, or the smallest while there are few. */
 static double low_quantile(const Cost *cost) {
     const size_t count = cost->taken < SAMPLES ? cost->taken : SAMPLES;
     double first = cost->samples[0], second = INFINITY;
@@ -107,8 +107,8 @@ static void add_sample(Cost *cost, double sample) {
     cost->low = low_quantile(cost);
 }
 
-/* The first time an operation is done nothing is known of its cost: item by item, until there is
- * so much work that helpers are worth while. Returns how many items were done. */
+/* The cost of an operation is unknown the first time. So this works item by item until there is
+ * enough work to justify helpers. Returns how many items were done. */
 static size_t explore(Task *task, Cost *cost, size_t count) {
     size_t done = 0;
 
@@ -125,7 +125,7 @@ static size_t at_least_one(double items) {
     return items < 1.0 ? 1 : items > 1e9 ? (size_t)1e9 : (size_t)items;
 }
 
-/* Items from the first one on that explore has left. */
+/* The items that explore has left, beginning with first. */
 typedef struct {
     Task *task;
     size_t first;
@@ -136,7 +136,7 @@ static void work_on_rest(void *context, size_t begin, size_t end) {
     work(rest->task, rest->first + begin, rest->first + end);
 }
 
-/* Threads that are worth waking besides the caller's. */
+/* The number of threads worth waking in addition to the caller's. */
 static size_t number_of_helpers(const Task *task, double total) {
     const size_t most = task->pool->settings.threads - 1;
     const size_t wanted = at_least_one(total / WORTH_A_THREAD) - 1;

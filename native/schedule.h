@@ -8,12 +8,12 @@
 /* Works on items 0 to count - 1. Returns how many instances have a status worse than a warning. */
 size_t schedule_run(Task *task, size_t count);
 
-/* Lists the instances in a mask, all if there is none, for tasks that are listed. Returns their
- * number. */
+/* Lists the instances in a mask, or all if there is none, for tasks that use a list. Returns
+ * their number. */
 size_t schedule_choose(Pool *pool, Mask mask);
 
-/* Does not work on items, for want of memory. The caller's arrays are filled all the same: with
- * what was there before. */
+/* Gives up on items because memory ran out. The caller's arrays are still filled, with the
+ * previous values. */
 size_t task_give_up(Task *task, size_t begin, size_t end);
 
 #endif

@@ -43,7 +43,7 @@ static void unlink_snapshot(Pool *pool, const Snapshot *snapshot) {
     }
 }
 
-/* The states of a closed pool went with its instances. */
+/* A closed pool has already freed its states with its instances. */
 static void drop_snapshot(Pool *pool, Snapshot *snapshot) {
     unlink_snapshot(pool, snapshot);
     for (size_t i = 0; i < pool->settings.count && pool->open; i++) {
@@ -58,7 +58,7 @@ void pool_drop_abandoned(Pool *pool) {
     if (!atomic_get(&pool->abandoned)) {
         return;
     }
-    atomic_set(&pool->abandoned, 0); /* before the look at the snapshots: no later one is missed */
+    atomic_set(&pool->abandoned, 0); /* cleared before the search: no later request is missed */
     for (Snapshot *snapshot = pool->snapshots, *next; snapshot != NULL; snapshot = next) {
         next = snapshot->next;
         if (atomic_get(&snapshot->abandoned)) {

@@ -5,9 +5,9 @@
 
 #include "pool.h"
 
-/* Frees those that were abandoned. */
+/* Frees the snapshots that were abandoned. */
 void pool_drop_abandoned(Pool *pool);
-/* Frees all; nobody has them any more. */
+/* Frees all snapshots. Nobody may use them afterwards. */
 void snapshots_drop_all(Pool *pool);
 
 #endif

@@ -10,7 +10,7 @@
 static const char *const BAD_INPUTS = "the inputs are not finite";
 const char *const BAD_OUTPUTS = "the outputs are not finite";
 
-/* After a step that was not done FMI wants no other. */
+/* FMI forbids further steps after a step that failed. */
 static void forbid_steps(Instance *me) {
     if (me->phase == PHASE_STEPPING) {
         me->phase = PHASE_ENDED;
@@ -26,7 +26,7 @@ Status instance_fail_step(Pool *pool, Instance *me, double time, Status status) 
     return status;
 }
 
-/* A communication step as several smaller ones. */
+/* Does a communication step as several smaller ones. */
 static Status step_in_parts(Pool *pool, Instance *me, double time, int64_t parts) {
     const Settings *s = &pool->settings;
     const double size = pool->step_size / (double)parts;
@@ -40,8 +40,8 @@ static Status step_in_parts(Pool *pool, Instance *me, double time, int64_t parts
     return status;
 }
 
-/* A discarded step leaves the instance where it may not be stepped on from: each try begins at the
- * state before the first one. */
+/* FMI forbids stepping on after a discarded step. So each try begins at the state before the
+ * first one. */
 static Status retry(Pool *pool, Instance *me, double time, void *before) {
     const Settings *s = &pool->settings;
     int64_t *health = health_of(pool, me);
@@ -95,7 +95,7 @@ Status instance_advance(Pool *pool, Instance *me) {
 }
 
 WIDE bool all_finite(const double *values, size_t count) {
-    int64_t bad = 0; /* as wide as the values, for the compiler's sake */
+    int64_t bad = 0; /* as wide as the values, so that the compiler can vectorize */
 
     for (size_t i = 0; i < count; i++) {
         bad |= !(fabs(values[i]) <= DBL_MAX);
@@ -140,7 +140,7 @@ void matrix_gather(const Matrix *matrix, size_t column, size_t rows, double *val
 
 Status instance_fail_reading(Pool *pool, Instance *me, Status status) {
     instance_fail(pool, me, "reading the outputs", status);
-    forbid_steps(me); /* the step before may have been the last */
+    forbid_steps(me); /* FMI may forbid further steps now */
     return status;
 }
 

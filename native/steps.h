@@ -1,4 +1,4 @@
-/* Steps of one instance, and what is read after them. */
+/* Steps of one instance, and reading its outputs. */
 
 #ifndef FMUGYM_STEPS_H
 #define FMUGYM_STEPS_H
@@ -8,14 +8,15 @@
 
 /* Scratch memory of one thread. */
 typedef struct {
-    double *values; /* of one instance, */
-    void *typed;    /* and their typed form */
-    double *inputs; /* of a run of instances, one after the other */
+    double *values; /* values of one instance */
+    void *typed;    /* the same values in their C types */
+    double *inputs; /* inputs of a run of instances, one instance after the other */
     double *outputs;
     bool sound; /* whether these inputs are all finite */
 } Scratch;
 
-/* The order of operations of PoolSpec.communication_point; a division by 1 changes nothing. */
+/* Uses the same order of operations as PoolSpec.communication_point. Division by 1 changes
+ * nothing. */
 static inline double instance_time(const Pool *pool, const Instance *me) {
     const Settings *s = &pool->settings;
     const double since_start = (double)me->steps * s->time_step;
@@ -27,11 +28,11 @@ static inline void instance_count_from(Instance *me, int64_t steps) {
     me->steps = me->counted = steps;
 }
 
-/* Sets the inputs, does a step and reads the outputs to the scratch memory. */
+/* Sets the inputs, does a step and reads the outputs into the scratch memory. */
 Status instance_step(Pool *pool, Instance *me, Scratch scratch);
 /* Does the substeps of a step. */
 Status instance_advance(Pool *pool, Instance *me);
-/* Reads the outputs to the pool's array, if they are finite. */
+/* Reads the outputs into the pool's array, if they are finite. */
 Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch);
 /* Copies the outputs from the pool's array. */
 void instance_copy_outputs(const Pool *pool, const Instance *me, double *values);

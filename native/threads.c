@@ -1,13 +1,14 @@
 /* Helper threads that take chunks of jobs.
  *
- * The items of a job are divided into as many ranges as threads may work on it. Each thread begins
- * with a range that is its own from job to job, as what it touches is in its processor's cache
- * then, and goes on with what is left of the others'.
+ * The items of a job are divided into one range for each thread that may work on it. Each thread
+ * begins with the same range in every job, because the data of that range is in its processor's
+ * cache. Then it takes chunks of the other ranges.
  *
- * A job sits in a slot, and slots are never freed, so a helper that was put to sleep by the
- * operating system between finding a job and taking a chunk of it does no harm when it wakes up
- * much later: a chunk is taken by replacing a range's ticket, (epoch, next item), and the epoch has
- * gone on. So the caller waits for chunks that were taken, never for threads. */
+ * A job occupies a slot, and slots are never freed. The operating system may suspend a helper
+ * after it has found a job and before it takes a chunk. Such a helper does no harm when it wakes
+ * up much later. To take a chunk, it must replace the ticket of a range, (epoch, next item), and
+ * the epoch has changed by then. So the caller waits for chunks that were taken, never for
+ * threads. */
 
 #include "threads.h"
 
@@ -22,17 +23,17 @@
 #endif
 
 enum {
-    SLOTS = 64, /* jobs at the same time; with more, a caller works alone */
+    SLOTS = 64, /* maximum number of jobs at the same time; a caller beyond it works alone */
     MOST_RANGES = 16,
     MOST_HELPERS = 255,
-    WHOLE = 16,           /* items whose 32-bit values fill a line of the cache */
-    FANOUT = 2,           /* helpers that each thread wakes */
-    STACK_SIZE = 8 << 20, /* of the main thread on most systems: FMUs may count on it */
+    WHOLE = 16,           /* number of items whose 32-bit values fill a cache line */
+    FANOUT = 2,           /* number of helpers that each thread wakes */
+    STACK_SIZE = 8 << 20, /* as for the main thread on most systems: FMUs may rely on it */
     HELPER_SPIN = 20000,  /* ns to look for more work before going to sleep */
     CALLER_SPIN = 5000    /* ns to wait for the last chunks before going to sleep */
 };
 
-/* Of a range: epoch << 32 | next item. Each is written by another thread, most of the time. */
+/* The ticket of a range: epoch << 32 | next item. Mostly, different threads write the tickets. */
 typedef struct {
     _Alignas(CACHE_LINE) Atomic value;
 } Ticket;
@@ -40,18 +41,18 @@ typedef struct {
 typedef struct {
     Ticket tickets[MOST_RANGES];
     _Alignas(CACHE_LINE) Atomic done;
-    _Alignas(CACHE_LINE) Atomic helpers; /* at work in this slot */
-    Atomic woken;                        /* for this job */
-    /* constant from the opening of the tickets until all is done */
+    _Alignas(CACHE_LINE) Atomic helpers; /* number of helpers at work in this slot */
+    Atomic woken;                        /* number of helpers woken for this job */
+    /* these stay constant from the opening of the tickets until the job is done */
     _Alignas(CACHE_LINE) Atomic ranges;
     Atomic count;
-    Atomic limit; /* of helpers */
+    Atomic limit; /* maximum number of helpers */
     Atomic smallest;
     Atomic largest;
     Job job;
-    Floats floats; /* of the caller */
-    /* while the caller waits for the last chunks */
-    _Alignas(CACHE_LINE) Atomic waiting; /* whether it sleeps */
+    Floats floats; /* the caller's floating-point environment */
+    /* these are used while the caller waits for the last chunks */
+    _Alignas(CACHE_LINE) Atomic waiting; /* whether the caller sleeps */
     Mutex lock;
     Condition finished;
 } Slot;
@@ -63,11 +64,11 @@ _Static_assert(offsetof(Slot, ranges) - offsetof(Slot, helpers) == CACHE_LINE, "
 static const uint64_t CLOSED = UINT32_MAX;
 
 static Slot slots[SLOTS];
-static _Alignas(CACHE_LINE) Atomic taken;  /* one bit per slot: in use */
-static _Alignas(CACHE_LINE) Atomic opened; /* one bit per slot: has a job */
+static _Alignas(CACHE_LINE) Atomic taken;  /* one bit per slot: whether it is in use */
+static _Alignas(CACHE_LINE) Atomic opened; /* one bit per slot: whether it has a job */
 static _Alignas(CACHE_LINE) Atomic sleeping;
 static Atomic started;
-static Mutex lock; /* of going to sleep and of starting helpers */
+static Mutex lock; /* guards going to sleep and starting helpers */
 static Condition work_arrived;
 static _Alignas(CACHE_LINE) Atomic jobs;
 static Atomic wakes, chunks;
@@ -76,7 +77,8 @@ static size_t next_item(uint64_t ticket) {
     return (size_t)(ticket & UINT32_MAX);
 }
 
-/* Whole cache lines where there are many items: neighbours write next to each other. */
+/* If there are many items, ranges begin at whole cache lines, because neighbouring items write
+ * next to each other. */
 static size_t start_of_range(uint64_t count, uint64_t ranges, uint64_t range) {
     const uint64_t start = count * range / ranges;
     const bool whole = range < ranges && count / ranges >= 4 * WHOLE;
@@ -87,8 +89,8 @@ static size_t end_of_range(const Slot *slot, size_t range) {
     return start_of_range(atomic_get(&slot->count), atomic_get(&slot->ranges), range + 1);
 }
 
-/* Large chunks first, smaller ones towards the end, so that all finish together; the caller begins
- * with a small one. Large ones are multiples of WHOLE, too. */
+/* Chunks are large first and smaller towards the end, so that all threads finish together. The
+ * caller begins with a small one. Large chunks are multiples of WHOLE, too. */
 static size_t chunk_size(const Slot *slot, size_t left, bool small) {
     const size_t smallest = (size_t)atomic_get(&slot->smallest);
     const size_t largest = (size_t)atomic_get(&slot->largest);
@@ -113,7 +115,7 @@ static void finish(Slot *slot, size_t size, size_t count) {
 /* A thread that works on a job. */
 typedef struct {
     bool helper;
-    uint64_t epoch; /* of the job for which it has the caller's floating-point environment */
+    uint64_t epoch; /* the job for which it has the caller's floating-point environment */
 } Worker;
 
 static void do_chunk(Slot *slot, uint64_t ticket, size_t size, Worker *worker) {
@@ -145,7 +147,7 @@ static bool take_chunk(Slot *slot, size_t range, bool small, Worker *worker) {
     }
 }
 
-/* Takes chunks until there are none: first of the own range, then of the others'. */
+/* Takes chunks until there are none, first from its own range, then from the others. */
 static void take_chunks(Slot *slot, size_t home, Worker worker) {
     const size_t ranges = (size_t)atomic_get(&slot->ranges);
     uint64_t number = 0;
@@ -189,7 +191,7 @@ static void wake_one(void) {
     atomic_add(&wakes, 1);
 }
 
-/* Wakes a few of the helpers that a job still lacks. Those wake others in turn. */
+/* Wakes a few of the helpers that a job still needs. Those wake others in turn. */
 static void wake_some(Slot *slot) {
     for (int i = 0; i < FANOUT && atomic_get(&sleeping) > 0 && has_work(slot); i++) {
         if (atomic_add(&slot->woken, 1) >= atomic_get(&slot->limit)) {
@@ -199,7 +201,7 @@ static void wake_some(Slot *slot) {
     }
 }
 
-/* The caller's range is the first one. */
+/* Works as a helper. The caller has the first range, so the helpers begin at later ones. */
 static void help(Slot *slot, size_t number) {
     if (atomic_add(&slot->helpers, 1) < atomic_get(&slot->limit)) {
         wake_some(slot);
@@ -263,8 +265,8 @@ static void *helper_entry(void *number) {
     return NULL;
 }
 
-/* Signals are for the threads that were there before, except those of a thread's own faults: if
- * they are blocked, the system ends the process without a word from any handler. */
+/* Helpers block all signals except faults, so that the threads of the application handle them.
+ * Blocked faults would end the process without calling any handler. */
 static void block_signals(sigset_t *before) {
     static const int faults[] = {SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGABRT, SIGTRAP, SIGSYS};
     sigset_t blocked;
@@ -294,7 +296,7 @@ static bool start_helper(size_t number) {
 
 #endif
 
-/* Where the system refuses, those that are there must do. */
+/* If the system refuses to start more, the existing helpers must do. */
 static void start_helpers(size_t wanted) {
     wanted = wanted > MOST_HELPERS ? MOST_HELPERS : wanted;
     if (atomic_get(&started) >= wanted) {
@@ -319,7 +321,7 @@ static Slot *take_slot(void) {
     return NULL;
 }
 
-/* The tickets are closed while the rest changes: no late helper may take a chunk meanwhile. */
+/* The tickets stay closed during the changes, so that no late helper takes a chunk. */
 static void open_slot(Slot *slot, const Job *job) {
     const uint64_t epoch = (atomic_get(&slot->tickets[0].value) >> 32) + 1;
     const size_t ranges = job->helpers < MOST_RANGES ? job->helpers + 1 : MOST_RANGES;
@@ -363,8 +365,8 @@ static void wait_for_chunks(Slot *slot, size_t count) {
     mutex_unlock(&slot->lock);
 }
 
-/* Helpers that look for work take part at once. Those that sleep are woken after the first chunk,
- * by which time there may be nothing left for them. */
+/* Helpers that look for work join at once. The caller wakes sleeping ones after its first chunk,
+ * when there may be no work left for them. */
 void threads_run(const Job *job) {
     Worker caller = {.helper = false};
     Slot *slot = job->helpers == 0 || job->count < 2 ? NULL : take_slot();

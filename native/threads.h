@@ -10,25 +10,26 @@ typedef struct {
     void (*work)(void *context, size_t begin, size_t end);
     void *context;
     size_t count;    /* items 0 to count - 1, at most 2^31 */
-    size_t helpers;  /* at most so many threads besides the caller */
-    size_t smallest; /* chunk, in items, at least 1 */
+    size_t helpers;  /* maximum number of threads in addition to the caller */
+    size_t smallest; /* smallest chunk in items, at least 1 */
     size_t largest;
 } Job;
 
-/* Works through all items, on the calling thread and on helpers that come free, and returns when
- * all are done. Helpers are started when first asked for and then kept, asleep. */
+/* Works through all items on the calling thread and on free helpers. Returns when all items are
+ * done. Helpers are started when first needed. They stay asleep between jobs. */
 void threads_run(const Job *job);
 
-/* What has happened in this process. */
+/* Counters of this process. */
 typedef struct {
-    uint64_t jobs;   /* that helpers could take part in */
-    uint64_t wakes;  /* of helpers that slept */
-    uint64_t chunks; /* of these jobs */
+    uint64_t jobs;   /* jobs that helpers could join */
+    uint64_t wakes;  /* wake-ups of sleeping helpers */
+    uint64_t chunks; /* chunks of these jobs */
 } ThreadStatistics;
 
 ThreadStatistics threads_statistics(void);
 
-/* To be called once before anything else, and in the child after a fork, which has no helpers. */
+/* Must be called once before anything else, and in the child after a fork, where no helpers
+ * exist. */
 void threads_reset(void);
 
 #endif

@@ -1,4 +1,4 @@
-/* Arrays of the caller: of the right type, size, shape and alignment, or refused. */
+/* Arrays of the caller. An array of the wrong type, size, shape or alignment is refused. */
 
 #ifndef FMUGYM_BUFFERS_H
 #define FMUGYM_BUFFERS_H
@@ -11,15 +11,15 @@
 typedef enum { ITEM_FLOAT64, ITEM_FLOAT32, ITEM_INT64, ITEM_INT8, ITEM_BOOLEAN } Item;
 
 typedef enum {
-    COPIED,   /* with any strides and at any address; values are copied out */
-    IN_PLACE, /* C-contiguous and aligned, used in place */
-    WRITTEN   /* likewise, and written */
+    COPIED,   /* any strides and alignment; the values are copied */
+    IN_PLACE, /* C-contiguous and aligned; the array is used in place */
+    WRITTEN   /* like IN_PLACE, and the array is written to */
 } Use;
 
-enum { ANY_LENGTH = -1 }; /* for a length of any number */
+enum { ANY_LENGTH = -1 }; /* stands for any length */
 
-/* Takes an array; the shape has as many lengths as dimensions says. Returns false with an exception
- * that begins with the name if the array is another one. */
+/* Takes an array. The shape holds as many lengths as dimensions says. If the array does not fit,
+ * returns false with an exception whose text begins with the name. */
 bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
                  int dimensions, const Py_ssize_t *shape);
 
@@ -28,7 +28,7 @@ bool take_vector(PyObject *object, Py_buffer *buffer, Use use, const char *name,
 bool take_matrix(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
                  Py_ssize_t rows, Py_ssize_t columns);
 
-/* Gives a buffer back, if there is one. */
+/* Releases a buffer, if there is one. */
 void release_buffer(Py_buffer *buffer);
 
 #endif

@@ -6,7 +6,7 @@
 
 PyObject *closed_error;
 
-/* The memory of the echo, which is the process's. */
+/* The memory of the echo. It belongs to the whole process. */
 static Py_buffer echo;
 
 static PyObject *echo_to(PyObject *module, PyObject *memory) {

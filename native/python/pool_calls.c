@@ -11,8 +11,7 @@ bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
     return given == expected;
 }
 
-/* A call, the arrays that it holds on to, and what comes of it. Arrays that are the pool's own need
- * no new buffer. */
+/* A call, the arrays that it keeps, and its result. The pool's own arrays need no new buffer. */
 typedef struct {
     int operation;
     Call call;
@@ -185,7 +184,7 @@ PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return done && report_messages(self) ? PyLong_FromSsize_t(reading.failed) : NULL;
 }
 
-/* Small questions */
+/* Queries */
 
 typedef struct {
     size_t index;

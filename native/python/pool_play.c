@@ -10,17 +10,17 @@ enum { STARTS, BLOCK, USED, LOW, WIDTH, ROWS, COUNTS, ENDED, PLAY_BUFFERS };
 static const char *const PLAYING = "fmugym._native.playing";
 static const char *const STREAMS = "fmugym._native.streams";
 
-/* What prepare_play has made. It stays as it is; the next one takes its place as a whole. */
+/* The result of prepare_play. It never changes; the next call replaces it as a whole. */
 typedef struct {
     Play play;
     Py_buffer buffers[PLAY_BUFFERS];
-    PyObject *start; /* the Access of what is set before initialization */
-    int64_t *rows;   /* a copy, as they are used to find a place in memory */
+    PyObject *start; /* the Access of the variables set before initialization */
+    int64_t *rows;   /* a copy, because these values index memory */
 } Playing;
 
-/* What set_streams has made. */
+/* The result of set_streams. */
 typedef struct {
-    PyObject *generators, *capsules; /* keep alive what the streams point to */
+    PyObject *generators, *capsules; /* these keep the targets of the streams alive */
     const Stream *streams[];
 } Streams;
 
@@ -218,7 +218,7 @@ static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwarg
     return is_sound(&playing->play);
 }
 
-/* What was prepared before is forgotten in any case; a call that uses it holds on to it. */
+/* Always discards the previous preparation. A call that uses it keeps its own reference. */
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
     PyPool *self = (PyPool *)object;
     Playing *playing = calloc(1, sizeof *playing);

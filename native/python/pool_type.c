@@ -1,4 +1,4 @@
-/* The type Pool: how one is made and closed, entered, and how its FMUs' messages come out. */
+/* The type Pool: making, closing and entering pools, and reporting the messages of their FMUs. */
 
 #include <stdlib.h>
 #include <string.h>
@@ -10,11 +10,10 @@ PyObject *decode(const char *text) {
                                 text == NULL ? 0 : (Py_ssize_t)strlen(text), "replace");
 }
 
-/* Messages go to Python after a call, on the thread that made it. */
+/* Messages go to Python after a call, on the thread that made the call. */
 
-/* An exception that is an error of the receiver's must not stop the pool; any other, as of Ctrl-C
- * or sys.exit, is for the caller. Signals are looked at before: what a handler of theirs raises
- * would else be taken for the receiver's. */
+/* An ordinary exception in the receiver must not stop the pool. Any other, such as one from
+ * Ctrl-C or sys.exit, goes to the caller. */
 static bool report(PyPool *self, const Message *message) {
     PyObject *result =
         PyObject_CallFunction(self->callback, "niNN", (Py_ssize_t)message->index, message->status,
@@ -33,7 +32,9 @@ static bool report_dropped(PyPool *self) {
     return report(self, &message);
 }
 
-/* What is left when an exception comes is for the next call. */
+/* If an exception interrupts this, the next call reports the remaining messages. Signals are
+ * checked before each message. Otherwise the exception of a signal handler would count as the
+ * receiver's. */
 static bool drain(PyPool *self) {
     size_t dropped;
     Message *left = log_take(&self->pool.log, &dropped);
@@ -61,8 +62,8 @@ bool report_messages(PyPool *self) {
 
 /* Entering */
 
-/* Getting the GIL back may take milliseconds where other Python threads are busy: work so short
- * that nobody notices is done without letting go of it. */
+/* Getting the GIL back may take milliseconds if other Python threads are busy. So very short
+ * work keeps the GIL. */
 static bool is_short(const PyPool *self, int length) {
     return length == ALWAYS_SHORT || (length >= 0 && pool_is_quick(&self->pool, length));
 }
@@ -121,7 +122,7 @@ PyObject *py_close(PyObject *object, PyObject *unused) {
     Py_RETURN_NONE;
 }
 
-/* An error may be on its way when this is called; another one cannot be raised here. */
+/* An exception may already be set when this is called. This function cannot raise another one. */
 static void close_at_the_end(PyPool *self) {
     PyObject *type, *value, *traceback;
 
@@ -153,7 +154,7 @@ static void pool_dealloc(PyObject *object) {
     Py_DECREF(type);
 }
 
-/* Making: each argument is a group of named values */
+/* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
     PyObject *paths, *stop_time, *tolerance, *strings;
@@ -358,7 +359,7 @@ static bool open_pool(PyPool *self) {
     return opened;
 }
 
-/* The dicts are copied: nobody shall take out of them what the settings point to. */
+/* Copies the dicts, so that nobody can remove what the settings point to. */
 static PyObject *copy_of_groups(PyObject *kwargs) {
     PyObject *copy = PyDict_New(), *name, *group;
     Py_ssize_t place = 0;

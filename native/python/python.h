@@ -1,4 +1,4 @@
-/* What the files with Python's view of the pool share. Nothing else includes Python.h. */
+/* Shared by the files that present the pool to Python. No other file includes Python.h. */
 
 #ifndef FMUGYM_PYTHON_H
 #define FMUGYM_PYTHON_H
@@ -21,19 +21,19 @@ typedef struct {
 
 typedef struct {
     PyObject_HEAD Snapshot *snapshot;
-    PyObject *pool; /* keeps the memory of the pool, not its instances */
+    PyObject *pool; /* keeps the memory of the pool alive, but not its instances */
 } PySnapshot;
 
 typedef struct {
     PyObject_HEAD Pool pool;
     bool opened;         /* whether the pool may need closing */
-    PyObject *arguments; /* keeps alive what the settings point to */
+    PyObject *arguments; /* keeps the targets of the settings alive */
     PyObject *callback;  /* borrowed from arguments, as are the arrays */
     PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
     const char **paths;
     StringValue *strings;
-    PyObject *playing; /* capsules, as a call holds on to those that it has begun with */
+    PyObject *playing; /* a capsule, so that a running call can keep its own reference */
     PyObject *streams;
 } PyPool;
 
@@ -44,26 +44,27 @@ extern PyType_Spec access_spec, snapshot_spec, pool_spec;
 
 /* The table of an FMI version; NULL with an exception if there is none. */
 const Fmi *fmi_of(int version);
-/* Whether an object is an access for this pool; else there is an exception. */
+/* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
 
 PyObject *decode(const char *text);
-/* Takes the values of a dict by their names, as PyArg_ParseTupleAndKeywords does. */
+/* Parses the values of a dict by name, as PyArg_ParseTupleAndKeywords does. */
 bool parse_group(PyObject *group, const char *format, char **names, ...);
 bool has_arguments(Py_ssize_t given, Py_ssize_t expected);
 
-/* Calls. Work is done inside the pool, with the GIL (alone) or without. Nobody waits for the pool
- * with the GIL: who is inside may need it. */
+/* Calls. Work runs inside the pool, either with the GIL (alone) or without it. No thread waits
+ * for the pool while it holds the GIL, because the thread inside may need the GIL. */
 
 typedef void Work(PyPool *self, bool alone, void *context);
 
 enum { ALWAYS_SHORT = -1, NEVER_SHORT = -2 };
 
-/* Does some work; length is one of the operations of pool.h, for which the pool knows its length,
- * or one of the above. Returns false with an exception if the pool cannot be entered. */
+/* Does some work. length is one of the operations of pool.h, whose duration the pool knows, or
+ * one of the constants above. Returns false with an exception if the pool cannot be entered. */
 bool perform(PyPool *self, int length, Work *work, void *context);
 
-/* Hands over the messages of FMUs. Returns false if that was interrupted, with the exception. */
+/* Passes the messages of FMUs to Python. Returns false with an exception if that was
+ * interrupted. */
 bool report_messages(PyPool *self);
 
 /* The methods of a pool */

@@ -1,10 +1,11 @@
-/* The type Snapshot: FMU states, freed with the last reference; and the pool's methods for it. */
+/* The type Snapshot: FMU states that are freed with the last reference. Also the pool's methods
+ * for it. */
 
 #include "python.h"
 
 PyTypeObject *snapshot_type;
 
-/* May run on any thread and at any time, so also while a call of the pool is under way. */
+/* May run on any thread and at any time, even during a call of the pool. */
 static void snapshot_dealloc(PyObject *object) {
     PySnapshot *self = (PySnapshot *)object;
     PyTypeObject *type = Py_TYPE(object);
