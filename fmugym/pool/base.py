@@ -1,4 +1,4 @@
-"""The contract that every pool fulfils, whatever steps its instances."""
+"""The contract of all pools, however they step their instances."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Pool(ABC):
     overwrites them.
 
     A status is a ``fmugym.fmi.status.Status``. A failure of an FMU is never raised, because it
-    concerns one instance only. Its status tells of the failure, and ``failure`` gives the reason.
+    concerns one instance only. Its status shows the failure, and ``failure`` gives the reason.
     Its outputs stay as they were before the call, and the next reset repairs or replaces the
     instance. The same holds for an instance whose inputs are not finite: it is not stepped.
 
@@ -50,8 +50,8 @@ class Pool(ABC):
         inputs: Shape (k_in, N); the caller writes to it before a step.
         outputs: Shape (k, N).
         statuses: Shape (N,).
-        observations: What ``step_own`` fills, shape (N, num_observed).
-        step_own: Does one step with what was written to ``inputs``, and fills ``observations``.
+        observations: The array that ``step_own`` fills, shape (N, num_observed).
+        step_own: Does one step with the values in ``inputs``, and fills ``observations``.
             Returns how many instances have a status worse than a warning.
     """
 
@@ -75,7 +75,7 @@ class Pool(ABC):
 
         Returns:
             The outputs, shape (k, N), and the statuses, shape (N,). Both are unchanged for
-            instances outside of the mask.
+            instances outside the mask.
         """
 
     @abstractmethod
@@ -88,10 +88,10 @@ class Pool(ABC):
         """Do one step with the instances.
 
         Args:
-            inputs: Shape (k_in, N), finite, copied to ``self.inputs``; None for what is there.
-            skip: Which instances not to step, shape (N,); their outputs and statuses stay.
-            observations: Filled with the first ``num_observed`` outputs of all instances, shape
-                (N, num_observed), C-contiguous.
+            inputs: Shape (k_in, N), finite, copied to ``self.inputs``; None to use the values there.
+            skip: The instances not to step, shape (N,). Their outputs and statuses stay as they are.
+            observations: The array to fill with the first ``num_observed`` outputs of all instances,
+                shape (N, num_observed), C-contiguous.
 
         Returns:
             The outputs, shape (k, N), and the statuses, shape (N,).
@@ -102,7 +102,7 @@ class Pool(ABC):
         """Copy the FMU states and times of all instances.
 
         Returns:
-            A snapshot for ``restore`` of this very pool. It is freed with its last reference.
+            A snapshot for ``restore`` of the same pool. It is freed with its last reference.
 
         Raises:
             SimulationError: If the FMU offers no state, or an instance cannot save it now.
@@ -122,7 +122,7 @@ class Pool(ABC):
             As ``reset``.
 
         Raises:
-            SimulationError: If the snapshot is another pool's, or an instance was replaced since.
+            SimulationError: If the snapshot comes from another pool, or an instance was replaced since.
         """
 
     @abstractmethod
@@ -147,23 +147,23 @@ class Pool(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free all instances; calling it again is fine."""
+        """Free all instances. It may be called more than once."""
 
-    # Abilities that a pool may have. These defaults are those of a pool without them.
+    # Optional abilities. The defaults are for pools without them.
 
     @property
     def is_real(self) -> bool:
-        """Whether a step may move something real, so that nothing is to be tried with it."""
+        """Whether a step may move real hardware, so that trials with it are forbidden."""
         return False
 
     @property
     def reset_method(self) -> ResetMethod:
-        """How instances start an episode anew."""
+        """How instances start a new episode."""
         return ResetMethod.RESET
 
     @property
     def can_play(self) -> bool:
-        """Whether the pool can run compiled hooks in its own pass (``NativePool.prepare_play``)."""
+        """Whether the pool can run compiled hooks within a step (``NativePool.prepare_play``)."""
         return False
 
     def prepare_play(
@@ -178,15 +178,15 @@ class Pool(ABC):
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool cannot; ``can_play`` tells.
+            SimulationError: If the pool does not support it; see ``can_play``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
     def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
-        """Set what the function of ``prepare_play`` draws episodes from.
+        """Set the generators from which the function of ``prepare_play`` draws episodes.
 
         Raises:
-            SimulationError: If the pool cannot; ``can_play`` tells.
+            SimulationError: If the pool does not support it; see ``can_play``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
 
@@ -195,13 +195,13 @@ class Pool(ABC):
         return function
 
     def halt(self) -> None:
-        """Stop at once what goes on without being stepped; the next reset starts it again."""
+        """Stop at once whatever runs on without being stepped; the next reset starts it again."""
         return
 
     def note_fault(self, index: int) -> None:
-        """Count a fault that the caller found: numbers made of the outputs are not finite."""
+        """Count a fault that the caller found: numbers computed from the outputs are not finite."""
         return
 
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what is known of the last step by name, each of shape (N,)."""
+        """Return facts about the last step by name, each of shape (N,)."""
         return {}

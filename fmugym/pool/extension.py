@@ -1,4 +1,4 @@
-"""Whether the C extension is there, and what to do where it is not."""
+"""Whether the C extension exists, and a warning if it does not."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HOW_TO_BUILD = (
 def has_native_pool() -> bool:
     """Whether the C extension was built when this package was installed."""
     try:
-        import fmugym._native  # noqa: F401  (can it be?)
+        import fmugym._native  # noqa: F401  (can it be imported?)
     except ImportError:
         return False
     return True
@@ -28,5 +28,5 @@ def has_native_pool() -> bool:
 
 @functools.cache
 def warn_of_slow_path() -> None:
-    """Say once in a process that FMUs are stepped by Python."""
+    """Warn once per process that Python steps the FMUs."""
     logger.warning("FMUs are stepped by Python, which is slow: %s", HOW_TO_BUILD)

@@ -1,4 +1,4 @@
-"""The counters of a pool: the work and the faults of each instance."""
+"""The counters of a pool for the work and the faults of each instance."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ HEALTH: Final = (
 """The names of the counters, in the order of the columns and of ``native/pool.h``."""
 
 HEALTH_COUNTS: Final = len(HEALTH) + 1
-"""The number of columns of an array of counts; the last has the retries of the last step."""
+"""The number of columns of an array of counts; the last column has the last step's retries."""
 
 
 class Column:
@@ -64,7 +64,7 @@ def no_counts(num_instances: int) -> HealthArray:
 
 
 def note(counts: HealthArray, status: int) -> int:
-    """Add a status to the counts of its instance if it is a fault; returns the status."""
+    """Count a status for its instance if it is a fault; return the status."""
     if status > Status.WARNING:
         column = _FAULTS.get(Status(status))
         if column is not None:
@@ -87,10 +87,10 @@ class CountedPool(Pool):
         return self._spec.reset_method
 
     def _count_steps(self) -> None:
-        """Add the steps until now to the counts."""
+        """Add the steps so far to the counts."""
 
     def _memory_growth(self) -> Any:
-        """How much memory has grown, in bytes: one number for each instance, or one for all."""
+        """The growth of memory in bytes: one number for each instance, or one for all."""
         return 0
 
     def health(self) -> dict[str, HealthArray]:

@@ -34,7 +34,7 @@ def local_pool(
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        native: Whether to take the native pool; by default, if the extension was built.
+        native: Whether to use the native pool; by default True if the extension was built.
         threads: See ``NativePool``; the Python pool has one thread.
         private_libraries: See ``NativePool``; the Python pool has one library.
         first_index: See ``NativePool``.

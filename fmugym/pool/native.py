@@ -1,14 +1,14 @@
-"""The pool in C: a thousand instances stepped in one call, on several threads.
+"""The pool in C: it steps thousands of instances in one call, on several threads.
 
-It does what ``PythonPool`` does, bit for bit, whatever the number of threads. Beyond the contract
-of ``Pool`` it offers arrays of its own and calls without any conversion, for the vector
-environment:
+Its results equal those of ``PythonPool`` bit for bit, for any number of threads. Beyond the
+contract of ``Pool``, it offers the vector environment its internal arrays and calls without any
+conversion:
 
 * write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
   ``pool.observations``;
-* ``pool.step_into`` and ``pool.reset_into`` write the observations to memory of the caller and
-  return how many of the instances had trouble, so that statuses are looked at only if there is any;
-* ``pool.step_or_reset`` starts ended instances anew while the others are stepped.
+* ``pool.step_into`` and ``pool.reset_into`` write the observations to the caller's memory and
+  return how many instances had trouble; the caller reads the statuses only if there are any;
+* ``pool.step_or_reset`` restarts ended instances while it steps the others.
 """
 
 from __future__ import annotations
@@ -84,20 +84,20 @@ class NativePool(CountedPool):
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        threads: The most threads to work on, the calling one included; by default one for each
-            processor that this process may use. Results do not depend on it.
-        private_libraries: Whether each instance gets a copy of the FMU's library, and so of its
-            global variables, of its own; by default only where the FMU says that it can be
+        threads: The most threads to use, including the calling one; by default one for each
+            processor that this process may use. The results do not depend on it.
+        private_libraries: Whether each instance gets a private copy of the FMU's library, and so
+            of its global variables. By default only if the FMU says that it can be
             instantiated only once per process. See ``fmugym.trial.shared_globals``.
-        first_index: What messages number the first instance.
-        counts: Where to count what is in ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
+        first_index: The number of the first instance in messages.
+        counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
         outputs: The outputs, shape (k, N), float64.
         statuses: The statuses, shape (N,), int8.
         observations: The observations of ``step_own``, shape (N, num_observed), float32.
-        threads: The most threads that work on a call.
+        threads: The most threads that a call uses.
 
     Raises:
         FMULoadError: If the FMU cannot be loaded or instantiated.
@@ -192,7 +192,7 @@ class NativePool(CountedPool):
             raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
-        """Find or make the access to variables; one access stands for one list of variables."""
+        """Find or make the access to variables; there is one for each list of variables."""
         access = self._accesses.get(variables)
         if access is None:
             if len(self._accesses) >= _MOST_CACHED:
@@ -274,7 +274,7 @@ class NativePool(CountedPool):
             doing = f"the step at t = {time:g} s"
         elif string != _NO_STRING:
             doing = f"setting {self._string_name(string)!r}"
-        if status < 0:  # it was refused, and is a whole sentence
+        if status < 0:  # the call was refused, and the text is a whole sentence
             return doing
         label = Status(status).name.capitalize()
         name = f"{self._fmu.description.model_identifier}_{self._first_index + index}"
@@ -303,7 +303,7 @@ class NativePool(CountedPool):
         self._open_pool().recycle()
 
     def watched(self, function: Callable[P, R]) -> Callable[P, R]:
-        """Have what calls of a function take that resets instances added to the growth."""
+        """Add the memory that a reset function allocates to the growth counter."""
         return function if self._watch is None else self._watch.around(function)
 
     def close(self) -> None:
@@ -326,7 +326,7 @@ class NativePool(CountedPool):
         """Do one step as ``step`` does.
 
         Args:
-            inputs: As for ``step``, but used where they are and not copied to ``self.inputs``.
+            inputs: As for ``step``, but used in place and not copied to ``self.inputs``.
             skip: As for ``step``.
             observations: As for ``step``.
 
@@ -374,10 +374,10 @@ class NativePool(CountedPool):
         mask: MaskArray,
         observations: FloatArray32 | None = None,
     ) -> int:
-        """Start the instances in the mask anew and step the others, in one go.
+        """Start the instances in the mask anew and step the others, in one call.
 
-        The same as ``step`` with the mask to be skipped and ``reset`` with the mask, but for the
-        time it takes: no thread waits for the end of one before it begins the other.
+        The result is that of ``step``, which skips the mask, and ``reset`` with the mask. This is
+        faster, because no thread waits for the end of one before it begins the other.
 
         Args:
             inputs: As for ``step_into``.
@@ -400,7 +400,7 @@ class NativePool(CountedPool):
 
     @property
     def costs(self) -> dict[str, float]:
-        """The measured time of one instance in ns by method; 0 where it is not known yet."""
+        """The measured time of one instance in ns by method; 0 if it is not known yet."""
         return dict(zip(("step", "reset", "step_or_reset"), self._pool.costs(), strict=True))
 
     def prepare_play(
@@ -412,26 +412,26 @@ class NativePool(CountedPool):
         draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
     ) -> Callable[..., tuple[int, int]]:
-        """Let whole steps of a vector environment be done here, hooks included.
+        """Prepare the pool to do whole steps of a vector environment, hooks included.
 
-        What was prepared before is forgotten. The arrays are used as they are, from step to step.
+        This replaces what was prepared before. Every step uses the given arrays in place.
 
         Args:
             variables: As for ``reset``.
             programs: From the actions to the inputs; from the outputs to done, truncated, reward.
             actions: The lowest and the highest action.
-            start_values: As the values of ``reset``; the draws are written there.
-            draws: Uniform numbers drawn ahead, shape (N, episodes, draws); how many episodes of
-                them are used, shape (N,); lower ends and widths of the distributions and the
-                rows of the start values they are for, shape (draws,).
+            start_values: As the values of ``reset``; the pool writes the draws there.
+            draws: Uniform numbers drawn ahead, shape (N, episodes, draws); how many of their
+                episodes are used, shape (N,); the lower ends and widths of the distributions and
+                their rows in the start values, shape (draws,).
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
 
         Returns:
             A function of actions (int64), observations, rewards, terminated, truncated and drawn
-            values (draws, N), which does a step and fills all but the first, once ``set_streams``
-            was called; of the drawn values only those of episodes that start. It returns how many
-            instances have a status worse than a warning, and how many episodes have ended.
+            values (draws, N). It does a step and fills all but the actions; of the drawn values,
+            only those of episodes that start. It returns how many instances have a status worse
+            than a warning, and how many episodes have ended. Call ``set_streams`` before it.
         """
         block, used, low, width, rows = draws
         count, ended, limit = episodes
@@ -447,16 +447,16 @@ class NativePool(CountedPool):
         return self._pool.play
 
     def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
-        """Tell what the episodes of ``prepare_play`` are drawn from, when these are used up.
+        """Set the generators that ``prepare_play`` uses when the numbers drawn ahead are used up.
 
         Args:
-            generators: N of them. They are numpy's, and drawn from without their locks.
+            generators: N bit generators of numpy. The pool draws from them without their locks.
         """
         self._pool.set_streams(generators)
 
     @property
     def uses_states(self) -> bool:
-        """Whether resets restore saved initial states, as far as is known by now."""
+        """Whether resets restore saved initial states, as far as known so far."""
         return self._pool.uses_states()
 
 
@@ -465,12 +465,12 @@ class PlayProgram(Protocol):
 
     @property
     def code(self) -> npt.NDArray[np.uint16]:
-        """Operation and operands of each instruction."""
+        """The operation and the operands of each instruction."""
         ...
 
     @property
     def constants(self) -> FloatArray:
-        """What the instructions refer to."""
+        """The constants that the instructions refer to."""
         ...
 
     @property
@@ -484,7 +484,7 @@ def _program_bytes(program: PlayProgram) -> tuple[bytes, bytes, bytes]:
 
 
 class _Receiver:
-    """Passes the messages of the FMU on; it must not refer to the pool."""
+    """Passes on the FMU's messages; it must not refer to the pool."""
 
     def __init__(self, log: logging.Logger, model: str, first_index: int) -> None:
         self._log, self._model, self._first_index = log, model, first_index
@@ -513,7 +513,7 @@ def _type_number(variable: Variable, version: int) -> int:
 
 
 def _resources(folder: Path, version: int) -> bytes:
-    """What an FMU is told of its folder, which differs between all three versions."""
+    """The location of its resources that an FMU gets; each FMI version has a different form."""
     if version == 1:
         return folder.as_uri().encode()
     if version == 2:
@@ -522,9 +522,9 @@ def _resources(folder: Path, version: int) -> bytes:
 
 
 def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
-    """Copy the library's folder: other paths and other inodes make other libraries.
+    """Copy the library's folder: the system treats files with other paths and inodes as new.
 
-    The copies live in the FMU's temporary folder and go with it.
+    The copies are in the FMU's temporary folder and are deleted with it.
     """
     paths = []
     try:

@@ -1,4 +1,4 @@
-"""One place of a pool in Python: an instance with its buffers, replaced if a reset cannot help."""
+"""One place in a Python pool: an instance with its buffers, replaced if a reset cannot help."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Snapshot:
     """A saved state of one instance.
 
     Attributes:
-        instance: The instance, which alone can restore the state.
+        instance: The only instance that can restore the state.
         state: The FMU state.
-        count: How many communication steps led to it.
+        count: The number of communication steps before the state.
     """
 
     instance: Instance
@@ -50,7 +50,7 @@ def _is_fine(status: int) -> bool:
 
 
 class Slot:
-    """One place of the pool: its instance, which is replaced if a reset cannot help.
+    """One place in the pool. Its instance is replaced if a reset cannot help.
 
     Args:
         library: The FMU's library.
@@ -96,11 +96,11 @@ class Slot:
         self._good_outputs = self._output_row.tolist()
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
-        """Start an episode anew by the spec's reset method.
+        """Start a new episode by the spec's reset method.
 
-        With ``RESTORE``, the state after initialization is kept once the same start values come a
-        second time after an episode with steps, and it is restored from then on. Other start values
-        take a reset and an initialization.
+        ``RESTORE`` keeps the state after initialization once the same start values come a second
+        time after an episode with steps, and restores it from then on. Other start values need a
+        reset and an initialization.
         """
         key = (variables, values.tobytes())
         stepped = self._count > self._spec.warm_up_steps * self._spec.substeps
@@ -120,7 +120,7 @@ class Slot:
         return status
 
     def count_steps(self) -> None:
-        """Add the steps until now to the counts."""
+        """Add the steps so far to the counts."""
         self._counts[Column.STEPS] += self._count - self._counted
         self._counted = self._count
 
@@ -128,7 +128,7 @@ class Slot:
         self._count = self._counted = count
 
     def _make_anew_if_due(self) -> None:
-        """Replace an instance that has leaked memory, or that no reset would make as new."""
+        """Replace an instance that has leaked memory, or that no reset can make like new."""
         is_due, self.is_due = self.is_due, False
         if self._instance.phase in (Phase.DEAD, Phase.INSTANTIATED):
             return
@@ -147,11 +147,11 @@ class Slot:
         except SimulationError:  # a reset and an initialization may still work
             got = Status.ERROR
         if not _is_fine(got) or self._output_row.tobytes() != self._first_outputs:
-            self._saved, self._restores = None, False  # whatever the trial has found
+            self._saved, self._restores = None, False  # whatever the trial showed
         return self._saved is not None
 
     def _keep_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> None:
-        """Keep the state if it will be of use."""
+        """Keep the state if a later reset can use it."""
         again = stepped and key == self._start_key
         self._start_key, self._saved = key, None
         if again and self._restores:
@@ -200,7 +200,7 @@ class Slot:
                 raise SimulationError(f"the warm-up failed: {self.failure}")
 
     def step(self) -> int:
-        """Set the inputs, step, and get the outputs; returns the status."""
+        """Set the inputs, step, and get the outputs; return the status."""
         if self._instance.phase is not _STEPPING:
             return self._failed("the instance needs a reset before it can be stepped")
         inputs = self._input_row.tolist()
@@ -235,7 +235,8 @@ class Slot:
     def _step_with_retries(self, time: float, step_size: float) -> int:
         """Repeat a discarded step as smaller ones.
 
-        Each attempt begins at the state before the first one: no step may follow a discarded one.
+        Each attempt begins at the state before the first, because no step may follow a discarded
+        one.
         """
         instance = self._instance
         try:
@@ -294,7 +295,7 @@ class Slot:
         return Snapshot(self._instance, self._instance.save_state(), self._count)
 
     def require_own(self, snapshot: Snapshot) -> None:
-        """Refuse a state of another instance, since FMUs accept it silently."""
+        """Refuse a state of another instance, because FMUs accept it silently."""
         if snapshot.instance is not self._instance:
             raise SimulationError("the snapshot is of another instance than this one")
 

@@ -1,4 +1,4 @@
-"""What a pool is told: its part of the config, checked and resolved against the FMU."""
+"""The specification of a pool: its part of the config, checked and resolved for the FMU."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ ISOLATIONS: Final = ("none", "process")
 """Where FMUs run: in the caller's process, or in worker processes."""
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
-"""How long a worker process may take for a call, in seconds of real time."""
+"""How long a call to a worker process may take, in seconds of real time."""
 
 DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
-"""Bytes that resets may take for good."""
+"""How many bytes resets may leak."""
 
 
 class ResetMethod(StrEnum):
-    """How an instance starts an episode anew, from the fastest way to the surest."""
+    """How an instance starts a new episode, from the fastest method to the most reliable."""
 
     RESTORE = "restore"
-    """Restore the FMU state after initialization where the start values are the same."""
+    """Restore the FMU state after initialization if the start values are the same."""
     RESET = "reset"
     """Call the FMU's reset function and initialize the instance."""
     INSTANCE = "instance"
     """Free the instance and make a new one."""
     LIBRARY = "library"
-    """Also load the shared library anew, so that its global variables begin anew."""
+    """Also load the shared library anew, to reset its global variables."""
     PROCESS = "process"
     """Start a new worker process."""
 
@@ -54,15 +54,15 @@ class PoolSpec:
         num_observed: How many of the outputs, from the first, make an observation.
         substeps: Number of communication steps in one step.
         start_time: First communication point, in seconds.
-        stop_time: Passed to the FMU where it is not None, in seconds.
-        tolerance: Passed to the FMU where it is not None.
+        stop_time: Passed to the FMU unless it is None, in seconds.
+        tolerance: Passed to the FMU unless it is None.
         warm_up_steps: Steps simulated at each reset, inputs at their start values, before the
             first output is read.
         strings: String parameters and their values.
         fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
             8 ... smaller ones, from the FMU state before it.
-        leak_limit: Bytes that resets may take before instances are recycled; None for ever.
-        reset_method: How instances start an episode anew.
+        leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
+        reset_method: How instances start a new episode.
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
     """
 
@@ -82,7 +82,7 @@ class PoolSpec:
     input_limits: tuple[tuple[float, float], ...] = ()
 
     def communication_point(self, count: int) -> float:
-        """The time after ``count`` communication steps; never a sum, which would drift."""
+        """The time after ``count`` communication steps; not computed as a sum, which would drift."""
         return self.start_time + count * self.time_step / self.substeps
 
     @property
@@ -92,6 +92,6 @@ class PoolSpec:
 
 
 def whole_number_of_steps(duration: float, time_step: float) -> int | None:
-    """The number of steps in a duration, or None if it is not a whole one."""
+    """The number of steps in a duration, or None if it is not a whole number."""
     count = round(duration / time_step)
     return count if math.isclose(count * time_step, duration, abs_tol=1e-9) else None

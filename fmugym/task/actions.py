@@ -1,4 +1,4 @@
-"""From an action to the inputs of the FMU."""
+"""Conversion of actions to inputs of the FMU."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from fmugym.task.spaces import to_input_types
 __all__ = ["elements_of", "flat_inputs", "has_nan", "is_element", "is_misfit", "no_action"]
 
 _OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
-"""What indexing and arithmetic raise for values of another kind or shape."""
+"""The exceptions that indexing and arithmetic raise for values of a wrong kind or shape."""
 
 _FEW: Final = 64
-"""Up to so many elements Python's floats are faster than numpy."""
+"""Up to this many elements, Python's floats are faster than numpy."""
 
 
 def no_action(space: spaces.Space[Any]) -> Any:
-    """Return what hooks read before the first action; None for spaces that have no zero."""
+    """Return the action that hooks read before the first one; None for spaces without a zero."""
     if isinstance(space, spaces.Discrete):
         return space.dtype.type(space.start)
     if isinstance(space, spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete):
@@ -47,12 +47,12 @@ def is_element(action: Any, elements: range) -> bool:
         return action in elements
     try:
         return operator.index(action) in elements
-    except Exception:  # a TypeError; or the object's own method fails
+    except Exception:  # a TypeError, or whatever the object's method raises
         return False
 
 
 def has_nan(action: Any) -> bool:
-    """Whether a number of an action is NaN, whatever the hooks would make of it."""
+    """Whether an action contains NaN, however the hooks would treat it."""
     if isinstance(action, np.ndarray):
         return action.dtype.kind == "f" and _holds_nan(action)
     if isinstance(action, float | np.floating):
@@ -61,23 +61,23 @@ def has_nan(action: Any) -> bool:
         return False
     try:
         return any(map(has_nan, action.values() if isinstance(action, Mapping) else action))
-    except Exception:  # a list that holds itself, or an object whose own methods fail
+    except Exception:  # a list that contains itself, or an object whose methods fail
         return False
 
 
 def is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
-    """Whether an exception of a hook comes from an action that is not in the action space.
+    """Whether a hook raised an exception because the action is not in the action space.
 
-    Hooks may take more than the elements of the space, a bare number for an array of one, say. So
-    exceptions of other kinds than a misfit raises are the hook's own.
+    Hooks may accept more than the elements of the space: a bare number for an array of one, for
+    example. Only the exceptions that a misfit raises are therefore blamed on the action.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Gymnasium warns of actions that are no arrays
+            warnings.simplefilter("ignore")  # Gymnasium warns if actions are not arrays
             if space.contains(action):
                 return False
         is_numeric = np.asarray(action).dtype.kind in "biuf"
-    except Exception:  # an object whose own methods fail
+    except Exception:  # an object whose methods fail
         return True
     return not is_numeric or isinstance(error, _OF_MISFITS)
 
@@ -97,20 +97,21 @@ def flat_inputs(
     Args:
         values: Numbers, in any shape.
         variables: The inputs.
-        source: Says for an error where values come from.
+        source: Tells in an error where the values come from.
 
     Returns:
-        New values of the inputs' types, as float64; they need not be finite.
+        A new array of values rounded to the inputs' types, as float64; they need not be finite.
 
     Raises:
-        ConfigError: If these are no numbers, not one for each input, or too large for their type.
+        ConfigError: If the values are not numbers, not one for each input, or too large for their
+            type.
     """
     if values is None:
         raise ConfigError("_get_inputs returned None, expected a number for each input")
     try:
         raw = np.asarray(values)
         flat = raw.astype(np.float64, casting="unsafe" if raw.dtype == object else "same_kind")
-    except Exception:  # no numbers, too large ones, or objects whose own methods fail
+    except Exception:  # not numbers, too large, or objects whose methods fail
         raise ConfigError(f"{source(values)} does not make numbers") from None
     flat = flat.ravel()
     if flat.size != len(variables):

@@ -35,7 +35,7 @@ class Episode(NamedTuple):
 
 
 class EpisodePlan:
-    """The draws of an episode, prepared once, so that a reset only draws.
+    """The draws of an episode, prepared once so that a reset only has to draw.
 
     The parameters are drawn first, then the episode variables, each in the order of their dict.
 
@@ -43,11 +43,11 @@ class EpisodePlan:
         model_variables: The FMU's variables for the parameters.
         parameters: Constants (checked) or distributions by name, in the same order.
         episode_variables: Constants or distributions by name.
-        overridden: The parameters that infos report as drawn, although they may be constants.
+        overridden: The parameters that infos report as drawn even if they are constants.
 
     Attributes:
         model_variables: As given.
-        constants: The parameters' values, 0 where they are drawn, shape (P,).
+        constants: The parameters' values, shape (P,); 0 for those that are drawn.
         told: The overridden parameters and their values, which infos report.
     """
 
@@ -87,7 +87,7 @@ class EpisodePlan:
 
     @property
     def limits(self) -> tuple[FloatArray, FloatArray]:
-        """Lower ends and widths of the uniform distributions, each of shape (draws,)."""
+        """The lower ends and widths of the uniform distributions, each of shape (draws,)."""
         return self._low[:, 0].copy(), self._width[:, 0].copy()
 
     @property
@@ -109,17 +109,17 @@ class EpisodePlan:
 
     @property
     def num_uniform(self) -> int | None:
-        """The number of draws if all are uniform draws of Reals, None otherwise."""
+        """The number of draws if all are uniform draws of Reals; otherwise None."""
         if any(may_not_fit for *_, may_not_fit in self._random_parameters):
             return None
         return len(self._sampler.limits) if self._sampler.all_uniform else None
 
     def scaled(self, fractions: FloatArray) -> FloatArray:
-        """Turn uniform numbers of [0, 1), shape (draws, M), into the drawn values."""
+        """Scale uniform numbers from [0, 1) to the drawn values; both have shape (draws, M)."""
         return self._low + self._width * fractions
 
     def starts(self) -> Starts:
-        """Draw two episodes for the trial of resets, from a stream that nothing else uses."""
+        """Draw two episodes for the trial of resets, from a separate random stream."""
         rng = np.random.default_rng(0)
         columns = [self.draw(rng).start_values[:, 0].tolist() for _ in range(2)]
         return Starts(self.model_variables, tuple(zip(*columns, strict=True)))
@@ -164,9 +164,9 @@ def _always_fits(distribution: Any, variable: Variable) -> bool:
 
 
 class Sampler:
-    """Draws from a fixed list of distributions in their order.
+    """Draws from a fixed list of distributions, in order.
 
-    One call makes successive uniform draws. The results are those of single draws, because
+    A single call makes successive uniform draws. The results equal those of single draws, because
     ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
 
     Attributes:

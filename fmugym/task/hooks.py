@@ -25,7 +25,7 @@ __all__ = ["Hooks"]
 class Hooks(gymnasium.Env[Any, Any], ABC):
     """The hooks with their defaults; a subclass of ``FMUEnv`` overrides what its task needs.
 
-    What the hooks may read is listed at ``FMUEnv``.
+    ``FMUEnv`` lists what the hooks may read.
     """
 
     config: EnvConfig
@@ -52,25 +52,25 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         """Turn ``self.action`` into the values of the inputs, in the order of the config.
 
         Returns:
-            One number for each input. By default these are the action's own elements; for a
-            ``Discrete`` made from an Enumeration or Integer, the value that the element stands for.
+            One number for each input. By default, these are the elements of the action. For a
+            ``Discrete`` made from an Enumeration or Integer, it is the value of the element.
         """
         values = self._action_values
         if values is None:
             return self.action
-        if isinstance(values, range):  # of an Integer; it may be a wide one
+        if isinstance(values, range):  # the range of an Integer, which may be wide
             return values[0] + self.action
         return np.array(values)[self.action]
 
     def _update(self) -> None:
-        """Advance what the task integrates or filters; called once after each step of the FMU."""
+        """Update integrators and filters of the task; called once after each step of the FMU."""
 
     @abstractmethod
     def _is_done(self) -> bool:
-        """Whether the task has ended, by success or by failure: ``terminated``."""
+        """Whether the task has ended in success or failure; becomes ``terminated``."""
 
     def _is_truncated(self) -> bool:
-        """Whether to cut the episode short for a reason outside of the task."""
+        """Whether to cut the episode short for a reason outside the task."""
         return False
 
     def _reward_policy(self) -> Any:
@@ -78,7 +78,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
         Returns:
             By default ``negative_reward`` where the task has ended and ``positive_reward``
-            otherwise; for a goal task ``_goal_reward`` of this observation.
+            otherwise. For a goal task, ``_goal_reward`` of this observation.
         """
         positive, negative = self.config.positive_reward, self.config.negative_reward
         if self._is_goal_task:
@@ -88,7 +88,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         return np.where(self.done, negative, positive)
 
     def _reward_for_goals(self, observation: Mapping[str, Any]) -> Any:
-        """Call ``_goal_reward`` as ``compute_reward`` does, with environments first."""
+        """Call ``_goal_reward`` as ``compute_reward`` does, with environments on the first axis."""
         try:
             achieved, desired = observation["achieved_goal"], observation["desired_goal"]
         except (KeyError, TypeError, IndexError):
@@ -104,32 +104,32 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         """The observation, a new array (or dict of new arrays).
 
         Returns:
-            By default the outputs in the type of the observation space. If they do not make an
-            element of it, as where an own hook adds to them, in the type of the default space.
+            By default, the outputs in the type of the observation space. If they do not fit that
+            space (an overriding hook may add elements), in the type of their default space.
         """
         return self._observe(self.state)
 
     def _get_info(self) -> dict[str, Any]:
-        """More facts about this step by name, a new dict."""
+        """Additional facts about this step by name, as a new dict."""
         return {}
 
-    # Settled once, at construction.
+    # Called once, at construction.
 
     def _get_action_space(self) -> spaces.Space[Any]:
-        """The action space; by default from the inputs' types, min and max."""
+        """The action space; by default made from the inputs' types, min and max."""
         return fmu_spaces.action_space(self._interface)
 
     def _get_observation_space(self) -> spaces.Space[Any]:
-        """The observation space; by default from the outputs' types, min and max."""
+        """The observation space; by default made from the outputs' types, min and max."""
         return fmu_spaces.observation_space(self._interface)
 
-    # Of some tasks only.
+    # For some tasks only.
 
     def _goal_reward(self, achieved_goal: Any, desired_goal: Any) -> Any:
-        """The reward for reaching one goal when another was wanted, element-wise.
+        """The element-wise reward for reaching ``achieved_goal`` when ``desired_goal`` was wanted.
 
         Override it for a goal task, whose observations are dicts with ``achieved_goal`` and
-        ``desired_goal``. The default reward and ``compute_reward`` are then made from it.
+        ``desired_goal``. The default reward and ``compute_reward`` then call it.
         """
         raise SimulationError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
 
@@ -137,16 +137,16 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         """The parameters that the options of ``reset`` override for one episode, by name."""
         return check_mapping("option 'model_parameters'", options.get("model_parameters", {}))
 
-    # Of pictures.
+    # For pictures.
 
     def _get_scene(self) -> Scene[Any]:
-        """What ``render`` draws; see ``fmugym.rendering``. Called once."""
+        """The scene that ``render`` draws; see ``fmugym.rendering``. Called once."""
         raise SimulationError(f"{type(self).__name__} has render modes, but no _get_scene")
 
     def _get_frame(self) -> Any:
-        """What the scene needs to know of this moment; by default ``out``."""
+        """The data that the scene needs to draw the current state; by default ``out``."""
         return self.out
 
     def _describe_action(self) -> str:
-        """The action as text for the picture."""
+        """The text that shows the action in the picture."""
         return ", ".join(f"{value:+.3g}" for value in self.inputs)

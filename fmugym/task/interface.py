@@ -56,7 +56,7 @@ class Interface:
         """The limits of a variable: the config's, or else the FMU's.
 
         Raises:
-            ConfigError: If the FMU's contradict each other.
+            ConfigError: If the FMU's limits contradict each other.
         """
         low, high = self._limits(variable)
         if not low <= high:
@@ -70,7 +70,7 @@ class Interface:
         return float(low), float(high)
 
     def pool_spec(self) -> PoolSpec:
-        """What the pool has to do.
+        """The pool's part of the config.
 
         Raises:
             ConfigError: If the warm-up is not a whole number of steps.
@@ -120,10 +120,10 @@ class Interface:
 
 
 def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
-    """Look all names up in the FMU and settle what the config left to it.
+    """Look up all names in the FMU, and take from the FMU what the config leaves open.
 
     Raises:
-        ConfigError: If a name is unknown, or its variable cannot be used so.
+        ConfigError: If a name is unknown, or its variable cannot be used in that role.
     """
     given = [
         (start_variable(description, name, value), value)
@@ -152,7 +152,7 @@ def input_variable(description: ModelDescription, name: str) -> Variable:
     """Find a variable that can be written before every step.
 
     Raises:
-        ConfigError: If there is none of this name, or it must not be written then.
+        ConfigError: If no variable has this name, or it must not be written before a step.
     """
     variable = description.variable(name)
     _require_numeric(variable, "an input")
@@ -168,7 +168,7 @@ def output_variable(description: ModelDescription, name: str) -> Variable:
     """Find a variable that can be read after every step.
 
     Raises:
-        ConfigError: If there is none of this name, or a float cannot carry its value.
+        ConfigError: If no variable has this name, or a float cannot hold its value.
     """
     variable = description.variable(name)
     _require_numeric(variable, "an output")
@@ -188,7 +188,8 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
     """Find a variable that can be set before initialization.
 
     Raises:
-        ConfigError: If there is none of this name, or it cannot be set or not be carried.
+        ConfigError: If no variable has this name, it cannot be set, or a float cannot hold its
+            value.
     """
     variable = description.variable(name)
     if not variable.settable_at_start:
@@ -215,7 +216,7 @@ def _require_text(name: str, value: Any) -> None:
 
 
 def checked(variable: Variable, value: Any) -> Any:
-    """Check a start value of a numeric variable; a distribution is left for what it draws."""
+    """Check a start value of a numeric variable; distributions are checked when they are drawn."""
     return value if is_distribution(value) else checked_value(variable, value)
 
 
@@ -223,7 +224,7 @@ def checked_value(variable: Variable, value: Any) -> float:
     """Convert a value for a numeric variable, without loss.
 
     Raises:
-        ConfigError: If the value is not finite, not of the variable's kind, or out of its type's
+        ConfigError: If the value is not finite, not of the variable's kind, or outside its type's
             range.
     """
     if isinstance(value, str) and variable.items:

@@ -1,4 +1,4 @@
-"""How an environment opens its FMU, and the pool that it runs in."""
+"""How an environment opens its FMU and makes its pool."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _request: ContextVar[tuple[int, dict[str, Any]]] = ContextVar("request", default
 
 @contextmanager
 def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
-    """Give environments that are made in this context a pool of this size.
+    """Give each environment made in this context a pool of this size.
 
     Args:
-        num_instances: Number of FMU instances; a vector environment's prototype has all of them.
+        num_instances: Number of FMU instances; the prototype of a vector environment has them all.
         options: Passed to ``fmugym.trial.opening.make_pool``.
     """
     token = _request.set((num_instances, options))
@@ -41,11 +41,11 @@ def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
 
 
 def open_fmu(cls: type, path: str | os.PathLike[str], config: EnvConfig) -> FMU:
-    """Open the FMU of an environment; relative paths are relative to the file of its class.
+    """Open the FMU of an environment; relative paths start at the folder of its class's file.
 
     Raises:
-        ConfigError: If an argument does not fit.
-        FMULoadError: If the file is missing or no sound FMU.
+        ConfigError: If an argument is invalid.
+        FMULoadError: If the file is missing or not a valid FMU.
     """
     return FMU(
         _find_file(cls, check_path("fmu_path", path)),
@@ -67,7 +67,7 @@ def open_pool(
     """Make the pool that the config, the arguments and the context ask for.
 
     Raises:
-        ConfigError: If an argument does not fit.
+        ConfigError: If an argument is invalid.
         FMULoadError: If the FMU cannot be used on this machine.
     """
     if isolation is not None:
@@ -86,9 +86,9 @@ def open_pool(
 
 
 def _find_file(cls: type, path: Path) -> Path:
-    """Find a relative path beside the file of the class, or of a class that it derives from.
+    """Find a relative path next to the file of the class or of one of its base classes.
 
-    Classes of a notebook or of the interactive interpreter have no file: for them the path is
+    Classes from a notebook or the interactive interpreter have no file. For them, the path is
     relative to the working directory.
     """
     if path.is_absolute():
@@ -102,7 +102,7 @@ def _find_file(cls: type, path: Path) -> Path:
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except OSError:  # no file can have this path
+    except OSError:  # the path is not valid for any file
         return False
 
 

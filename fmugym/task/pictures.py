@@ -19,7 +19,7 @@ _GYMNASIUM_MODES = ("human", "rgb_array", "ansi", "rgb_array_list", "ansi_list")
 
 
 class Pictured(Hooks):
-    """What ``FMUEnv`` does about pictures."""
+    """The part of ``FMUEnv`` that makes pictures."""
 
     render_size: ClassVar[tuple[int, int]] = (600, 400)
     """Width and height of the pictures in pixels."""
@@ -35,10 +35,10 @@ class Pictured(Hooks):
         raise NotImplementedError
 
     def _checked_render_mode(self, mode: Any) -> str | None:
-        """Warn of a mode that the class does not have, and go on without pictures.
+        """Warn of a mode that the class does not support, and go on without pictures.
 
-        Libraries ask for pictures of any environment, as Stable-Baselines3's ``make_vec_env`` does.
-        A mode that Gymnasium does not know is a mistake.
+        Some libraries ask every environment for pictures: ``make_vec_env`` of Stable-Baselines3,
+        for example. A mode that Gymnasium does not know is an error.
         """
         known = list(self.metadata.get("render_modes", ()))
         if mode is None:
@@ -59,11 +59,11 @@ class Pictured(Hooks):
             self.render()
 
     def render(self) -> Any:
-        """Draw the present state.
+        """Draw the current state.
 
         Returns:
-            In the mode ``rgb_array`` an array of shape (height, width, 3) and type uint8. In the
-            mode ``human`` None: the picture is in a window.
+            In the mode ``rgb_array``, an array of shape (height, width, 3) and type uint8. In the
+            mode ``human``, None; a window shows the picture.
 
         Raises:
             SimulationError: Before the first reset.

@@ -1,7 +1,7 @@
-"""Checks of what hooks return: of a kind that the environment can use, and finite.
+"""Checks that hooks return usable kinds of values, and finite numbers.
 
 A result of the wrong kind is a mistake in the class, and ``ConfigError`` names the hook. Numbers
-that are not finite are a fault of the episode, like a failure of the FMU.
+that are not finite end the episode with a fault, as a failure of the FMU does.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ __all__ = [
 ]
 
 FLOAT32_LIMIT: Final = float(np.finfo(np.float32).max)
-"""Greater numbers are infinite in an observation of float32."""
+"""Greater numbers become infinite in a float32 observation."""
 
 _FEW: Final = 64
-"""Up to so many elements Python's floats are faster than numpy."""
+"""Up to this many elements, Python's floats are faster than numpy."""
 
 _OBSERVE: Final = "_get_observation"
 
@@ -38,10 +38,10 @@ Finiteness = Callable[[Any], bool]
 
 
 def given(value: Any, hook: str) -> Any:
-    """Return what a hook returned.
+    """Return the result of a hook unless it is None.
 
     Raises:
-        ConfigError: If that is None.
+        ConfigError: If the result is None.
     """
     if value is None:
         raise ConfigError(f"{hook} returned None; is its return statement missing?")
@@ -49,7 +49,7 @@ def given(value: Any, hook: str) -> Any:
 
 
 def as_flag(hook: str, value: Any) -> bool:
-    """Return the True or False of a hook as a bool; 0 and 1, and arrays of one element, will do.
+    """Convert a hook's result to a bool. Also accepts 0, 1 and arrays of one element.
 
     Raises:
         ConfigError: If it is something else.
@@ -65,10 +65,10 @@ def as_flag(hook: str, value: Any) -> bool:
 
 
 def as_reward(value: Any) -> float:
-    """Return a reward as a float, finite or not; an array of one element will do.
+    """Convert a reward to a float, finite or not. Also accepts an array of one element.
 
     Raises:
-        ConfigError: If it is no number.
+        ConfigError: If it is not a number.
     """
     if type(value) is np.float64 or type(value) is np.float32:
         return float(value)
@@ -76,10 +76,10 @@ def as_reward(value: Any) -> float:
 
 
 def as_info(value: Any) -> dict[str, Any]:
-    """Return the info of a hook as a new dict.
+    """Convert the info of a hook to a new dict.
 
     Raises:
-        ConfigError: If it is no mapping from names.
+        ConfigError: If it is not a mapping from names.
     """
     if type(value) is dict:
         return value.copy()
@@ -87,18 +87,18 @@ def as_info(value: Any) -> dict[str, Any]:
 
 
 def _single(value: Any) -> Any:
-    """The element of an array of one; anything else as it is."""
-    is_array = issubclass(type(value), np.ndarray)  # isinstance may call the object's own methods
+    """Return the element of a one-element array; return anything else unchanged."""
+    is_array = issubclass(type(value), np.ndarray)  # isinstance may call the object's methods
     return value.reshape(-1)[0] if is_array and value.size == 1 else value
 
 
 def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
-    """Make the check of the observations of a space.
+    """Make the function that checks the observations of a space.
 
     Returns:
-        A function of an observation. It tells whether all numbers are finite, and raises
-        ``ConfigError`` if the observation does not have the shape and kind of the space. Bounds are
-        not checked.
+        A function that takes an observation and tells whether all its numbers are finite. It
+        raises ``ConfigError`` if the observation does not have the shape and kind of the space. It
+        does not check bounds.
     """
     if isinstance(space, spaces.Dict):
         return _of_dict({name: finiteness_of(inner) for name, inner in space.spaces.items()})
@@ -142,7 +142,7 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
         try:
             fits = observation.keys() == parts.keys()
-        except Exception:  # no mapping, or its own methods fail
+        except Exception:  # not a mapping, or its methods fail
             fits = False
         if not fits:
             raise ConfigError(
@@ -178,7 +178,7 @@ def _numbers(observation: Any, kinds: str) -> np.ndarray[Any, Any]:
     given(observation, _OBSERVE)
     try:
         array = np.asarray(observation)
-    except Exception:  # ragged lists, or objects whose own methods fail
+    except Exception:  # ragged lists, or objects whose methods fail
         array = np.asarray(None)
     if array.dtype.kind not in kinds:
         raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, expected an array of numbers")

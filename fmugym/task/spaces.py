@@ -1,4 +1,4 @@
-"""Spaces made from the FMU's variables, and the way between their elements and FMU values.
+"""Spaces made from the FMU's variables, and conversions between elements and FMU values.
 
 ======================================  ==========================================================
 variables                               space
@@ -40,7 +40,8 @@ def action_space(interface: Interface) -> spaces.Space[Any]:
     """Make the action space of an environment's inputs.
 
     Raises:
-        ConfigError: If there is no input, or one has no limits; the text says how to give them.
+        ConfigError: If there is no input, or an input has no limits. The text says how to set
+            them.
     """
     if not interface.inputs:
         raise ConfigError(
@@ -58,7 +59,7 @@ def action_space(interface: Interface) -> spaces.Space[Any]:
 
 
 def observation_space(interface: Interface) -> spaces.Space[Any]:
-    """Make the observation space of an environment's outputs; a Real may be unbounded in it."""
+    """Make the observation space of an environment's outputs. Reals may be unbounded."""
     return _space(interface, interface.outputs)
 
 
@@ -128,7 +129,7 @@ def to_input_types(
         The values for the FMU, still as float64.
 
     Raises:
-        ConfigError: If a value is out of its type's range.
+        ConfigError: If a value is outside its type's range.
     """
     result = values.copy()
     for index, variable in enumerate(variables):
@@ -143,7 +144,7 @@ def _to_input_type(variable: Variable, value: float) -> float:
     if variable.kind in {"integer", "enumeration"}:
         value = round(value)
     items = [item for _, item in variable.items]
-    if items and min(items) <= value <= max(items):  # there may be gaps between them
+    if items and min(items) <= value <= max(items):  # the items may have gaps between them
         value = min(items, key=lambda item: abs(item - value))
     return checked_value(variable, value)
 
@@ -151,7 +152,7 @@ def _to_input_type(variable: Variable, value: float) -> float:
 def default_observation(
     interface: Interface, space: spaces.Space[Any]
 ) -> Callable[[Sequence[float]], Any]:
-    """Make the function from the outputs to an element of an observation space.
+    """Make the function that turns the outputs into an element of an observation space.
 
     Args:
         interface: Names the outputs.
@@ -178,15 +179,15 @@ def default_observation(
 def outputs_observation(
     interface: Interface, space: spaces.Space[Any]
 ) -> Callable[[Sequence[float]], Any]:
-    """Make what ``super()._get_observation()`` returns to a class with an own hook.
+    """Make the function behind ``super()._get_observation()`` for a class that overrides it.
 
     Args:
         interface: Names the outputs.
         space: The environment's observation space, which the outputs alone may not fit.
 
     Returns:
-        The function to elements of the space, or else of the default space of the outputs. It
-        raises ``ConfigError`` when it is called if there is neither.
+        A function that returns elements of the space or, if the outputs do not fit it, of their
+        default space. If they have no default space, calling it raises ``ConfigError``.
     """
 
     @cache

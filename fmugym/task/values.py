@@ -12,15 +12,15 @@ __all__ = ["EpisodeVariables", "LateDict", "NamedValues"]
 
 
 class NamedValues(Mapping[str, Any]):
-    """A read-only mapping from names to values that are kept in a fixed order.
+    """A read-only mapping from names to values in a fixed order.
 
     Args:
-        kind: What the names name, for error texts.
+        kind: What the names refer to, for error texts.
         names: The names, in the order of the values.
-        get_values: Returns the present values.
+        get_values: Returns the current values.
 
     Raises:
-        ConfigError: By ``[]``, for an unknown name; the text has the nearest one.
+        ConfigError: If ``[]`` gets an unknown name; the text suggests the nearest one.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class NamedValues(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         try:
             index = self._index[name]
-        except Exception:  # a KeyError; or something that is no key at all
+        except Exception:  # a KeyError, or an object that cannot be a key
             raise unknown_name(self._kind, name, self._index) from None
         return self._get_values()[index]
 
@@ -41,7 +41,7 @@ class NamedValues(Mapping[str, Any]):
         return isinstance(name, str) and str.__str__(name) in self._index
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return a value, or the default if there is none of this name."""
+        """Return the value of a name, or the default if the name is unknown."""
         if name not in self:
             return default
         return self._get_values()[self._index[name]]
@@ -57,7 +57,7 @@ class NamedValues(Mapping[str, Any]):
 
 
 class EpisodeVariables(dict[str, Any]):
-    """The episode variables: a dict whose names are those of the config.
+    """The episode variables: a dict that accepts only the names in the config.
 
     Args:
         names: The names; their values are None until the first reset.
@@ -75,10 +75,10 @@ class EpisodeVariables(dict[str, Any]):
         super().__setitem__(name, value)
 
     def update(self, *args: Any, **kwargs: Any) -> None:
-        """Write several variables, as in a dict; none is written if a name is unknown."""
+        """Write several variables, as in a dict. If a name is unknown, nothing is written."""
         try:
             new = dict(*args, **kwargs)
-        except Exception:  # no dict at all, or one whose own methods fail
+        except Exception:  # not a dict, or a dict whose methods fail
             raise ConfigError(f"{shown(args)} are no values by name") from None
         for name in new:
             if name not in self:
@@ -90,7 +90,7 @@ class EpisodeVariables(dict[str, Any]):
         return self
 
     def setdefault(self, name: str, default: Any = None) -> Any:
-        """Read a variable; the default is not used, as all variables are there."""
+        """Read a variable. The default is never used, because all variables exist."""
         return self[name]
 
     def _keep(self, *_: Any) -> Any:
@@ -99,19 +99,19 @@ class EpisodeVariables(dict[str, Any]):
     __delitem__ = pop = popitem = clear = _keep
 
     def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
-        """A copy is a plain dict."""
+        """Make copies plain dicts."""
         return dict, (dict(self),)
 
 
 class LateDict(dict[str, Any]):
-    """A dict that is filled when it is first read or written, for values that are rarely read.
+    """A dict for values that are rarely read; it is filled when first read or written.
 
-    Every method of ``dict`` fills it first. Functions in C that look into a dict without calling
-    its methods (none of the standard library's does) would find ``_UNFILLED``.
+    Every method of ``dict`` fills it first. C functions that read a dict without calling its
+    methods would find ``_UNFILLED``; no function of the standard library does that.
 
     Args:
-        fill: Returns the items.
-        arguments: What to call it with.
+        fill: A function that returns the items.
+        arguments: The arguments of ``fill``.
     """
 
     __slots__ = ("_fill",)
@@ -120,10 +120,10 @@ class LateDict(dict[str, Any]):
 
     @classmethod
     def of(cls, fill: Callable[..., Mapping[str, Any]], *arguments: Any) -> LateDict:
-        """Make one in a third of the time that a constructor in Python takes."""
+        """Make a dict in a third of the time that a Python constructor takes."""
         late: LateDict = dict.__new__(cls)
         late._fill = fill, arguments
-        dict.__setitem__(late, _UNFILLED, None)  # json.dumps writes {} for a dict of no items
+        dict.__setitem__(late, _UNFILLED, None)  # json.dumps writes {} for an empty dict
         return late
 
     def _filled(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class LateDict(dict[str, Any]):
     __hash__ = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A copy is a plain dict."""
+        """Make copies plain dicts."""
         return dict, (dict(self.items()),)
 
 
@@ -150,7 +150,7 @@ _NOT_OF_THE_ITEMS: Final = {
 
 
 def _filling(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a method of ``dict`` fill every ``LateDict`` that it is called with."""
+    """Wrap a method of ``dict`` so that it first fills every ``LateDict`` among its arguments."""
 
     @functools.wraps(method)
     def call(*values: Any, **items: Any) -> Any:

@@ -1,1 +1,1 @@
-"""The first meeting with an FMU, in a process that may die of it, and what follows from it."""
+"""The first trial of an FMU, in a process that it may crash, and the conclusions drawn from it."""

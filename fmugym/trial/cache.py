@@ -1,6 +1,6 @@
-"""What is remembered between runs: small texts by key in the user's cache folder.
+"""A cache that lasts between runs: small texts by key in the user's cache folder.
 
-A folder that cannot be read or written is no error: then nothing is remembered.
+If the folder cannot be read or written, nothing is cached, and no error is raised.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ __all__ = ["cache_folder", "recall", "remember"]
 logger = logging.getLogger(__name__)
 
 _LARGEST: Final = 2**20
-"""Bytes of a text."""
+"""The largest size of a text in bytes."""
 
 _READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-"""Neither follow a link nor wait for the other end of a pipe; Windows has no such flags."""
+"""Do not follow links, and do not wait for a pipe's writer; Windows has no such flags."""
 
 
 def cache_folder() -> Path:
-    """The folder: ``FMUGYM_CACHE_DIR``, or ``fmugym`` in the system's place for caches.
+    """Return ``FMUGYM_CACHE_DIR``, or else ``fmugym`` in the system's folder for caches.
 
-    That is ``XDG_CACHE_HOME`` or ``~/.cache``, on macOS ``~/Library/Caches``, on Windows
-    ``LOCALAPPDATA``.
+    The system's folder is ``XDG_CACHE_HOME`` or ``~/.cache``; on macOS ``~/Library/Caches``; on
+    Windows ``LOCALAPPDATA``.
 
     Raises:
-        RuntimeError: If the user has no home.
+        RuntimeError: If the user has no home folder.
     """
     given = os.environ.get("FMUGYM_CACHE_DIR")
     return Path(given).expanduser() if given else _system_folder() / "fmugym"
@@ -47,10 +47,10 @@ def _system_folder() -> Path:
 
 
 def recall(key: str) -> str | None:
-    """Find what was remembered under a key, or None.
+    """Read the text that was cached under a key; None if there is none.
 
-    Nothing but a regular file of a sensible size is read: a pipe would never end, and a link may
-    lead anywhere.
+    Only a regular file of a sensible size is read: a pipe might never end, and a link may lead
+    anywhere.
     """
     try:
         handle = os.open(cache_folder() / key, _READ)
@@ -64,7 +64,7 @@ def recall(key: str) -> str | None:
 
 
 def remember(key: str, text: str) -> None:
-    """Remember a text under a key, which is a file name."""
+    """Cache a text under a key, which is a file name."""
     try:
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def remember(key: str, text: str) -> None:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Write a file in one go: another process may read or write it now."""
+    """Replace a file atomically, because another process may be reading or writing it."""
     handle, name = tempfile.mkstemp(dir=path.parent)
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as file:

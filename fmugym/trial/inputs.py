@@ -1,4 +1,4 @@
-"""Inputs for trials: within their limits, moving, and different for each instance."""
+"""Inputs for trials: they move within their limits and differ between instances."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from fmugym.pool.spec import PoolSpec
 __all__ = ["moving_inputs", "neighbour_inputs", "start_inputs"]
 
 _UNBOUNDED: Final = 1.0
-"""How far a Real without limits moves to each side, in its own unit."""
+"""How far a Real without limits moves to each side, in its unit."""
 
 
 def start_inputs(spec: PoolSpec) -> FloatArray:
-    """Start values of the inputs, moved into their limits, shape (inputs,)."""
+    """The start values of the inputs, clipped to their limits, shape (inputs,)."""
     return np.array([_start(*pair) for pair in _with_limits(spec)], np.float64)
 
 
 def neighbour_inputs(spec: PoolSpec) -> FloatArray:
-    """Inputs for an instance that may disturb another: the other end of each range."""
+    """The inputs of an instance that may disturb another: the opposite end of each range."""
     return np.array([_other(*pair) for pair in _with_limits(spec)], np.float64)
 
 
 def moving_inputs(spec: PoolSpec, steps: int, amplitude: float, phase: float = 0.0) -> FloatArray:
-    """Inputs that move from step to step, each at a pace of its own.
+    """Make inputs that move from step to step, each at a different pace.
 
     Args:
         spec: Names the inputs.
-        steps: How many.
-        amplitude: How far they move, as a part of the range on each side of the start value.
-        phase: Makes the inputs of one instance differ from those of another, in steps.
+        steps: The number of steps.
+        amplitude: How far they move, as a fraction of the range on each side of the start value.
+        phase: A shift in steps, by which the inputs of one instance differ from those of another.
 
     Returns:
         Shape (steps, inputs).
@@ -62,7 +62,7 @@ def _start(variable: Variable, limits: _Limits) -> float:
 
 
 def _moved(variable: Variable, limits: _Limits, swing: FloatArray) -> FloatArray:
-    """Values around the start: up to the upper limit, down to the lower one."""
+    """Values around the start value that swing up to the upper limit and down to the lower one."""
     start = _start(variable, limits)
     if variable.kind == "boolean":
         return np.where(swing > 0.3, 1.0 - start, start)

@@ -1,7 +1,7 @@
 """Whether instances of an FMU disturb each other.
 
-The standard says that they do not. Some FMUs keep part of their state in global variables of their
-library all the same, or call functions that are not safe in threads.
+The standard says that they do not. Even so, some FMUs keep part of their state in global variables
+of their library, or call functions that are not thread-safe.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ __all__ = ["default_spec", "disturb_in_threads", "disturb_in_turn"]
 logger = logging.getLogger(__name__)
 
 _DEFAULT_STEP_SIZE: Final = 0.01
-"""Where the FMU names none, in seconds."""
+"""The step size in seconds if the FMU gives none."""
 
 _MOST_OUTPUTS: Final = 1000
 _STEPS: Final = 30
 _ROUNDS: Final = 20
 _THREAD_SECONDS: Final = 0.2
-"""Real time after which a comparison in threads ends."""
+"""The real time in seconds after which a comparison in threads ends."""
 
 
 def default_spec(fmu: FMU) -> PoolSpec:
-    """What to do with an unknown FMU: write all inputs, read all outputs, in its own step size."""
+    """The spec for an unknown FMU: write all inputs, read all outputs, use the FMU's step size."""
     description = fmu.description
     numeric = [v for v in description.variables.values() if v.numeric]
     outputs = [v for v in numeric if v.causality == "output"] or [
@@ -61,10 +61,10 @@ def disturb_in_turn(
     *,
     private_libraries: bool = False,
 ) -> bool:
-    """Compare an instance run alone with one run beside another, which gets other inputs.
+    """Compare an instance run alone with one run beside another that gets different inputs.
 
-    Each run loads a fresh copy of the FMU's library. FMUs may still share what lies outside of
-    their library: files, other libraries, licences.
+    Each run loads a fresh copy of the FMU's library. FMUs may still share things outside their
+    library: files, other libraries, licences.
 
     Args:
         candidate: The FMU.
@@ -75,7 +75,7 @@ def disturb_in_turn(
         Whether the two instances depend on each other.
 
     Raises:
-        FMULoadError: If not even one instance can be made.
+        FMULoadError: If even a single instance cannot be made.
         SimulationError: If an instance alone fails.
     """
     spec = default_spec(candidate.open()) if spec is None else spec
@@ -91,7 +91,7 @@ def disturb_in_turn(
 def _run_alone(
     candidate: Candidate, spec: PoolSpec, private_libraries: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Run one instance with moving inputs, or with constant ones where the FMU fails."""
+    """Run one instance with moving inputs, or with constant ones if the FMU then fails."""
     inputs = _inputs_of_two(spec, 1.0)
     try:
         return _run(candidate, spec, inputs[:1], private_libraries), inputs
@@ -101,7 +101,7 @@ def _run_alone(
 
 
 def _inputs_of_two(spec: PoolSpec, amplitude: float) -> FloatArray:
-    """Inputs of two instances that differ in every step, shape (2, steps, inputs)."""
+    """The inputs of two instances, different in every step, shape (2, steps, inputs)."""
     first = moving_inputs(spec, _STEPS, amplitude)
     second = moving_inputs(spec, _STEPS, 1.0, phase=_STEPS)
     second[: _STEPS // 3] = neighbour_inputs(spec)
@@ -111,7 +111,7 @@ def _inputs_of_two(spec: PoolSpec, amplitude: float) -> FloatArray:
 def _run(
     candidate: Candidate, spec: PoolSpec, inputs: FloatArray, private_libraries: bool
 ) -> FloatArray:
-    """Step instances of a fresh copy in turn; returns the outputs of the first one."""
+    """Step instances of a fresh copy in turn; return the outputs of the first one."""
     count = len(inputs)
     fmu = candidate.open()
     pool = local_pool(fmu, spec, count, logger, threads=1, private_libraries=private_libraries)
@@ -136,14 +136,14 @@ def _trajectory(pool: Pool, inputs: FloatArray) -> FloatArray:
 
 
 def disturb_in_threads(candidate: Candidate, spec: PoolSpec) -> bool:
-    """Compare instances that are made, initialized and stepped at the same time with one alone.
+    """Compare a lone instance with instances that are made and stepped at the same time.
 
     Args:
         candidate: The FMU.
         spec: What to do in a step.
 
     Returns:
-        Whether an instance gave other outputs, or failed, beside another thread.
+        Whether an instance gave different outputs, or failed, while another thread ran.
 
     Raises:
         FMULoadError: If FMPy cannot load the FMU.
@@ -154,14 +154,14 @@ def disturb_in_threads(candidate: Candidate, spec: PoolSpec) -> bool:
         inputs = _inputs_of_two(spec, 0.0)[0]
         expected = _life(library, spec, inputs, _nobody_waits)
         if _life(library, spec, inputs, _nobody_waits) != expected:
-            return False  # not even one alone gives the same again: nothing can be compared
+            return False  # a lone instance does not repeat its outputs: nothing to compare
         return not _Race(library, spec, inputs, expected).is_undisturbed()
     finally:
         library.close()
 
 
 class _Race:
-    """Two threads that live the life of an instance at the same time, several times."""
+    """Two threads that each make, run and free an instance at the same time, several times."""
 
     def __init__(
         self, library: Library, spec: PoolSpec, inputs: FloatArray, expected: bytes
@@ -200,7 +200,7 @@ class _Race:
 
 
 def _life(library: Library, spec: PoolSpec, inputs: FloatArray, wait: Callable[[], None]) -> bytes:
-    """Make, initialize, step and free an instance; returns all outputs."""
+    """Make, initialize, step and free an instance; return all outputs."""
     instance = library.instantiate()
     try:
         wait()
@@ -226,8 +226,8 @@ def _steps(instance: Instance, spec: PoolSpec, inputs: FloatArray) -> bytes:
 
 
 def _no_start_values() -> None:
-    """Leave the FMU's own."""
+    """Keep the FMU's start values."""
 
 
 def _nobody_waits() -> None:
-    """What an instance does that is alone."""
+    """Do nothing: a lone instance does not wait for others."""

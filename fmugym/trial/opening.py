@@ -1,4 +1,4 @@
-"""Which pool an FMU gets: decided by what the caller asks for and what the first meeting shows."""
+"""The choice of an FMU's pool, from the caller's wishes and the results of the first trial."""
 
 from __future__ import annotations
 
@@ -40,32 +40,31 @@ def make_pool(
     workers: int | None = None,
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
 ) -> Pool:
-    """Make the fastest pool that gives right values.
+    """Make the fastest pool that gives correct values.
 
     Args:
         fmu: The FMU; closed with the pool.
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        backend: ``"native"``, ``"python"``, or ``"auto"`` (also ``"fmu"``): native where the
-            extension was built. Or what stands in for the FMU; see ``BackendPool``.
-        starts: Start values of two episodes, for the trial of resets.
-        reset_method: One of ``ResetMethod``; by default the fastest one that the trial has found
-            to be right.
-        threads: See ``NativePool``; the Python pool has one thread. By default one where instances
-            disturb each other at the same time.
-        private_libraries: See ``NativePool``; by default where the FMU says that it can be
-            instantiated only once per process, or where two instances are found to disturb each
-            other. The Python pool has one library.
-        isolation: ``"process"`` for worker processes, ``"none"`` for this one. By default this one,
-            unless instances disturb each other and private libraries do not help.
-        workers: See ``ProcessPool``; by default one for each instance where they disturb each
-            other.
-        call_timeout: See ``ProcessPool``; nothing limits a call in this process.
+        backend: ``"native"``, ``"python"``, or ``"auto"`` (also ``"fmu"``): native if the
+            extension was built. Or an object that replaces the FMU; see ``BackendPool``.
+        starts: The start values of two episodes, for the trial of resets.
+        reset_method: One of ``ResetMethod``; by default the fastest one that gives correct
+            results in the trial.
+        threads: See ``NativePool``; the Python pool has one thread. By default one if instances
+            disturb each other when they run at the same time.
+        private_libraries: See ``NativePool``; by default True if the FMU says that it can be
+            instantiated only once per process, or if two instances disturb each other in the
+            trial. The Python pool has one library.
+        isolation: ``"process"`` for worker processes, ``"none"`` for this process. By default this
+            process, unless instances disturb each other and private libraries do not help.
+        workers: See ``ProcessPool``; by default one for each instance if they disturb each other.
+        call_timeout: See ``ProcessPool``; calls in this process have no time limit.
 
     Raises:
         ConfigError: If the backend, the isolation or the reset method is unknown.
-        FMULoadError: If the FMU cannot be loaded or instantiated, or the backend is not there.
+        FMULoadError: If the FMU cannot be loaded or instantiated, or the backend is not available.
     """
     if not isinstance(backend, str):
         if spec.fault_retries:
@@ -114,7 +113,7 @@ def _is_native(backend: str) -> bool:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How to open a pool: first what the caller demands, then completed by what a trial shows."""
+    """How to open a pool: the caller's demands, completed with the results of a trial."""
 
     native: bool
     reset_method: str | None = None
@@ -130,13 +129,13 @@ class _Plan:
 
     @property
     def has_own_workers(self) -> bool:
-        """Whether the caller has settled which instances share a process."""
+        """Whether the caller has decided which instances share a process."""
         return self.isolation == "process" and self.workers is not None
 
     def completed(
         self, fmu: FMU, verdict: Verdict, num_instances: int, log: logging.Logger
     ) -> _Plan:
-        """Settle what the caller has left open, and tell in the log what is not as usual."""
+        """Decide what the caller has left open, and log every unusual choice."""
         plan = self
         if plan.reset_method is None:
             plan = replace(plan, reset_method=verdict.reset_method)
@@ -174,7 +173,7 @@ class _Plan:
         return self.native and self.isolation is None
 
     def _with_means_of_reset(self, num_instances: int) -> _Plan:
-        """New libraries need private ones of the native pool, new processes one each."""
+        """Provide the private libraries or the processes that the reset method needs."""
         method = self.method
         if method is ResetMethod.LIBRARY and (self.isolation == "process" or not self.native):
             method = ResetMethod.PROCESS
@@ -186,7 +185,7 @@ class _Plan:
 
 
 def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
-    """Say which reset methods the FMU promises and cannot keep."""
+    """Log the reset methods that the FMU offers but that do not work correctly."""
     wrong = [m for m, g in verdict.resets.items() if g in (Grade.WRONG, Grade.FAILS)]
     if not verdict.deterministic:
         log.warning("%s gives other outputs each time, even if it begins afresh", fmu.path.name)
@@ -203,7 +202,7 @@ def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
 def _verdict(
     fmu: FMU, spec: PoolSpec, starts: Starts | None, num_instances: int, plan: _Plan
 ) -> Verdict:
-    """What is known of an FMU: from a trial, or from here where trials are turned off."""
+    """Get the verdict on an FMU from a trial, or from this process if trials are turned off."""
     candidate = Candidate.of(fmu)
     spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
     if is_bundled(fmu.path):
@@ -224,8 +223,8 @@ def _verdict(
 
 
 def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:
-    """Compare two instances in this process, where the FMU will run untried anyway."""
+    """Compare two instances in this process, in which the FMU will run without a trial anyway."""
     try:
         return disturb_in_turn(candidate, spec)
-    except SimulationError:  # it fails alone too, without the values that the caller will set
+    except SimulationError:  # a lone instance fails too: it needs the caller's values
         return False

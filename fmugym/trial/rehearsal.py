@@ -1,9 +1,9 @@
-"""Whether an FMU begins each episode as a fresh instance does: found out by trying.
+"""Trials that show whether an FMU begins each episode as a fresh instance does.
 
 The reference is a fresh instance of a fresh copy of the FMU's library. One instance then plays
-several episodes, each begun by the reset method in question, and each is compared with the
-reference: after a short and after a long episode, twice, and with start values that differ. The
-inputs move, since a reset that forgets something often shows only then.
+several episodes, and the reset method in question begins each of them. Every episode is compared
+with the reference: after a short and after a long episode, twice, and with different start values.
+The inputs move, because that often is the only way to see that a reset forgets something.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from fmugym.trial.verdict import Grade
 __all__ = ["Rehearsal", "Starts"]
 
 _SHORT: Final = 3
-"""Steps of a short episode."""
+"""The steps of a short episode."""
 
 _LONGEST: Final = 400
-"""Steps of a long episode, at most."""
+"""The most steps of a long episode."""
 
 _LONG_SECONDS: Final = 0.1
-"""Real time after which a long episode of a slow FMU ends."""
+"""The real time in seconds after which a long episode of a slow FMU ends."""
 
 _AMPLITUDES: Final = (1.0, 0.1, 0.0)
-"""How far inputs move, as a part of their range: less where the FMU fails."""
+"""How far inputs move, as fractions of their range; the smaller ones for FMUs that fail."""
 
 _RELATIVE_TOLERANCE: Final = 1e-4
-"""Of solvers, where neither the config nor the FMU names one."""
+"""The solver tolerance if neither the config nor the FMU gives one."""
 
 _SLACK: Final = 10.0
-"""How many tolerances two runs of a solver may differ by."""
+"""By how many tolerances two runs of a solver may differ."""
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Start values of two episodes that differ.
+    """Different start values of two episodes.
 
     Attributes:
-        variables: The variables set before initialization, P of them.
+        variables: The P variables that are set before initialization.
         values: Their values, shape (P, 2).
     """
 
@@ -73,7 +73,7 @@ class _Run:
     failure: str = ""
 
     def cut(self, steps: int) -> _Run:
-        """The episode as it is if it is stopped after some steps."""
+        """The same episode, stopped after some steps."""
         if steps + 1 > len(self.rows):
             return self
         return _Run(self.rows[: steps + 1], Status.OK)
@@ -89,7 +89,7 @@ class Rehearsal:
 
     Attributes:
         deterministic: Whether two fresh instances give the same outputs.
-        reason: What the FMU said where not even a fresh instance can play an episode, or "".
+        reason: The FMU's message if even a fresh instance cannot play an episode, otherwise "".
     """
 
     def __init__(self, candidate: Candidate, spec: PoolSpec, starts: Starts) -> None:
@@ -107,7 +107,7 @@ class Rehearsal:
         return bool(self._references)
 
     def _find_reference(self) -> None:
-        """Play the reference with inputs that move as far as the FMU bears."""
+        """Play the reference with inputs that move as far as the FMU tolerates."""
         for amplitude in _AMPLITUDES:
             self._inputs = moving_inputs(self._spec, _LONGEST, amplitude)
             self._steps = _LONGEST
@@ -144,7 +144,7 @@ class Rehearsal:
         )
 
     def _play(self, pool: Pool, start: int, steps: int, *, measured: bool = False) -> _Run:
-        """Play one episode; a measured one settles how many steps a long episode has."""
+        """Play one episode; a measured one determines how many steps a long episode has."""
         deadline = time.perf_counter() + _LONG_SECONDS
         outputs, statuses = pool.reset(self._starts.variables, self._starts.column(start))
         rows = [outputs[:, 0].copy()]
@@ -188,7 +188,7 @@ class Rehearsal:
         return worst
 
     def _episodes(self) -> Sequence[tuple[int, int]]:
-        """Which start values and how many steps: each follows a short and a long one."""
+        """The start values and numbers of steps; each kind follows a short and a long episode."""
         short, long = min(_SHORT, self._steps), self._steps
         return ((0, short), (0, long), (0, long), (1, short), (0, short), (0, long), (1, long))
 
@@ -208,7 +208,7 @@ def _same(one: _Run, other: _Run) -> bool:
 
 
 def _difference(one: _Run, other: _Run) -> float:
-    """The largest difference of an output, as a part of its largest size."""
+    """The largest difference of an output, as a fraction of its largest magnitude."""
     length = min(len(one.rows), len(other.rows))
     a, b = one.rows[:length], other.rows[:length]
     if a.size == 0:

@@ -1,11 +1,11 @@
-"""A first meeting with an FMU, in a process that may die of it.
+"""The first trial of an FMU, in a process that it may crash.
 
 An FMU is native code: a fault in it ends the process that loads it. So a worker process
 (``fmugym.trial.worker``) loads, instantiates, initializes and steps an unknown FMU once before this
 process touches it. Success is cached by the file's content. Failures are not cached: a missing
 licence may return.
 
-A process protects from accidents, not from malice: the worker has all the rights of its user.
+A process protects from accidents but not from malice: the worker has all the rights of its user.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ logger = logging.getLogger(__name__)
 _WORKER = "fmugym.trial.worker"
 
 _ALONE: Final = {"loading and instantiation", "initialization", "the first step", "closing"}
-"""The stages of one instance; a worker that ends there only where memory is checked has shown that
-the FMU writes where it must not."""
+"""The stages of a single instance. If a worker ends there only when memory is checked, the FMU
+writes to memory that it must not touch."""
 
 
 _MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
-"""How glibc begins what it says of a memory error."""
+"""How glibc begins its messages about memory errors."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Candidate:
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
-        """Take over what an open FMU says of itself."""
+        """Make a candidate from an open FMU."""
         return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout)
 
     def open(self) -> FMU:
@@ -81,13 +81,13 @@ class Candidate:
 
     @property
     def exempt(self) -> bool:
-        """Whether it is never tried: turned off, or bundled with this package."""
+        """Whether to skip the trial: trials are turned off, or this package bundles the FMU."""
         off = os.environ.get("FMUGYM_PROBE", "").lower() in {"0", "off", "no", "false"}
         return off or self.timeout is None or is_bundled(self.path)
 
 
 class Stage(StrEnum):
-    """What a worker does after an instance alone has survived."""
+    """What a worker does after a lone instance has survived."""
 
     REFERENCE = "the episode of a fresh instance"
     RESTORE = "the rehearsal of state restores"
@@ -106,7 +106,7 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True)
 class Request:
-    """What the worker is asked.
+    """The request to a worker.
 
     Attributes:
         candidate: The FMU.
@@ -114,8 +114,8 @@ class Request:
         starts: The ``Starts`` of two episodes, or None for the FMU's own start values.
         several: Whether to try several instances.
         alone: Whether it is known that instances must not share a copy of the library.
-        skip: The stages that have ended a worker before.
-        check_memory: Whether the C library looks for memory errors (glibc only).
+        skip: The stages in which an earlier worker died.
+        check_memory: Whether the C library checks for memory errors (glibc only).
     """
 
     candidate: Candidate
@@ -131,9 +131,10 @@ class Request:
 class _Outcome:
     """How a trial ended.
 
-    ``stage`` is what the worker was doing, None before it touched the FMU. ``answer`` has the key
-    ``complete`` (whether the FMU went so far that it is known) if the process survived one
-    instance, the fields of a verdict as far as the worker came, and ``finished``.
+    ``stage`` is what the worker was doing; None before it touched the FMU. If the process survived
+    one instance, ``answer`` has the key ``complete``, which tells whether the FMU went far enough
+    to be known. ``answer`` also has the fields of a verdict that the worker reached, and
+    ``finished``.
     """
 
     stage: str | None
@@ -143,25 +144,25 @@ class _Outcome:
 
     @property
     def shows_memory_error(self) -> bool:
-        """Whether the C library has ended the process, which may live on where it looks away."""
+        """Whether the C library ended the process, which might have lived on without the checks."""
         return any(map(_MEMORY_ERROR.match, self.last_lines))
 
     @property
     def said(self) -> str:
-        """The last lines as the end of an error's text."""
+        """The last lines of output, to end an error's text."""
         return f"; its last lines: {' | '.join(self.last_lines)}" if self.last_lines else ""
 
 
 def meet(fmu: FMU) -> None:
     """Make sure that a process has loaded and stepped an FMU and survived.
 
-    Every way to load an FMU into this process begins here.
+    Every function that loads an FMU into this process calls this first.
 
     Args:
-        fmu: The FMU; it is not extracted.
+        fmu: The FMU; this does not extract it.
 
     Raises:
-        FMULoadError: If the process did not survive; with the reason and the last lines.
+        FMULoadError: If the process did not survive. The text has the reason and the last lines.
     """
     candidate = Candidate.of(fmu)
     if not candidate.exempt and known_verdict(fmu) is None:
@@ -182,7 +183,7 @@ def examine(
     alone: bool = False,
     must_survive: bool = True,
 ) -> Verdict:
-    """Find out in worker processes how an FMU has to be treated; ``meet`` included.
+    """Find out in worker processes how to treat an FMU; includes ``meet``.
 
     Args:
         candidate: The FMU, exempt or not.
@@ -190,14 +191,14 @@ def examine(
         starts: The ``Starts`` of two episodes, or None.
         several: Whether to try several instances.
         alone: Whether it is known that instances must not share a copy of the library.
-        must_survive: Whether it is an error if an instance alone ends the process; otherwise that
-            asks for isolation.
+        must_survive: Whether it is an error if a lone instance ends the process. If not, the
+            verdict asks for isolation.
 
     Returns:
-        The verdict, from the cache where the same was asked before.
+        The verdict, from the cache if the same request was made before.
 
     Raises:
-        FMULoadError: As ``meet``, with ``must_survive``.
+        FMULoadError: As ``meet``, if ``must_survive``.
     """
     asked = _digest(repr((spec, starts, candidate.preload)).encode())
     key = f"{_content_key(candidate.path)}-{asked}"
@@ -211,7 +212,7 @@ def examine(
 
 
 def _examine(request: Request, must_survive: bool) -> Verdict:
-    """Ask workers until one has come to the end; each crash is a stage that the next one skips."""
+    """Start workers until one finishes. Each skips the stages in which earlier ones crashed."""
     name, notes = request.candidate.path.name, _Notes()
     while True:
         outcome = _run(request)
@@ -225,7 +226,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
             if not (request.check_memory and outcome.shows_memory_error):
                 return notes.died_alone(name, must_survive)
             request = replace(request, check_memory=False)
-        elif outcome.stage in request.skip:  # it dies where it is not asked anything
+        elif outcome.stage in request.skip:  # it dies outside the requested stages
             break
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
@@ -236,14 +237,14 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
 
 
 class _Notes:
-    """What the workers of one trial have found."""
+    """The findings of the workers of one trial."""
 
     def __init__(self) -> None:
         self._answer: dict[str, Any] = {}
         self._deaths: list[_Outcome] = []
 
     def add(self, outcome: _Outcome) -> None:
-        """Take the answer of a worker, and its end if it did not finish."""
+        """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
         if "finished" not in outcome.answer:
             self._deaths.append(outcome)
@@ -263,10 +264,10 @@ class _Notes:
         )
 
     def died_alone(self, name: str, must_survive: bool) -> Verdict:
-        """Say that not even one instance survives, or that it needs a process.
+        """Report that even a lone instance dies, or that it needs a separate process.
 
         Raises:
-            FMULoadError: With ``must_survive``.
+            FMULoadError: If ``must_survive``.
         """
         last = self._deaths[-1]
         if must_survive:
@@ -296,7 +297,7 @@ def _stage(folder: Path) -> str | None:
 
 
 def _answer(folder: Path) -> dict[str, Any]:
-    """What the worker has answered so far."""
+    """Read the worker's answer so far."""
     try:
         return dict(json.loads((folder / "answer").read_text()))
     except (OSError, ValueError, TypeError):
@@ -304,7 +305,7 @@ def _answer(folder: Path) -> dict[str, Any]:
 
 
 def _watch(folder: Path, request: Request) -> tuple[str, list[str]]:
-    """Run the worker; what the FMU writes to standard output is taken for its last words."""
+    """Run the worker; the FMU's standard output counts among its last lines."""
     timeout = request.candidate.timeout or DEFAULT_PROBE_TIMEOUT
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", _WORKER, folder],
@@ -325,7 +326,7 @@ def _watch(folder: Path, request: Request) -> tuple[str, list[str]]:
 
 
 def _environment(folder: Path, check_memory: bool) -> dict[str, str]:
-    """What the FMU leaves behind goes with the folder; the worker finds the modules we found."""
+    """Keep the FMU's temporary files in the folder, and let the worker find the same modules."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONFAULTHANDLER"}
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
     checker = _memory_checker() if check_memory else None
@@ -337,7 +338,7 @@ def _environment(folder: Path, check_memory: bool) -> dict[str, str]:
 
 @functools.cache
 def _memory_checker() -> str | None:
-    """The library with which glibc ends a process that has written beyond an allocated block."""
+    """The library that lets glibc end a process that wrote beyond an allocated block."""
     try:
         maps = Path("/proc/self/maps").read_text()
     except OSError:
@@ -348,7 +349,7 @@ def _memory_checker() -> str | None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the worker and, on Unix, what the FMU has started."""
+    """End the worker and, on Unix, the processes that the FMU has started."""
     if sys.platform == "win32":
         process.kill()
     else:
@@ -361,7 +362,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _content_key(path: Path) -> str:
-    """What a verdict holds for: this content, on this platform, for this version of the package."""
+    """The scope of a verdict: this content, this platform, and this version of the package."""
     status = path.stat()
     content = _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
     return _digest(f"{content} {fmpy.platform_tuple} {_version()}".encode())
@@ -369,7 +370,7 @@ def _content_key(path: Path) -> str:
 
 @functools.lru_cache(maxsize=256)
 def _file_digest(path: Path, *_: int) -> str:
-    """Read a file once for each of its modification times, sizes and inodes."""
+    """Hash a file; read it again only when its modification time, size or inode changes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

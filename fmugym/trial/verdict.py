@@ -1,4 +1,4 @@
-"""What the first meeting with an FMU has shown, as a value and as the text that is cached."""
+"""The result of the first trial of an FMU, as a value and as text for the cache."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ _FORMAT: Final = 1
 
 
 class Grade(StrEnum):
-    """How an episode after a reset compares with the same episode of a fresh instance."""
+    """How well an episode after a reset matches the same episode of a fresh instance."""
 
     BITWISE = "bitwise"
-    """All outputs are equal to the last bit."""
+    """All outputs are bit-identical."""
     TOLERANCE = "tolerance"
     """The outputs differ by no more than a solver's tolerance."""
     WRONG = "wrong"
-    """The outputs differ, or an episode ends that should go on."""
+    """The outputs differ, or an episode ends too early."""
     FAILS = "fails"
-    """The FMU returned an error or ended its process."""
+    """The FMU returned an error or crashed its process."""
     ABSENT = "absent"
-    """The FMU does not offer it."""
+    """The FMU does not offer the reset method."""
 
 
 class Neighbours(StrEnum):
-    """What several instances need so as not to disturb each other."""
+    """What several instances need in order not to disturb each other."""
 
     INDEPENDENT = "independent"
     ONE_THREAD = "one thread"
-    """They are right in turn, but not at the same time."""
+    """Instances give correct results in turn, but not at the same time."""
     LIBRARIES = "libraries"
-    """Each needs a copy of the shared library."""
+    """Each instance needs a copy of the shared library."""
     PROCESSES = "processes"
-    """Each needs a process."""
+    """Each instance needs a process."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Verdict:
         deterministic: Whether two fresh instances give the same outputs.
         resets: The grade of each reset method that was tried.
         neighbours: What several instances need; None if only one was tried.
-        isolate: Whether one instance alone has harmed its process.
-        reasons: What was seen, one sentence each, for the log and ``fmugym info``.
+        isolate: Whether a lone instance has harmed its process.
+        reasons: The observations, one sentence each, for the log and ``fmugym info``.
     """
 
     complete: bool = False
@@ -64,7 +64,7 @@ class Verdict:
 
     @property
     def reset_method(self) -> ResetMethod:
-        """The first method of the best grade; a reset function if nothing was tried."""
+        """The first method with the best grade; the FMU's reset function if nothing was tried."""
         for wanted in (Grade.BITWISE, Grade.TOLERANCE):
             for method in ResetMethod:
                 if self.resets.get(method) is wanted:
@@ -87,7 +87,7 @@ class Verdict:
 
     @classmethod
     def from_text(cls, text: str | None) -> Verdict | None:
-        """Read a verdict; None for anything that ``to_text`` would not write."""
+        """Read a verdict; return None for any text that ``to_text`` would not write."""
         try:
             return cls._from_data(json.loads(text or ""))
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):

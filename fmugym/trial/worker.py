@@ -1,8 +1,8 @@
 """The process in which an FMU is tried for the first time; see ``fmugym.trial.trial``.
 
-It talks through files in a folder of its own, which no output of the FMU can disturb: it reads
-``request``, and writes ``stage`` before each step and ``answer`` as far as it has one. What the FMU
-says goes to standard error at once, since the next call may be the last.
+It communicates through files in a private folder, so that output of the FMU cannot interfere. It
+reads ``request``, writes ``stage`` before each step, and adds to ``answer`` as results come in. It
+writes the FMU's messages to standard error at once, because the next call may be the last.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from fmugym.trial.trial import Candidate, Request, Stage
 from fmugym.trial.verdict import Grade, Neighbours
 
 _NO_DIALOGUES: Final = 0x0003
-"""``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: a fault on Windows asks nobody."""
+"""``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""
 
 _LINE_BUFFERED: Final = 1
 """``_IOLBF`` of glibc, musl and macOS."""
 
 
 class Notes:
-    """What the parent can read at any time, also after the process has died.
+    """Notes that the parent can read at any time, even after the process has died.
 
     Args:
-        folder: Gets the files.
+        folder: The folder for the files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -51,11 +51,11 @@ class Notes:
         self._answer: dict[str, Any] = {}
 
     def stage(self, stage: str) -> None:
-        """Tell what is about to be done."""
+        """Write down what comes next."""
         (self._folder / "stage").write_text(stage)
 
     def answer(self, **values: Any) -> None:
-        """Add to the answer; the file is replaced in one go."""
+        """Add to the answer; the file is replaced atomically."""
         self._answer |= values
         path = self._folder / "answer.new"
         path.write_text(json.dumps(self._answer))
@@ -66,7 +66,7 @@ def main(folder: Path) -> None:
     """Try an FMU.
 
     Args:
-        folder: Has the request; gets the stage and the answer.
+        folder: The folder that has the request and gets the stage and the answer.
     """
     request: Request = pickle.loads((folder / "request").read_bytes())
     _prepare(request.candidate.timeout or DEFAULT_PROBE_TIMEOUT)
@@ -81,7 +81,7 @@ def main(folder: Path) -> None:
 
 
 def _prepare(timeout: float) -> None:
-    """Outlive neither the time-out nor, for long, a killed parent; leave no core dump."""
+    """End at the time-out, even if the parent was killed; leave no core dump."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     faulthandler.dump_traceback_later(timeout, exit=True, file=nowhere)
     if sys.platform == "win32":
@@ -94,7 +94,7 @@ def _prepare(timeout: float) -> None:
 
 
 def _print_line_by_line() -> None:
-    """What C prints to a pipe would be held back until much came together, and lost at a crash."""
+    """Flush C's output to a pipe after each line; a crash would lose what is buffered."""
     library = ctypes.CDLL(None)
     name = "__stdoutp" if sys.platform == "darwin" else "stdout"
     stream = ctypes.c_void_p.in_dll(library, name)
@@ -102,16 +102,16 @@ def _print_line_by_line() -> None:
 
 
 def _try_alone(candidate: Candidate, notes: Notes) -> bool:
-    """Try one instance; returns whether more of the FMU would be seen another time.
+    """Try one instance; return whether another trial might show more of the FMU.
 
-    In Python first: there messages come while the FMU runs. FMPy wants every function of the
-    standard to be there, the native pool does not.
+    The trial begins in Python, where messages arrive while the FMU runs. FMPy requires every
+    function of the standard; the native pool does not.
     """
     for native in (False, True) if has_native_pool() else (False,):
         try:
             _step_once(candidate, native, notes)
             return True
-        except FMUGymError:  # it is alive, and the caller will hear of it as well
+        except FMUGymError:  # the process is alive, and the caller will get the error too
             continue
     return False
 
@@ -131,13 +131,13 @@ def _step_once(candidate: Candidate, native: bool, notes: Notes) -> None:
 def _reset_and_step(pool: Pool, spec: PoolSpec, notes: Notes) -> None:
     notes.stage("initialization")
     _, statuses = pool.reset((), np.zeros((0, 1)))
-    if statuses[0] <= Status.WARNING:  # otherwise it may need the values that the caller will set
+    if statuses[0] <= Status.WARNING:  # otherwise it may need the caller's values
         notes.stage("the first step")
         pool.step(start_inputs(spec)[:, None])
 
 
 def _try_resets(request: Request, notes: Notes) -> None:
-    """Grade the reset methods, from the fastest on, until one is right to the last bit."""
+    """Grade the reset methods, fastest first, until one is exact to the last bit."""
     notes.stage(Stage.REFERENCE)
     if Stage.REFERENCE in request.skip:
         return
@@ -157,7 +157,7 @@ def _try_resets(request: Request, notes: Notes) -> None:
 
 
 def _methods(request: Request) -> list[ResetMethod]:
-    """What can be tried in this process: libraries are loaded anew by the native pool only."""
+    """The methods to try in this process; only the native pool can load libraries anew."""
     able = request.candidate.open().description.capabilities.can_get_and_set_fmu_state
     methods = [ResetMethod.RESTORE] if able else []
     methods += [ResetMethod.RESET, ResetMethod.INSTANCE]
@@ -169,7 +169,7 @@ def _try_several(request: Request, notes: Notes) -> None:
 
 
 def _need_of_several(request: Request, notes: Notes) -> Neighbours:
-    """Find the least that keeps instances from disturbing each other."""
+    """Find the cheapest way to keep instances from disturbing each other."""
     if request.alone or _disturbed(request, notes, private_libraries=False):
         copies = has_native_pool() and not _disturbed(request, notes, private_libraries=True)
         return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
@@ -177,7 +177,7 @@ def _need_of_several(request: Request, notes: Notes) -> Neighbours:
     try:
         if Stage.THREADS in request.skip or disturb_in_threads(request.candidate, request.spec):
             return Neighbours.ONE_THREAD
-    except FMUGymError:  # FMPy cannot load it, or it fails without the values of the caller
+    except FMUGymError:  # FMPy cannot load it, or it fails without the caller's values
         pass
     return Neighbours.INDEPENDENT
 
@@ -189,12 +189,12 @@ def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bo
         return True
     try:
         return disturb_in_turn(request.candidate, request.spec, private_libraries=private_libraries)
-    except FMUGymError:  # it fails alone too, without the values that the caller will set
+    except FMUGymError:  # a lone instance fails too: it needs the caller's values
         return False
 
 
 class _Echo(logging.Logger):
-    """Writes every message down at once, also those that its level would drop."""
+    """Writes every message at once, including those that its level would drop."""
 
     def log(self, level: int, msg: object, *args: object, **_: Any) -> None:
         os.write(2, f"{str(msg) % args}\n".encode(errors="replace"))
