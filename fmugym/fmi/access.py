@@ -50,14 +50,14 @@ class Access:
         self._use_single_call()
 
     def _use_single_call(self) -> None:
-        """Make the method the FMU's function, if one call moves all values, as in most FMUs."""
+        """Replace the methods with the FMU's functions if one call moves all values, as usual."""
         if len(self._groups) == 1 and self._groups[0][1] is self.values:
             get, set_, arguments = self._groups[0][2]
             self.get = functools.partial(get, *arguments)  # type: ignore[method-assign]
             self.set = functools.partial(set_, *arguments)  # type: ignore[method-assign]
 
     def get(self) -> int:
-        """Read all values from the FMU; returns the worst status."""
+        """Read all values from the FMU; return the worst status."""
         worst = 0
         for indices, buffer, (get, _, arguments) in self._groups:
             worst = max(worst, sane(get(*arguments)))
@@ -68,7 +68,7 @@ class Access:
         return worst
 
     def set(self) -> int:
-        """Write all values to the FMU; returns the worst status."""
+        """Write all values to the FMU; return the worst status."""
         worst = 0
         for indices, buffer, (_, set_, arguments) in self._groups:
             if buffer is not self.values:

@@ -48,7 +48,7 @@ class FMI1Instance(Instance):
 
     @classmethod
     def mend(cls, slave: Any) -> None:
-        """Declare that these return an int. FMPy declares a string, and dereferences all but OK."""
+        """Declare int results. FMPy declares strings, and dereferences every status except OK."""
         for name in cls._STATUS_FUNCTIONS:
             slave._functions[name].restype = ctypes.c_int
 

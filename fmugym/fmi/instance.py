@@ -27,7 +27,7 @@ __all__ = ["Initialize", "Instance", "SavedState", "Span"]
 
 
 class Span(NamedTuple):
-    """What the FMU gets to know at the start of a simulation; see ``Instance.initialize``."""
+    """The data that the FMU gets at the start of a simulation; see ``Instance.initialize``."""
 
     start_time: float
     stop_time: float | None
@@ -73,7 +73,7 @@ class Instance(ABC):
         self._instantiate_checked()
         self._component = ctypes.c_void_p(self._slave.component)
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
-        self._may_return = False  # to a state of an earlier time, of which FMI tells the FMU
+        self._may_return = False  # to an earlier state; FMI tells the FMU whether this may happen
         self.step = self._prepare_step()
         self._initialize = self._prepare_initialization()
         self._reset_function = self._function("Reset")
@@ -92,11 +92,11 @@ class Instance(ABC):
             )
         self.phase = Phase.INSTANTIATED
 
-    # What differs between the versions.
+    # The parts that differ between the versions.
 
     @classmethod
     def mend(cls, slave: Any) -> None:
-        """Correct FMPy's mistakes for this version; most need nothing."""
+        """Correct FMPy's mistakes for this version; most versions need no correction."""
         return
 
     @abstractmethod
@@ -111,10 +111,10 @@ class Instance(ABC):
     @abstractmethod
     def _prepare_initialization(self) -> Initialize: ...
 
-    # What the versions have in common.
+    # The parts that the versions share.
 
     def _function(self, name: str, *argtypes: Any, restype: Any = ctypes.c_int) -> Any:
-        """Look up a function of our own, so that FMPy's prototype stays as it is."""
+        """Look up a separate function object, so that FMPy's prototype stays unchanged."""
         function = self._slave.dll[self._function_name(name)]
         function.restype = restype
         if argtypes:
@@ -189,7 +189,7 @@ class Instance(ABC):
         self._require(Phase.INSTANTIATED, "initialize")
         try:
             self._initialize(Span(start_time, stop_time, tolerance), set_start_values)
-        except BaseException:  # half-way: only a reset is legal now
+        except BaseException:  # initialization is incomplete: only a reset is legal now
             if self.phase is Phase.INSTANTIATED:
                 self.phase = Phase.FAILED
             raise
@@ -209,7 +209,7 @@ class Instance(ABC):
         self.phase = Phase.INSTANTIATED
 
     def free(self) -> None:
-        """Terminate and free the instance; more than one call is fine."""
+        """Terminate and free the instance. It may be called more than once."""
         if not self._slave.component:
             return
         for state in self._saved_states:
@@ -217,7 +217,7 @@ class Instance(ABC):
         if self.can_read:
             self.judge(self._function("Terminate")(self._component))
         fatal, self.phase = self.phase is Phase.DEAD, Phase.DEAD
-        if not fatal:  # after Fatal the standard forbids even this: the memory stays lost
+        if not fatal:  # after Fatal, the standard forbids even this, so memory leaks
             self._function("FreeInstance", restype=None)(self._component)
         self._slave.component = None
         self._log.close()
@@ -226,7 +226,7 @@ class Instance(ABC):
         """Raise for a status worse than a warning.
 
         Raises:
-            SimulationError: With the call that failed and the FMU's last messages.
+            SimulationError: The text has the call that failed and the FMU's last messages.
         """
         if status > Status.WARNING or status < 0:
             raise SimulationError(self.describe_failure(doing, self.judge(status)))
@@ -237,7 +237,7 @@ class Instance(ABC):
         return f"{self._log.instance_name}: {doing} returned {label}{self._log.said()}"
 
     def judge(self, status: int) -> int:
-        """Note which calls are legal after a status; returns it as a ``Status``."""
+        """Note which calls are legal after a status; return it as a ``Status``."""
         status = sane(status)
         if status == Status.FATAL:
             self.phase = Phase.DEAD
@@ -246,7 +246,7 @@ class Instance(ABC):
         return status
 
     def judge_step(self, status: int) -> int:
-        """As ``judge``, and forbid more steps after a step that was not done."""
+        """Do what ``judge`` does, and forbid more steps after a step that was not done."""
         if status != Status.TERMINATED:
             status = self.judge(status)
         if status > Status.WARNING:
@@ -360,10 +360,10 @@ class Instance(ABC):
 
 
 class SavedState:
-    """The owner of an FMU state, which frees it once, while its instance lives.
+    """The owner of an FMU state; it frees the state once, while the instance lives.
 
     Attributes:
-        pointer: The FMU's own handle.
+        pointer: The FMU's handle.
     """
 
     def __init__(self, instance: Instance, pointer: ctypes.c_void_p) -> None:

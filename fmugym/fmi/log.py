@@ -3,8 +3,8 @@
 In FMI 1.0 and 2.0 the FMU gets a C function with a variable number of arguments, which ctypes
 cannot make. FMPy has a native proxy that formats the text. The proxy knows one target per process,
 and a call after that target is gone ends the process. So this module has one set of callbacks that
-lives as long as the process. They find the receiver by the unique name of the instance, in FMI 3.0
-by its environment pointer.
+lives as long as the process. They find the receiver by the unique name of the instance. In FMI 3.0,
+they find it by its environment pointer.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class MessageLog:
         self._target.log(level, "%s: [%s] %s", self.instance_name, category, message)
 
     def said(self) -> str:
-        """The recent messages as the end of an error's text."""
+        """The recent messages, to end an error's text."""
         return f"; the FMU said: {' | '.join(self.recent)}" if self.recent else ""
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What FMI calls return, and the states of FMI's state machine."""
+"""The status codes of FMI calls, and the states of FMI's state machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["Phase", "Status", "sane"]
 
 
 class Status(enum.IntEnum):
-    """What a call returned: FMI's codes, and two more."""
+    """The status of a call: FMI's codes, and two more."""
 
     OK = 0
     WARNING = 1

@@ -88,9 +88,9 @@ class Pool(ABC):
         """Do one step with the instances.
 
         Args:
-            inputs: Shape (k_in, N), finite, copied to ``self.inputs``; None to use the values there.
-            skip: The instances not to step, shape (N,). Their outputs and statuses stay as they are.
-            observations: The array to fill with the first ``num_observed`` outputs of all instances,
+            inputs: Shape (k_in, N), finite, copied to ``self.inputs``; None to use those values.
+            skip: The instances not to step, shape (N,). Their outputs and statuses stay unchanged.
+            observations: Array to fill with the first ``num_observed`` outputs of all instances,
                 shape (N, num_observed), C-contiguous.
 
         Returns:
@@ -122,7 +122,7 @@ class Pool(ABC):
             As ``reset``.
 
         Raises:
-            SimulationError: If the snapshot comes from another pool, or an instance was replaced since.
+            SimulationError: If the snapshot is of another pool, or an instance was replaced since.
         """
 
     @abstractmethod

@@ -82,7 +82,7 @@ class PoolSpec:
     input_limits: tuple[tuple[float, float], ...] = ()
 
     def communication_point(self, count: int) -> float:
-        """The time after ``count`` communication steps; not computed as a sum, which would drift."""
+        """The time after ``count`` communication steps; not a running sum, which would drift."""
         return self.start_time + count * self.time_step / self.substeps
 
     @property

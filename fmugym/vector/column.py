@@ -17,11 +17,11 @@ __all__ = ["PoolColumn"]
 
 
 class PoolColumn(Pool):
-    """See ``Pool``. Steps and resets do not touch the other instances.
+    """One instance as a ``Pool``. Steps and resets do not touch the other instances.
 
     Args:
         pool: The pool of N instances.
-        index: Which of them.
+        index: The index of the instance.
     """
 
     num_instances = 1
@@ -91,7 +91,7 @@ class PoolColumn(Pool):
         }
 
     def forget_health(self) -> None:
-        """See ``Pool.forget_health``; the counts are those of all."""
+        """See ``Pool.forget_health``; this affects the counts of all instances."""
         self._pool.forget_health()
 
     @property
@@ -105,7 +105,7 @@ class PoolColumn(Pool):
         return self._pool.reset_method
 
     def halt(self) -> None:
-        """See ``Pool.halt``; the other instances stop, too."""
+        """See ``Pool.halt``; the other instances stop too."""
         self._pool.halt()
 
     def note_fault(self, index: int) -> None:

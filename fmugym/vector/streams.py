@@ -1,4 +1,4 @@
-"""The random streams of N environments, each that of a single environment."""
+"""The random streams of N environments; each equals that of a single environment."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from fmugym.task.episode import EpisodePlan
 __all__ = ["EpisodeStreams"]
 
 _BLOCK_BYTES = 16 * 2**20
-"""Memory for values drawn ahead, at most."""
+"""The most memory for values drawn ahead."""
 
 _LONGEST_BLOCK = 32
-"""Episodes drawn ahead for one environment, at most."""
+"""The most episodes drawn ahead for one environment."""
 
 
 class EpisodeStreams:
@@ -26,8 +26,8 @@ class EpisodeStreams:
 
     Seeded with s, environment i draws what a single environment seeded with s + i draws, episode
     after episode. If all distributions are uniform, each takes one number of the stream. Several
-    episodes are then drawn ahead in one call. When a reset wants other draws, the stream goes back
-    to the place that the episodes have reached.
+    episodes are then drawn ahead in one call. When a reset needs other draws, the stream returns
+    to the position that the episodes have reached.
 
     Args:
         num_envs: N.
@@ -53,7 +53,7 @@ class EpisodeStreams:
         self.used = np.full(num_envs, self._length)
 
     def generator(self, index: int) -> np.random.Generator:
-        """The generator of an environment, at the place that its episodes have reached."""
+        """The generator of an environment, at the position that its episodes have reached."""
         generator = self._generators[index] or self._unseeded(index)
         ahead = int(self._length - self.used[index]) * self._draws
         if ahead:
@@ -101,7 +101,7 @@ class EpisodeStreams:
         return fractions
 
     def _refill(self, indices: npt.NDArray[np.intp]) -> None:
-        """Draw ahead for environments whose blocks are used up."""
+        """Draw new blocks for environments whose blocks are used up."""
         generators, rows = self._generators, self._rows
         for index in indices.tolist():
             (generators[index] or self._unseeded(index)).random(out=rows[index])
@@ -109,7 +109,7 @@ class EpisodeStreams:
 
 
 def _take_back(bits: Any, count: int) -> None:
-    """Go back in a stream, but keep the half number that an integer draw has left."""
+    """Go back in a stream, but keep the unused half that an integer draw has left over."""
     before = bits.state
     bits.advance(-count)
     if before["has_uint32"]:

@@ -1,4 +1,4 @@
-"""Views of a prototype, as N environments at once or as one of them, and copies of it."""
+"""Copies of a prototype, and views of it as N environments or as one of them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def light_copy(env: FMUEnv) -> FMUEnv:
 
 
 def copied_attributes(env: FMUEnv) -> dict[str, Any]:
-    """Copy the attributes that hooks might change; returns the copies by name."""
+    """Copy the attributes that hooks might change; return the copies by name."""
     memo = {id(env): env, id(env.spec): env.spec}
     return {
         name: _copied(value, memo)
@@ -65,12 +65,12 @@ def _may_change(value: Any) -> bool:
 def _copied(value: Any, memo: dict[int, Any]) -> Any:
     try:
         return copy.deepcopy(value, memo.copy())
-    except Exception:  # it is the user's, and cannot be copied: share it
+    except Exception:  # a user's object that cannot be copied: share it
         return value
 
 
 def batched(env: FMUEnv, count: int) -> None:
-    """Replace what hooks read of an environment by arrays of a batch, all zero."""
+    """Replace the attributes that hooks read with arrays for a batch, all zero."""
     outputs = np.zeros((len(env.out), count))
     env._values = outputs
     env.state = outputs[: env._output_count]
@@ -117,14 +117,14 @@ def take(values: Any, index: int) -> Any:
 
 
 def differs(before: Any, after: Any) -> bool:
-    """Whether a value was changed, as far as values of its type can be compared; NaNs are equal."""
+    """Whether a value has changed, if values of its type can be compared; NaNs are equal."""
     if before is after:
         return False
     if type(before) is not type(after):
         return True
     try:
         return _differ(before, after)
-    except Exception:  # the values are the user's, and so is how they compare
+    except Exception:  # users' values may raise anything when compared
         return False
 
 

@@ -1,4 +1,4 @@
-"""What every way of playing N environments has in common."""
+"""The interface that all engines for N environments share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Engine", "StepResult"]
 
 
 class StepResult(NamedTuple):
-    """What a step of N environments gives; all arrays are new."""
+    """The result of a step of N environments; all arrays are new."""
 
     observations: Any
     rewards: FloatArray
@@ -25,7 +25,7 @@ class StepResult(NamedTuple):
 
 
 class Engine(ABC):
-    """Drives N environments; when an ended one starts again is not its concern.
+    """Drives N environments; the caller decides when an ended one starts again.
 
     Attributes:
         ended: Whether the last step ended the episode, shape (N,); always the same array.
@@ -50,7 +50,7 @@ class Engine(ABC):
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes of the environments in the mask; returns the observations of all."""
+        """Start episodes of the environments in the mask; return the observations of all."""
 
     @abstractmethod
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
@@ -62,7 +62,7 @@ class Engine(ABC):
 
     @abstractmethod
     def single(self, index: int) -> FMUEnv:
-        """Return an environment as a single one, for reading it and for calling its methods."""
+        """Return one environment as a single one, to read it and call its methods."""
 
     @abstractmethod
     def call(
@@ -72,11 +72,11 @@ class Engine(ABC):
         arguments: Sequence[Any],
         keywords: Mapping[str, Any],
     ) -> list[Any]:
-        """Call a method of some environments; what it assigns takes effect.
+        """Call a method of some environments; attributes that it assigns take effect.
 
         Raises:
-            ConfigError: If a method changes what environments of this engine cannot have each for
-                itself. Then none of them has changed.
+            ConfigError: If a method changes something that all environments of this engine must
+                share. Then no environment is changed.
         """
 
     @abstractmethod

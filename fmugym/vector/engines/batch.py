@@ -1,4 +1,4 @@
-"""N environments whose hooks are evaluated once for all, on arrays."""
+"""N environments whose hooks run once for all of them, on arrays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ IndexArray = npt.NDArray[np.intp]
 
 
 class BatchEngine(Engine):
-    """Turns a prototype into N environments: from now on its hooks read arrays.
+    """Turns a prototype into N environments; from then on, its hooks read arrays.
 
     Args:
         env: The prototype, made with a pool of N instances.
@@ -86,11 +86,11 @@ class BatchEngine(Engine):
         return column(self.env, index)
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
-        """See ``Engine.set_attribute``; values that differ must be numbers."""
+        """See ``Engine.set_attribute``; values may only differ if they are numbers."""
         self._assign({name: self._of_all(name, values)})
 
     def _of_all(self, name: str, values: Mapping[int, Any]) -> tuple[Any, bool]:
-        """The value for all environments, and whether it is an array of one for each."""
+        """The value for all environments, and whether it is an array with one for each."""
         if len(values) < self._n:
             present = {i: attribute(self.single(i), name) for i in range(self._n)}
             values = {**present, **values}
@@ -144,7 +144,7 @@ class BatchEngine(Engine):
         return row
 
     def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
-        """Note whose constants are those of another plan: of options, or of an earlier one."""
+        """Note which environments have another plan's constants: from options or an earlier plan."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
 
@@ -178,7 +178,7 @@ class BatchEngine(Engine):
     def _begin(
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
     ) -> dict[str, FloatArray]:
-        """Draw and start episodes; returns the values that the info tells, by name."""
+        """Draw and start episodes; return the values for the info, by name."""
         values = self._draw(indices, plan)
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
@@ -187,18 +187,18 @@ class BatchEngine(Engine):
         return {name: self._drawn(name) for name in [*plan.told, *plan.drawn_names]}
 
     def _drawn(self, name: str) -> FloatArray:
-        """The row of a value just drawn; a variable may have become a table of equal rows."""
+        """The row of a drawn value; a variable may have become a table of equal rows."""
         row = self._row(name)
         return (row if row.ndim == 1 else row.reshape(-1, self._n)[0]).copy()
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
-        """After a reset, hooks read what they read in a single environment."""
+        """Reset what hooks read, as a reset of a single environment does."""
         env = self.env
         env.step_count[indices] = 0
         env.previous_state[:, indices] = env.state[:, indices]
         no_action = np.reshape(env._no_action, (*env.action.shape[:-1], 1))
         env.action[..., indices] = env.previous_action[..., indices] = no_action
-        env.done = env.done.copy()  # the caller has this array
+        env.done = env.done.copy()  # the caller holds this array
         env.done[indices] = False
         for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
             row[indices] = (
@@ -287,16 +287,16 @@ class BatchEngine(Engine):
         env.previous_state = self._outputs_before[: env._output_count]
         try:
             self._write_inputs(env._get_inputs(), resetting)
-        except BaseException:  # no FMU was touched: better actions may follow
+        except BaseException:  # no FMU was touched: valid actions may follow
             env.action, env.previous_action, env.previous_state = before
             raise
 
     def _checked(self, actions: Any) -> npt.NDArray[Any]:
-        """Copy the actions, environments last as hooks want them."""
+        """Copy the actions, with environments on the last axis, as hooks expect."""
         space: Any = self.env.action_space
         array = checked_actions(space, self._n, actions)
         if array.dtype != space.dtype:
-            with np.errstate(over="ignore"):  # it becomes infinite, and so does an input
+            with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
                 array = array.astype(space.dtype)
         return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
@@ -311,7 +311,7 @@ class BatchEngine(Engine):
         self._require_finite_inputs(resetting)
 
     def _stepping(self, resetting: MaskArray | None) -> list[int]:
-        """The numbers of the environments that do not start an episode in this step."""
+        """The indices of the environments that do not start an episode in this step."""
         return [i for i in range(self._n) if resetting is None or not resetting[i]]
 
     def _require_finite_inputs(self, resetting: MaskArray | None) -> None:
@@ -358,7 +358,7 @@ class BatchEngine(Engine):
     def _update(self, resetting: MaskArray | None, failed: MaskArray) -> None:
         """Call the hook, but keep the variables of environments that did not step.
 
-        What it assigns is copied: it may be part of an array that the next step writes again.
+        Values that it assigns are copied, because the next step may overwrite their array.
         """
         variables = self.env.variables
         before = {name: self._row(name) for name in variables}
@@ -376,7 +376,7 @@ class BatchEngine(Engine):
             results.restore_variable(name, self._row(name), mask, values[..., mask])
 
     def _reached_limit(self) -> MaskArray:
-        """Compare only when the longest episode may have got there."""
+        """Find the episodes at their limit; compare only if the longest may have reached it."""
         self._longest += 1
         if self._longest < self._limit:
             return np.zeros(self._n, np.bool_)
@@ -407,7 +407,7 @@ class BatchEngine(Engine):
         return failed
 
     def _handle_faults(self, result: StepResult, statuses: StatusArray, has_faults: bool) -> None:
-        """Deal with FMUs that failed or asked to stop, and with numbers that are not finite."""
+        """Handle FMUs that failed or asked to stop, and numbers that are not finite."""
         wrong_rewards = not_finite(result.rewards)
         wrong_observations = not_finite(result.observations)
         if not has_faults and wrong_rewards is None and wrong_observations is None:
@@ -430,7 +430,7 @@ class BatchEngine(Engine):
     def _end_with_faults(
         self, result: StepResult, reasons: Mapping[int, str], failed: MaskArray
     ) -> None:
-        """End the episodes of some environments, whose state is that before the step."""
+        """End the episodes of some environments, in the state before the step."""
         env, config = self.env, self.env.config
         faulty = np.zeros(self._n, np.bool_)
         faulty[list(reasons)] = True
@@ -471,14 +471,14 @@ class BatchEngine(Engine):
 
 
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
-    """The numbers of the environments that are in both masks; None stands for an empty mask."""
+    """The indices of the environments in both masks; None stands for an empty mask."""
     return [] if rows is None else np.flatnonzero(rows & mask).tolist()
 
 
 def _by_name(
     calls: Iterable[MethodCall], assigned: Callable[[MethodCall], Mapping[str, Any]]
 ) -> dict[str, dict[int, Any]]:
-    """What methods have assigned: values by the number of the environment, by name."""
+    """The values that methods have assigned: for each name, values by environment index."""
     by_name: dict[str, dict[int, Any]] = {}
     for call in calls:
         for name, value in assigned(call).items():
@@ -489,7 +489,7 @@ def _by_name(
 def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
     try:
         row = np.array(values)
-    except (TypeError, ValueError):  # lists that make no array
+    except (TypeError, ValueError):  # lists that do not form an array
         row = np.empty(0, object)
     if row.ndim != 1 or row.dtype.kind not in "biuf":
         raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")

@@ -1,4 +1,4 @@
-"""N environments whose hooks run as programs in the native pool's own pass."""
+"""N environments whose hooks run as programs inside the native pool's step."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ logger = logging.getLogger(__name__)
 
 _FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
 _REWARD = 2
-"""The number of the reward among the results of the second program."""
+"""The index of the reward among the results of the second program."""
 
-_make_tuple: Any = tuple.__new__  # a third of what a NamedTuple's own constructor takes
+_make_tuple: Any = tuple.__new__  # takes a third of the time of a NamedTuple's constructor
 
 
 def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program] | None:
@@ -49,7 +49,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
         _require_playable(env)
         programs = trace_hooks(env)
         _require_same(sample_states(env), programs)
-    except Exception as reason:  # hooks do with numbers whatever they like
+    except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
@@ -59,7 +59,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
 
 
 def _require_playable(env: FMUEnv) -> None:
-    """Refuse what the native pool does not do in its own pass, whatever the hooks are."""
+    """Refuse environments that the native pool cannot play, whatever their hooks are."""
     if not env._open_pool("a vector environment").can_play:
         raise UntraceableError("the pool is not the native one")
     if env._plan.num_uniform is None:
@@ -91,11 +91,11 @@ def _equal(value: FloatArray, expected: Any) -> bool:
 
 
 class CompiledEngine(BatchEngine):
-    """A ``BatchEngine`` whose steps are done by the native pool alone, hooks included.
+    """A ``BatchEngine`` in which the native pool does whole steps, hooks included.
 
-    Resets are those of ``BatchEngine``, on the same arrays. So are steps while parameters of a
-    running episode were overridden or set since it began, and where hooks cannot be compiled any
-    more after their attributes were set.
+    ``BatchEngine`` does the resets, on the same arrays. It also does the steps in two cases:
+    while parameters of a running episode are overridden or were set since it began, and if the
+    hooks can no longer be compiled after an attribute was set.
 
     Args:
         env: The prototype, made with a native pool of N instances.
@@ -117,7 +117,7 @@ class CompiledEngine(BatchEngine):
         self._prepare(programs)
 
     def _prepare(self, programs: tuple[Program, Program] | None) -> None:
-        """Give the pool all that a step consists of, if it can draw the episodes."""
+        """Give the pool everything it needs for a step, if it can draw the episodes."""
         plan, streams = self.env._plan, self._streams
         self._programs = programs
         self._prepared = False
@@ -145,7 +145,7 @@ class CompiledEngine(BatchEngine):
         self._prepare(self._programs)
 
     def _assign(self, attributes: Mapping[str, tuple[Any, bool]]) -> None:
-        """Compile the hooks anew: the programs hold the former values of the attributes."""
+        """Compile the hooks anew, because the programs contain the old values of the attributes."""
         super()._assign(attributes)
         try:
             programs = trace_hooks(self.env)
@@ -191,7 +191,7 @@ class CompiledEngine(BatchEngine):
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         if resetting is not None:
-            told = LateDict.of(_told, self._names, drawn, resetting)  # few ever look at it
+            told = LateDict.of(_told, self._names, drawn, resetting)  # rarely read
             infos = {"drawn": told, "_drawn": resetting}
         result: StepResult = _make_tuple(StepResult, (*arrays, infos))
         if troubled or (self._may_overflow and not_finite(rewards) is not None):

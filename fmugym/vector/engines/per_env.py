@@ -1,4 +1,4 @@
-"""N environments whose hooks are evaluated one environment after another."""
+"""N environments whose hooks run for one environment after another."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class PerEnvEngine(Engine):
         return [v(*arguments, **keywords) if callable(v) else v for v in values]
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
-        """See ``Engine.set_attribute``; here the values may be anything."""
+        """See ``Engine.set_attribute``; the values may be of any type."""
         for index, value in values.items():
             setattr(self._envs[index], name, value)
 
@@ -135,7 +135,7 @@ class PerEnvEngine(Engine):
             raise _located(error, index) from error
 
     def _step_pool(self, actions: Sequence[Any], resetting: MaskArray | None) -> None:
-        """Step the FMUs whose episodes go on, once all of their actions are known to be good."""
+        """Step the FMUs whose episodes go on, after checking that all their actions are valid."""
         taken: list[tuple[FMUEnv, tuple[Any, ...]]] = []
         try:
             for index, env in enumerate(self._envs):
@@ -151,13 +151,13 @@ class PerEnvEngine(Engine):
         self._pool.step(None, resetting, self._pool.observations)
 
     def _actions(self, actions: Any) -> Sequence[Any]:
-        """The action of each environment, as copies: hooks keep them."""
+        """Copy the action of each environment, because hooks keep it."""
         space = self._envs[0].action_space
         if self._together and is_array_space(space):
             return list(checked_actions(space, len(self._envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
-        except Exception:  # the actions are the user's
+        except Exception:  # users' actions may raise anything
             raise ConfigError(
                 f"the actions do not make one of {space} for each environment: {shown(actions)}"
             ) from None
@@ -169,10 +169,10 @@ class PerEnvEngine(Engine):
         return self._limit is not None and env.step_count >= self._limit
 
     def _with_info(self, infos: dict[str, Any], info: Any, index: int) -> dict[str, Any]:
-        """Merge the info of one environment; Gymnasium does so for what its types can hold."""
+        """Merge the info of one environment; Gymnasium merges only values that its types can hold."""
         try:
             return self._add_info(infos, info, index)
-        except Exception:  # the info is the user's
+        except Exception:  # users' infos may raise anything
             raise ConfigError(
                 f"environment {index}: its info does not fit those of the others: {shown(info)}"
             ) from None
@@ -181,7 +181,7 @@ class PerEnvEngine(Engine):
         empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)
         try:
             return concatenate(self._space, self._observations, empty)
-        except Exception:  # the observations are the user's
+        except Exception:  # users' observations may raise anything
             raise ConfigError(
                 f"_get_observation returned {shown(self._observations[0])}, which is no element of "
                 f"{self._space}"
@@ -189,7 +189,7 @@ class PerEnvEngine(Engine):
 
 
 def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
-    """Share what is costly to make, and copy all other attributes of the subclass."""
+    """Copy an environment: share what is costly to make, and copy all other attributes."""
     single = light_copy(env)
     single.__dict__.update(copied_attributes(env))
     single.variables = EpisodeVariables(env.config.episode_variables)
