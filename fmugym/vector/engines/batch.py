@@ -144,7 +144,7 @@ class BatchEngine(Engine):
         return row
 
     def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
-        """Note which environments have another plan's constants: from options or an earlier plan."""
+        """Note which environments have another plan's constants: from options, or an older plan."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
 

@@ -169,7 +169,7 @@ class PerEnvEngine(Engine):
         return self._limit is not None and env.step_count >= self._limit
 
     def _with_info(self, infos: dict[str, Any], info: Any, index: int) -> dict[str, Any]:
-        """Merge the info of one environment; Gymnasium merges only values that its types can hold."""
+        """Merge the info of one environment; Gymnasium merges only what its types can hold."""
         try:
             return self._add_info(infos, info, index)
         except Exception:  # users' infos may raise anything
