@@ -52,6 +52,7 @@ def test_a_wheel_is_built_without_a_compiler(tmp_path):
     command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(tmp_path), str(copy)]
     environment = {**os.environ, "CC": str(tmp_path / "no-compiler")}
     environment.pop("PYTEST_ADDOPTS", None)
+    environment.pop("FMUGYM_REQUIRE_NATIVE", None)
     result = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert result.returncode == 0, result.stderr
     (wheel,) = tmp_path.glob("*.whl")

@@ -89,6 +89,7 @@ class SwingFit:
             ConfigError: If the mass is not positive and finite.
         """
         found = self.parameters(mass)
+        mass = found["m"]
         names = [name for name in found if name != "m"]
         slopes = self._slopes(mass, [found[name] for name in names])
         errors = np.sqrt(np.diag(slopes @ self.covariance @ slopes.T))
