@@ -486,8 +486,8 @@ class TestLeaks:
     def test_without_knowledge_of_the_heap(self, make, monkeypatch, backend, caplog):
         monkeypatch.setattr("fmugym.pool.memory._mallinfo", lambda: None)
         pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
-        assert self.play(pool, leak=self.LEAK) < 4 * self.LIMIT
-        assert caplog.text == ""
+        assert self.play(pool, leak=self.LEAK) < 6 * self.LIMIT
+        assert len(caplog.records) <= 1  # the watch has to guess what recycling frees
 
 
 def test_bundled_fmus_are_not_watched():
