@@ -74,6 +74,7 @@ class Experiment(TypedDict):
     restores: bool
     rebuilds: bool
     reloads: bool
+    one_initialization: bool
 
 class Variables(TypedDict):
     """What is set and read in each step, and the Strings that are set before initialization."""

@@ -69,8 +69,10 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     if (status > STATUS_WARNING) {
         return status;
     }
+    instance_begin_turn(pool);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
+    instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         return fail_initialization(pool, me, &context, doing, status);

@@ -35,6 +35,8 @@ typedef struct {
                     */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
+    bool one_initialization; /* whether only one instance in the process may be made, initialized,
+                              * reset or freed at a time */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -133,7 +135,8 @@ typedef struct Pool {
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
     Floats floats; /* environment of the thread inside, which FMUs must find */
-    Mutex making;  /* held while an instance is made or freed: FMUs may keep lists of them */
+    Mutex own_making;
+    Mutex *making; /* held while an instance is made or freed: FMUs may keep lists of them */
     bool open;
     Log log;
     Library *libraries;

@@ -212,7 +212,7 @@ class TestNeighbours:
             ("well behaved", Neighbours.INDEPENDENT),
             ("globals", Neighbours.LIBRARIES),
             ("one in a process", Neighbours.LIBRARIES),
-            ("strtok", Neighbours.ONE_THREAD),
+            ("strtok", Neighbours.ONE_INITIALIZATION),
         ],
     )
     def test_in_a_vector_environment(self, make_fmu, token, need):

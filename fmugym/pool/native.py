@@ -170,6 +170,7 @@ class NativePool(CountedPool):
                     "restores": method == ResetMethod.RESTORE,
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
+                    "one_initialization": spec.one_initialization,
                 },
                 variables={
                     "inputs": self._access(spec.inputs),

@@ -64,6 +64,8 @@ class PoolSpec:
         leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
         reset_method: How instances start a new episode.
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
+        one_initialization: Whether only one instance in a process may be made, initialized, reset
+            or freed at a time. Steps run in parallel all the same.
     """
 
     inputs: tuple[Variable, ...]
@@ -80,6 +82,7 @@ class PoolSpec:
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET
     input_limits: tuple[tuple[float, float], ...] = ()
+    one_initialization: bool = False
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""

@@ -237,6 +237,7 @@ _GRADES: Final = {
 }
 _NEEDS: Final = {
     "independent": "independent",
+    "one initialization at a time": "initialized one at a time",
     "one thread": "one thread for all",
     "libraries": "a copy of the library each",
     "processes": "a process each",

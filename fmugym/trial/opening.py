@@ -78,7 +78,7 @@ def make_pool(
         raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
     plan = plan.completed(fmu, _verdict(fmu, spec, starts, num_instances, plan), num_instances, log)
-    spec = replace(spec, reset_method=plan.method)
+    spec = replace(spec, reset_method=plan.method, one_initialization=plan.one_initialization)
     if plan.isolation == "process":
         return ProcessPool(
             fmu,
@@ -121,6 +121,7 @@ class _Plan:
     private_libraries: bool | None = None
     isolation: str | None = None
     workers: int | None = None
+    one_initialization: bool = False
 
     @property
     def method(self) -> ResetMethod:
@@ -154,6 +155,9 @@ class _Plan:
     ) -> _Plan:
         if neighbours is Neighbours.INDEPENDENT:
             return self
+        if neighbours is Neighbours.ONE_INITIALIZATION:
+            log.info("%s: its instances are initialized one at a time", fmu.path.name)
+            return replace(self, one_initialization=True)
         plan, what = replace(self, threads=1), "all are stepped by one thread"
         in_process = self.isolation == "none"
         if neighbours is Neighbours.LIBRARIES and (in_process or self._can_copy_libraries):

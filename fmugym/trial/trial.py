@@ -97,6 +97,7 @@ class Stage(StrEnum):
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
     THREADS = "the comparison with an instance in another thread"
+    TURNS = "the comparison with an instance in another thread, initialized in turn"
 
     @classmethod
     def of(cls, method: ResetMethod) -> Stage:

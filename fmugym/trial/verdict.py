@@ -34,6 +34,8 @@ class Neighbours(StrEnum):
     """What several instances need in order not to disturb each other."""
 
     INDEPENDENT = "independent"
+    ONE_INITIALIZATION = "one initialization at a time"
+    """Instances may step at the same time, but not be initialized."""
     ONE_THREAD = "one thread"
     """Instances give correct results in turn, but not at the same time."""
     LIBRARIES = "libraries"

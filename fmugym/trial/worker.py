@@ -173,13 +173,22 @@ def _need_of_several(request: Request, notes: Notes) -> Neighbours:
     if request.alone or _disturbed(request, notes, private_libraries=False):
         copies = has_native_pool() and not _disturbed(request, notes, private_libraries=True)
         return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
-    notes.stage(Stage.THREADS)
+    if not _disturbed_in_threads(request, notes, Stage.THREADS):
+        return Neighbours.INDEPENDENT
+    if not _disturbed_in_threads(request, notes, Stage.TURNS):
+        return Neighbours.ONE_INITIALIZATION
+    return Neighbours.ONE_THREAD
+
+
+def _disturbed_in_threads(request: Request, notes: Notes, stage: Stage) -> bool:
+    notes.stage(stage)
+    if stage in request.skip:
+        return True
+    in_turn = stage is Stage.TURNS
     try:
-        if Stage.THREADS in request.skip or disturb_in_threads(request.candidate, request.spec):
-            return Neighbours.ONE_THREAD
+        return disturb_in_threads(request.candidate, request.spec, one_initialization=in_turn)
     except FMUGymError:  # FMPy cannot load it, or it fails without the caller's values
-        pass
-    return Neighbours.INDEPENDENT
+        return False
 
 
 def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bool:
