@@ -75,6 +75,7 @@ class Experiment(TypedDict):
     rebuilds: bool
     reloads: bool
     one_initialization: bool
+    pace: tuple[float, int, int]
 
 class Variables(TypedDict):
     """What is set and read in each step, and the Strings that are set before initialization."""

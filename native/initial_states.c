@@ -69,6 +69,7 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     if (status > STATUS_WARNING) {
         return status;
     }
+    pace_wait(&pool->pace);
     instance_begin_turn(pool);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);

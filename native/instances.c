@@ -25,6 +25,7 @@ bool instance_build(Pool *pool, Instance *me) {
     const Identity identity = {name_of(pool, index), s->token, s->resources,
                                log_environment(&pool->log, index), s->logging};
 
+    pace_wait(&pool->pace);
     mutex_lock(pool->making);
     me->component = s->fmi->instantiate(me->library, &identity);
     mutex_unlock(pool->making);

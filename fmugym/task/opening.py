@@ -15,6 +15,7 @@ from typing import Any
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_option, check_path
 from fmugym.config import EnvConfig
+from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.task.episode import EpisodePlan
@@ -73,6 +74,7 @@ def open_pool(
     if isolation is not None:
         isolation = check_option("isolation", isolation, ISOLATIONS)
     num_instances, requested = _request.get()
+    _check_max_instances(fmu, num_instances, config.max_instances)
     options: dict[str, Any] = {
         "isolation": isolation or config.isolation,
         "call_timeout": config.call_timeout,
@@ -83,6 +85,15 @@ def open_pool(
     if backend is not None:
         options["backend"] = backend
     return make_pool(fmu, spec, num_instances, log, **options)
+
+
+def _check_max_instances(fmu: FMU, wanted: int, most: int | None) -> None:
+    if most is not None and wanted > most:
+        fmu.close()
+        raise ConfigError(
+            f"{fmu.path.name}: {wanted} environments need {wanted} instances, but config key "
+            f"'max_instances' allows {most}"
+        )
 
 
 def _find_file(cls: type, path: Path) -> Path:

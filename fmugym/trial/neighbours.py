@@ -16,13 +16,15 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMULoadError, SimulationError
+from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.local import local_pool
+from fmugym.pool.pacing import Pacer
+from fmugym.pool.patience import licence_errors, require_licence
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
 from fmugym.trial.trial import Candidate
@@ -83,6 +85,8 @@ def disturb_in_turn(
     alone, inputs = _run_alone(candidate, spec, private_libraries)
     try:
         beside = _run(candidate, spec, inputs, private_libraries)
+    except LicenceError:
+        raise
     except (FMULoadError, SimulationError) as error:
         logger.info("%s: a second instance fails: %s", candidate.path.name, error)
         return True
@@ -124,6 +128,7 @@ def _run(
 
 def _trajectory(pool: Pool, inputs: FloatArray) -> FloatArray:
     outputs, statuses = pool.reset((), np.zeros((0, pool.num_instances)))
+    require_licence(pool)
     rows = []
     for step in range(_STEPS + 1):
         if statuses[0] > Status.WARNING:
@@ -167,10 +172,13 @@ def disturb_in_threads(
 
 def _two_lives(library: Library, spec: PoolSpec) -> list[_Life]:
     """Let two instances live one after the other, with inputs that differ if the FMU bears it."""
+    pacer = Pacer(spec)
     try:
-        return [_Life(library, spec, inputs) for inputs in _inputs_of_two(spec, 1.0)]
+        return [_Life(library, spec, inputs, pacer) for inputs in _inputs_of_two(spec, 1.0)]
+    except LicenceError:
+        raise
     except SimulationError:
-        return [_Life(library, spec, _inputs_of_two(spec, 0.0)[0])] * 2
+        return [_Life(library, spec, _inputs_of_two(spec, 0.0)[0], pacer)] * 2
 
 
 class _Company:
@@ -226,6 +234,7 @@ class _Race:
 
     def __init__(self, lives: Sequence[_Life], company: _Company) -> None:
         self._lives, self._company = lives, company
+        self._refusal: LicenceError | None = None
         self._deadline = time.perf_counter() + _THREAD_SECONDS
         self._disturbed = False
 
@@ -235,6 +244,8 @@ class _Race:
             thread.start()
         for thread in threads:
             thread.join()
+        if self._refusal is not None:
+            raise self._refusal
         return not self._disturbed
 
     def _run(self, life: _Life) -> None:
@@ -245,6 +256,8 @@ class _Race:
                 is_late = number > 0 and time.perf_counter() > self._deadline
                 if self._disturbed or is_late:
                     break
+        except LicenceError as error:
+            self._refusal = error
         except (FMULoadError, SimulationError) as error:
             logger.info("an instance fails beside another thread: %s", error)
             self._disturbed = True
@@ -261,24 +274,27 @@ class _Life:
         library: The FMU's library.
         spec: What to do in a step.
         inputs: Shape (steps, inputs).
+        pacer: Waits before an instance is made or initialized.
 
     Attributes:
         outputs: All outputs of a lone instance.
     """
 
-    def __init__(self, library: Library, spec: PoolSpec, inputs: FloatArray) -> None:
-        self._library, self._spec, self._inputs = library, spec, inputs
+    def __init__(self, library: Library, spec: PoolSpec, inputs: FloatArray, pacer: Pacer) -> None:
+        self._library, self._spec, self._inputs, self._pacer = library, spec, inputs, pacer
         self.outputs = self()
 
     def __call__(self, company: _Company | None = None) -> bytes:
         """Make, initialize, step and free an instance; return all outputs."""
         company = company or _Company()
         spec = self._spec
-        with company.turn:
+        with company.turn, licence_errors():
+            self._pacer.wait()
             instance = self._library.instantiate()
         try:
             company.before_initialization()
-            with company.turn:
+            with company.turn, licence_errors():
+                self._pacer.wait()
                 instance.initialize(
                     spec.start_time, spec.stop_time, spec.tolerance, _no_start_values
                 )

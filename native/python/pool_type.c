@@ -190,12 +190,12 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
                             "rebuilds",   "reloads",       "one_initialization",
-                            NULL};
+                            "pace",       NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLpppp:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLpppp(dLL):experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization);
+                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
