@@ -27,7 +27,7 @@ EVERY = {
     "test_licences": 12,
     "test_neighbours": 4,
     "test_pool": 8,
-    "test_quirks": 13,
+    "test_quirks": 31,
     "test_zoo": 29,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""
