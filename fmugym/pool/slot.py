@@ -85,8 +85,8 @@ class Slot:
         self._first_outputs = b""
         self._build()
 
-    def _build(self) -> None:
-        self._instance = self._library.instantiate()
+    def _build(self, *, hear_all: bool = False) -> None:
+        self._instance = self._library.instantiate(hear_all=hear_all)
         self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
         self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
         self._start_variables: tuple[Variable, ...] = ()
@@ -108,6 +108,7 @@ class Slot:
         self._counts[Column.RESETS] += 1
         self._counts[Column.RETRIED] = 0
         try:
+            self._instance.begin_episode()
             self._make_anew_if_due()
             if not self._restored(key):
                 self._initialize(variables, values)
@@ -135,7 +136,7 @@ class Slot:
         if is_due:
             self._counts[Column.RECYCLINGS] += 1
             self._replace()
-        elif self._spec.reset_method not in _REUSING:
+        elif self._spec.reset_method not in _REUSING or self._instance.hears_more_than_wanted:
             self._rebuild()
 
     def _restored(self, key: tuple[tuple[Variable, ...], bytes]) -> bool:
@@ -158,6 +159,16 @@ class Slot:
             self._saved = self._instance.save_state()
 
     def _initialize(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """Initialize; if that fails without a word, repeat it and let the FMU log everything."""
+        try:
+            self._initialize_once(variables, values)
+        except SimulationError:
+            if self._instance.phase is Phase.DEAD or not self._instance.can_say_more:
+                raise
+            self._rebuild(hear_all=True)
+            self._initialize_once(variables, values)
+
+    def _initialize_once(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         self._return_to_instantiated()
         if variables is not self._start_variables:
             self._start = Access(self._instance, variables)
@@ -182,9 +193,9 @@ class Slot:
         self._counts[Column.REPLACEMENTS] += 1
         self._rebuild()
 
-    def _rebuild(self) -> None:
+    def _rebuild(self, *, hear_all: bool = False) -> None:
         self._library.discard(self._instance)
-        self._build()
+        self._build(hear_all=hear_all)
 
     def _set_start_values(self) -> None:
         self._instance.check("setting the start values", self._start.set())
