@@ -79,18 +79,11 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     return warm_up(pool, me);
 }
 
-/* Whether a call of the FMU failed, and the FMU did not say why. */
-static bool is_unexplained(const Instance *me) {
-    const Failure *failure = me->failure;
-    return failure != NULL && failure->status >= 0 && failure->said == NULL;
-}
-
 /* An initialization that fails without a word is repeated, and the FMU is asked to log all. */
 static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
     const Status status = initialize_once(pool, me, start, scratch);
 
-    if (status > STATUS_WARNING && is_unexplained(me) && me->phase != PHASE_DEAD &&
-        instance_rebuild_to_hear(pool, me)) {
+    if (status > STATUS_WARNING && instance_rebuild_to_hear(pool, me)) {
         return initialize_once(pool, me, start, scratch);
     }
     return status;

@@ -48,26 +48,37 @@ static bool ask_for_errors(Pool *pool, Instance *me) {
     return build(pool, me, false);
 }
 
-/* Repeating a call must not double the time of every reset. */
-static bool may_repeat(Pool *pool) {
-    enum { MOST = 16 };
-    return !pool->settings.logging && atomic_add(&pool->repeated, 1) < MOST;
+/* An FMU that logs nothing may take long to be instantiated, and it may fail often. */
+static bool may_hear_all(Pool *pool) {
+    enum { MOST = 4 };
+    return !pool->settings.logging && atomic_add(&pool->heard, 1) < MOST;
 }
 
 bool instance_build(Pool *pool, Instance *me) {
     if (build(pool, me, pool->settings.logging)) {
         return ask_for_errors(pool, me);
     }
-    return log_is_silent(&pool->log, index_of(pool, me)) && may_repeat(pool) &&
+    return log_is_silent(&pool->log, index_of(pool, me)) && may_hear_all(pool) &&
            build(pool, me, true);
 }
 
+/* Whether a call of the FMU failed, and the FMU did not say why. */
+static bool is_unexplained(const Instance *me) {
+    const Failure *failure = me->failure;
+    return failure != NULL && failure->status >= 0 && failure->said == NULL;
+}
+
 bool instance_rebuild_to_hear(Pool *pool, Instance *me) {
-    if (me->hearing == HEARING_ALL || !may_repeat(pool)) {
+    if (!is_unexplained(me) || me->phase == PHASE_DEAD || me->hearing == HEARING_ALL ||
+        pool->snapshots != NULL || !may_hear_all(pool)) {
         return false;
     }
     instance_discard(pool, me);
-    return build(pool, me, true);
+    if (!build(pool, me, true)) {
+        return false;
+    }
+    failure_drop(me);
+    return true;
 }
 
 void instance_hush(Pool *pool, Instance *me) {
@@ -176,6 +187,9 @@ Status instance_renew_if_due(Pool *pool, Instance *me) {
     if (due) {
         health_of(pool, me)[RECYCLINGS]++;
         return replace(pool, me);
+    }
+    if (me->phase != PHASE_STEPPING && instance_rebuild_to_hear(pool, me)) {
+        return STATUS_OK;
     }
     const bool loud = me->hearing == HEARING_ALL && !pool->settings.logging;
     return loud || pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;

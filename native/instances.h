@@ -7,8 +7,8 @@
 
 /* Returns whether the FMU could be instantiated. */
 bool instance_build(Pool *pool, Instance *me);
-/* Makes an instance anew that logs everything until its next reset. Returns false if it cannot be
- * made, or if that was done too often. */
+/* If the FMU failed without a message, makes an instance anew that logs everything until its next
+ * reset. Returns false if it cannot be made, or if that was done too often. */
 bool instance_rebuild_to_hear(Pool *pool, Instance *me);
 /* Stops an FMU that logs more than it was asked for. */
 void instance_hush(Pool *pool, Instance *me);

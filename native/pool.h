@@ -159,7 +159,7 @@ typedef struct Pool {
     Cost costs[OPERATIONS];
     Atomic states_too_large;
     Atomic deaf;     /* whether the FMU has refused the categories of its own */
-    Atomic repeated; /* how many calls were repeated to hear why they fail */
+    Atomic heard;    /* how often an instance was asked to log everything */
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

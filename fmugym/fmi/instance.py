@@ -111,8 +111,13 @@ class Instance(ABC):
 
     @property
     def can_say_more(self) -> bool:
-        """Whether a call that failed without a message may be repeated to hear why."""
-        return not self.hears_all and not self._log.recent and self._hearing.may_repeat()
+        """Whether a new instance may log everything, because a call failed without a message."""
+        return not self.hears_all and not self._log.recent and self._hearing.may_hear_all()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the FMU has logged nothing in this episode."""
+        return not self._log.recent
 
     @property
     def hears_more_than_wanted(self) -> bool:
@@ -395,6 +400,11 @@ class Instance(ABC):
         saved = SavedState(self, state)
         self._saved_states.add(saved)
         return saved
+
+    @property
+    def number_of_states(self) -> int:
+        """How many saved states are in use."""
+        return len(self._saved_states)
 
     def restore_state(self, state: SavedState) -> None:
         """Return to a state saved by this instance.

@@ -37,8 +37,8 @@ _ids = itertools.count(1)
 _IDLE_LIMIT: Final = 1000
 """Messages that nobody wants, until the FMU is asked to log less."""
 
-_MOST_REPEATED: Final = 16
-"""Repeating a call must not double the time of every reset."""
+_MOST_HEARD: Final = 4
+"""How many instances of a library may log all; it may take long to make them, and fail often."""
 
 
 class Hearing:
@@ -50,12 +50,12 @@ class Hearing:
 
     def __init__(self) -> None:
         self.deaf = False
-        self._repeated = 0
+        self._heard = 0
 
-    def may_repeat(self) -> bool:
-        """Whether one more call may be repeated to hear why it fails."""
-        self._repeated += 1
-        return self._repeated <= _MOST_REPEATED
+    def may_hear_all(self) -> bool:
+        """Whether one more instance may log everything."""
+        self._heard += 1
+        return self._heard <= _MOST_HEARD
 
 
 class MessageLog:
