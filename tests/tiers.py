@@ -25,7 +25,7 @@ SLOW_MODULES = {
 EVERY = {
     "test_hostile_archive": 9,
     "test_pool": 8,
-    "test_quirks": 13,
+    "test_quirks": 31,
     "test_words": 17,
     "test_zoo": 29,
 }

@@ -38,6 +38,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
@@ -260,6 +261,7 @@ class NativePool(CountedPool):
         try:
             pool.restore(snapshot, mask)
         except ValueError as error:
+            require_refusal(error)
             raise SimulationError(str(error)) from None
         return self._result
 
@@ -342,7 +344,8 @@ class NativePool(CountedPool):
         """
         try:
             return self._pool.step(inputs, skip, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             pool = self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             return pool.step(inputs, _as_mask(skip), observations)
@@ -368,7 +371,8 @@ class NativePool(CountedPool):
         access = self._accesses.get(variables) or self._access(variables)
         try:
             return self._reset(access, values, mask, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             self._open_pool()
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
@@ -399,7 +403,8 @@ class NativePool(CountedPool):
         access = self._accesses.get(variables) or self._access(variables)
         try:
             return self._step_or_reset(inputs, access, values, mask, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             values = np.asarray(values, np.float64)
