@@ -84,6 +84,10 @@ class BatchEngine(Engine):
         """See ``Engine.seed_of``."""
         return self._streams.seed_of(index)
 
+    def close(self) -> None:
+        """See ``Engine.close``."""
+        self.env.close()
+
     @contextmanager
     def single(self, index: int) -> Iterator[FMUEnv]:
         """See ``Engine.single``; the prototype stands in for the environment."""
@@ -177,6 +181,7 @@ class BatchEngine(Engine):
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
+        self.has_moved = False
         indices = np.flatnonzero(mask)
         self._streams.seed(seeds, indices)
         drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
@@ -203,6 +208,7 @@ class BatchEngine(Engine):
     ) -> dict[str, FloatArray]:
         """Draw and start episodes; return the values for the info, by name."""
         values = self._draw(indices, plan)
+        self.has_moved = True
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
@@ -283,6 +289,7 @@ class BatchEngine(Engine):
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         env, pool = self.env, self._pool
+        self.has_moved = False
         actions = self._checked(actions)
         env._in_hooks = True
         try:
@@ -291,6 +298,7 @@ class BatchEngine(Engine):
             if resetting is not None:
                 drawn = self._begin(resetting, np.flatnonzero(resetting), env._plan)
             observed = self._new_observations()
+            self.has_moved = True
             pool.step(None, resetting, observed)
             env.step_count += 1
             if resetting is None:

@@ -182,6 +182,7 @@ class CompiledEngine(BatchEngine):
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         arrays = observations, rewards, terminated, truncated
         drawn = np.empty(self._drawn_shape)
+        self.has_moved = False
         play = self._play if resetting is None else self._play_with_resets
         try:
             troubled, ended = play(actions, *arrays, drawn)
@@ -189,6 +190,7 @@ class CompiledEngine(BatchEngine):
             require_refusal(error)
             actions = np.require(self._checked(actions), np.int64, ["C", "A"])
             troubled, ended = play(actions, *arrays, drawn)
+        self.has_moved = True
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         if resetting is not None:
