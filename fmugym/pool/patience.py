@@ -31,7 +31,7 @@ _REFUSAL: Final = re.compile(
 )
 """How they say that they did not get it; most tell of a licence that they got, too."""
 
-_SAID: Final = re.compile(r"(?:the FMU said|its last lines): ")
+_SAID: Final = re.compile(r"(?:the FMU said|its last lines|it printed): ")
 """What comes before an FMU's words in the texts of errors."""
 
 _FIRST_PAUSE: Final = 0.5
