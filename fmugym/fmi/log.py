@@ -13,7 +13,8 @@ import ctypes
 import itertools
 import logging
 from collections import deque
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec
 
 import fmpy
 from fmpy.fmi1 import fmi1CallbackFunctions
@@ -23,13 +24,16 @@ from fmpy.logging import addLoggerProxy
 
 from fmugym.errors import printable
 
-__all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message"]
+__all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message", "raise_caught"]
+
+P = ParamSpec("P")
 
 logger = logging.getLogger(__name__)
 
 _LEVELS = (logging.INFO, logging.WARNING, logging.WARNING, logging.ERROR, logging.CRITICAL)
 _receivers: dict[int, MessageLog] = {}
 _ids = itertools.count(1)
+_caught: list[BaseException] = []
 
 
 class MessageLog:
@@ -77,6 +81,30 @@ class MessageLog:
         _receivers.pop(self.environment, None)
 
 
+def raise_caught() -> None:
+    """Raise the first exception that a receiver of messages has raised since the last call.
+
+    It may come from a signal handler, such as that of Ctrl-C. ctypes cannot pass it through the
+    FMU, so it has to be raised after the FMU has returned.
+    """
+    if _caught:
+        first = _caught[0]
+        _caught.clear()
+        raise first
+
+
+def _keeping_errors(function: Callable[P, None]) -> Callable[P, None]:
+    """Make a callback of a function: it keeps what the function raises for ``raise_caught``."""
+
+    def called(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            function(*args, **kwargs)
+        except BaseException as error:
+            _caught.append(error)
+
+    return called
+
+
 def _deliver(environment: int | None, status: int, category: bytes, message: bytes) -> None:
     category_text = printable((category or b"").decode(errors="replace"))
     text = printable((message or b"").decode(errors="replace").rstrip())
@@ -96,7 +124,7 @@ def _make_callbacks(structure: Any) -> Any:
     """Fill a callback structure. The members used here are the same in FMI 1.0 and 2.0."""
     types = dict(structure._fields_)
     callbacks = structure()
-    callbacks.logger = types["logger"](_by_name)
+    callbacks.logger = types["logger"](_keeping_errors(_by_name))
     callbacks.allocateMemory = ctypes.cast(fmpy.calloc, types["allocateMemory"])
     callbacks.freeMemory = ctypes.cast(fmpy.free, types["freeMemory"])
     addLoggerProxy(ctypes.byref(callbacks))
@@ -105,4 +133,4 @@ def _make_callbacks(structure: Any) -> Any:
 
 fmi1_callbacks = _make_callbacks(fmi1CallbackFunctions)
 fmi2_callbacks = _make_callbacks(fmi2CallbackFunctions)
-fmi3_log_message = fmi3LogMessageCallback(_deliver)
+fmi3_log_message = fmi3LogMessageCallback(_keeping_errors(_deliver))

@@ -37,6 +37,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
@@ -252,6 +253,7 @@ class NativePool(CountedPool):
         try:
             pool.restore(snapshot, mask)
         except ValueError as error:
+            require_refusal(error)
             raise SimulationError(str(error)) from None
         return self._result
 
@@ -334,7 +336,8 @@ class NativePool(CountedPool):
         """
         try:
             return self._pool.step(inputs, skip, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             pool = self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             return pool.step(inputs, _as_mask(skip), observations)
@@ -360,7 +363,8 @@ class NativePool(CountedPool):
         access = self._accesses.get(variables) or self._access(variables)
         try:
             return self._reset(access, values, mask, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             self._open_pool()
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
@@ -391,7 +395,8 @@ class NativePool(CountedPool):
         access = self._accesses.get(variables) or self._access(variables)
         try:
             return self._step_or_reset(inputs, access, values, mask, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             values = np.asarray(values, np.float64)

@@ -12,18 +12,14 @@ PyObject *decode(const char *text) {
 
 /* Messages go to Python after a call, on the thread that made the call. */
 
-/* An ordinary exception in the receiver must not stop the pool. Any other, such as one from
- * Ctrl-C or sys.exit, goes to the caller. */
+/* The caller gets what the receiver raises: it may come from a signal handler that ran in it. */
 static bool report(PyPool *self, const Message *message) {
     PyObject *result =
         PyObject_CallFunction(self->callback, "niNN", (Py_ssize_t)message->index, message->status,
                               decode(message->category), decode(message->text));
 
-    if (result == NULL && PyErr_ExceptionMatches(PyExc_Exception)) {
-        PyErr_WriteUnraisable(self->callback);
-    }
     Py_XDECREF(result);
-    return !PyErr_Occurred();
+    return result != NULL;
 }
 
 static bool report_dropped(PyPool *self) {
@@ -32,18 +28,16 @@ static bool report_dropped(PyPool *self) {
     return report(self, &message);
 }
 
-/* If an exception interrupts this, the next call reports the remaining messages. Signals are
- * checked before each message. Otherwise the exception of a signal handler would count as the
- * receiver's. */
+/* If an exception interrupts this, the next call reports the remaining messages. */
 static bool drain(PyPool *self) {
     size_t dropped;
     Message *left = log_take(&self->pool.log, &dropped);
-    bool good = PyErr_CheckSignals() == 0;
+    bool good = true;
 
     while (good && left != NULL) {
         Message *message = left;
         left = message->next;
-        good = report(self, message) && PyErr_CheckSignals() == 0;
+        good = report(self, message);
         message_free(message);
     }
     if (good && dropped > 0) {

@@ -11,6 +11,7 @@ import numpy as np
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.extension import require_refusal
 from fmugym.task.values import LateDict
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
@@ -174,7 +175,8 @@ class CompiledEngine(BatchEngine):
         play = self._play if resetting is None else self._play_with_resets
         try:
             troubled, ended = play(actions, *arrays, drawn)
-        except (TypeError, ValueError, BufferError):
+        except (TypeError, ValueError, BufferError) as error:
+            require_refusal(error)
             actions = np.require(self._checked(actions), np.int64, ["C", "A"])
             troubled, ended = play(actions, *arrays, drawn)
         self.any_ended = ended > 0
