@@ -95,6 +95,7 @@ class Library(TypedDict):
     private: bool
     logging: bool
     states: bool
+    categories: tuple[bytes, ...]
 
 class Experiment(TypedDict):
     """The times of an episode."""
