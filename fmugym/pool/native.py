@@ -18,7 +18,7 @@ import math
 import os
 import shutil
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, ParamSpec, Protocol, TypeVar
 
@@ -75,7 +75,6 @@ _SAID: Final = "\x1d"
 """Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 
 FloatArray32 = npt.NDArray[np.float32]
-IndexArray = npt.NDArray[np.int64]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -428,7 +427,7 @@ class NativePool(CountedPool):
         programs: tuple[PlayProgram, PlayProgram],
         actions: tuple[int, int],
         start_values: FloatArray,
-        draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
+        draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
     ) -> Callable[..., tuple[int, int]]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
@@ -440,19 +439,17 @@ class NativePool(CountedPool):
             programs: From the actions to the inputs; from the outputs to done, truncated, reward.
             actions: The lowest and the highest action.
             start_values: As the values of ``reset``; the pool writes the draws there.
-            draws: Uniform numbers drawn ahead, shape (N, episodes, draws); how many of their
-                episodes are used, shape (N,); the lower ends and widths of the distributions and
-                their rows in the start values, shape (draws,).
+            draws: The draws of an episode, and the random streams, shape (N, 6); see
+                ``EpisodeStreams``.
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
 
         Returns:
             A function of actions (int64), observations, rewards, terminated, truncated and drawn
             values (draws, N). It does a step and fills all but the actions; of the drawn values,
-            only those of episodes that start. It returns how many instances have a status worse
-            than a warning, and how many episodes have ended. Call ``set_streams`` before it.
+            only those of episodes that start; ``given`` ones are read. It returns how many
+            instances have a status worse than a warning, and how many episodes have ended.
         """
-        block, used, low, width, rows = draws
         count, ended, limit = episodes
         self._pool.prepare_play(
             start=self._access(variables),
@@ -460,18 +457,11 @@ class NativePool(CountedPool):
             inputs=_program_bytes(programs[0]),
             judgement=_program_bytes(programs[1]),
             actions=actions,
-            draws={"block": block, "used": used, "low": low, "width": width, "rows": rows},
+            draws=draws[0],
+            states=draws[1],
             episodes={"step_counts": count, "ended": ended, "limit": limit},
         )
         return self._pool.play
-
-    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
-        """Set the generators that ``prepare_play`` uses when the numbers drawn ahead are used up.
-
-        Args:
-            generators: N bit generators of numpy. The pool draws from them without their locks.
-        """
-        self._pool.set_streams(generators)
 
     @property
     def uses_states(self) -> bool:

@@ -143,7 +143,6 @@ static void pool_dealloc(PyObject *object) {
     free(self->categories);
     free(self->strings);
     Py_XDECREF(self->playing);
-    Py_XDECREF(self->streams);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -417,7 +416,6 @@ static PyMethodDef methods[] = {
     FAST("step_or_reset", py_step_or_reset),
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
-    {"set_streams", py_set_streams, METH_O, NULL},
     FAST("play", py_play),
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),
