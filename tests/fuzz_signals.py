@@ -1,0 +1,192 @@
+"""Signals at random moments: what their handler raises comes out, and all goes on as before.
+
+    python tests/fuzz_signals.py --count 2000 --seed 0
+
+In each case a timer sends a signal after some microseconds or milliseconds of calls of one
+environment: steps, resets, or opening and closing it. The handler raises ``KeyboardInterrupt`` or
+an ordinary exception. Nothing else may come out. Afterwards a reset begins an episode that equals
+one without a signal, bit for bit. When and where a signal arrives depends on the machine, so a case
+cannot be repeated exactly. See ``fuzz_driver.py``. Not for Windows, which has no such timers.
+"""
+
+import collections
+import contextlib
+import functools
+import gc
+import signal
+import sys
+import traceback
+
+import numpy as np
+from fuzz_driver import Case, main, require
+
+import fmugym
+from fmugym.envs import CartPoleEnv
+
+NUM_ENVS = 3
+CALLS = 400
+"""At most so many calls wait for the signal."""
+
+
+class AlarmError(Exception):
+    """An ordinary exception of a signal handler."""
+
+
+class Alarm:
+    """A timer whose handler raises once.
+
+    Args:
+        delay: Seconds.
+        error: What the handler raises.
+    """
+
+    def __init__(self, delay, error):
+        self._delay, self._error = delay, error
+        self._armed = self._rang = False
+        self._where = ""
+
+    def _ring(self, *_):
+        if self._armed:
+            self._armed, self._rang = False, True
+            self._where = "".join(traceback.format_stack()[-9:-1])
+            raise self._error
+
+    def interrupt(self, work):
+        """Do some work; fail unless what the handler raises comes out of it."""
+        before = signal.signal(signal.SIGALRM, self._ring)
+        came_out = None
+        try:
+            self._armed = True
+            signal.setitimer(signal.ITIMER_REAL, self._delay)
+            work()
+            self._armed = False
+        except BaseException as error:
+            came_out = error
+        self._armed = False
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        if came_out is not None and not self._is_ours(came_out):
+            raise came_out
+        require(came_out is not None or not self._rang, f"lost in {self._where}")
+
+    def _is_ours(self, error):
+        """Whether an error is that of the handler, or one of the family for which it is the cause.
+
+        Errors of hooks come out in an error of the family, and a signal may arrive in a hook.
+        """
+        seen = error
+        while seen is not None and seen is not self._error:
+            seen = seen.__cause__ or seen.__context__
+        is_wrapped = isinstance(error, fmugym.FMUGymError) and not isinstance(
+            self._error, KeyboardInterrupt
+        )
+        return error is self._error or (is_wrapped and seen is self._error)
+
+
+def single(**options):
+    return CartPoleEnv(**options)
+
+
+def vector(**options):
+    return fmugym.FMUVectorEnv(CartPoleEnv, NUM_ENVS, **options)
+
+
+WAYS = {
+    "single": single,
+    "single in Python": functools.partial(single, backend="python"),
+    "single isolated": functools.partial(single, isolation="process"),
+    "compiled": functools.partial(vector, hooks="compiled", threads=2),
+    "array": functools.partial(vector, hooks="array"),
+    "per_env": functools.partial(vector, hooks="per_env"),
+    "same step": functools.partial(vector, autoreset_mode="same_step"),
+    "vector in Python": functools.partial(vector, backend="python"),
+    "isolated": functools.partial(vector, isolation="process", workers=2),
+}
+
+
+def actions(env):
+    count = getattr(env, "num_envs", None)
+    return (
+        (lambda index: index % 3 % 2) if count is None else (lambda i: np.arange(i, i + count) % 2)
+    )
+
+
+def play(env, calls):
+    """Reset and step; yields what each call returns, without the infos."""
+    action = actions(env)
+    for index in range(calls):
+        if index % 50 == 0:
+            yield np.array(env.reset(seed=index)[0])
+        observation, reward, terminated, truncated, _ = env.step(action(index))
+        yield np.concatenate([np.ravel(x) for x in (observation, reward, terminated, truncated)])
+        if not hasattr(env, "num_envs") and (terminated or truncated):
+            env.reset()
+
+
+def bits(env):
+    return [array.tobytes() for array in play(env, 30)]
+
+
+class Stage:
+    """An environment of each way, and what its episodes are without signals."""
+
+    def __init__(self):
+        self._envs, self._expected = {}, {}
+
+    def env(self, way):
+        if way not in self._envs:
+            self._envs[way] = WAYS[way]()
+            self._expected[way] = bits(self._envs[way])
+        return self._envs[way]
+
+    def check(self, way):
+        require(bits(self._envs[way]) == self._expected[way], "another episode than before")
+
+    def close(self):
+        for env in self._envs.values():
+            env.close()
+        self._envs = {}
+
+
+def in_calls(way, stage, alarm):
+    """Interrupt steps and resets."""
+    env = stage.env(way)
+    alarm.interrupt(lambda: collections.deque(play(env, CALLS), 0))
+    stage.check(way)
+
+
+def in_life(way, stage, alarm):
+    """Interrupt opening and closing."""
+
+    def live():
+        for _ in range(3):
+            with contextlib.closing(WAYS[way]()) as env:
+                env.reset(seed=0)
+
+    stage.env(way)
+    alarm.interrupt(live)
+    stage.check(way)
+    gc.collect()  # an environment that was never returned is in a cycle with its exception
+
+
+@contextlib.contextmanager
+def program():
+    """See ``fuzz_driver.run``."""
+    stage = Stage()
+
+    def make(rng, folder):
+        way = rng.choice(tuple(WAYS))
+        call = rng.choice((in_calls, in_calls, in_life))
+        delay = 10 ** rng.uniform(-5.0, -1.5)
+        alarm = Alarm(delay, rng.choice((KeyboardInterrupt, AlarmError))("a signal"))
+        return Case(
+            lambda: call(way, stage, alarm), f"{call.__name__}, {way}", f"{delay:.1e} s", keeps=True
+        )
+
+    with contextlib.closing(stage):
+        yield make
+        gc.collect()
+
+
+if __name__ == "__main__":
+    sys.exit(main(program, __doc__, 2000))
