@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from busy import BusyEnv, build
+from busy import BusyEnv
+from c_fmus import build_busy
 from measure import Effort, MissingError
 from tables import Table, duration, share
 
@@ -43,7 +44,7 @@ def _cost(stack: ExitStack, effort: Effort) -> Table:
     table = Table("Worker processes: median time of a call", header)
     _add_cost(table, "1 cart-pole", _pools(stack, CartPoleEnv, 1), effort)
     try:
-        path = build(Path(stack.enter_context(tempfile.TemporaryDirectory())))
+        path = build_busy(Path(stack.enter_context(tempfile.TemporaryDirectory())))
     except MissingError as reason:
         table.rows.append([f"{SIZE} heavy FMUs", str(reason), "", "", ""])
         return table

@@ -158,7 +158,7 @@ def long(self):
         (branch, "branches on a value"),
         (sine, "uses numpy.sin"),
         (previous, "looks at the step before"),
-        (remembered, "sets attributes"),
+        (remembered, "changes self.worst"),
         (number, "a flag is no Boolean"),
         (array, "computes with ndarray"),
         (power, "fails on symbols: unsupported operand"),

@@ -30,7 +30,7 @@ from fmugym.vector.arguments import (
     checked_seeds,
     checked_step_limit,
 )
-from fmugym.vector.calls import TOGETHER, attribute, checked_name, require_settable
+from fmugym.vector.calls import TOGETHER, checked_name, require_settable
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.compiled import CompiledEngine, find_programs
@@ -120,6 +120,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _set_up(self, hooks: str, max_episode_steps: int | None) -> None:
         env, count = self._prototype, self.num_envs
+        env._prepare_hooks()  # its constructor may have set some as attributes
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = env.render_mode
         self.single_action_space = env.action_space
@@ -255,11 +256,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             raise SimulationError("render was called before the first reset")
         pictures = []
         for index in range(self.num_envs):
-            env = self._engine.single(index)
-            if env._renderer is None:
-                env._renderer = self._prototype._renderer
-            pictures.append(env.render())
-            self._prototype._renderer = env._renderer
+            with self._engine.single(index) as env:
+                if env._renderer is None:
+                    env._renderer = self._prototype._renderer
+                pictures.append(env.render())
+                self._prototype._renderer = env._renderer
         return tuple(pictures)
 
     # Single environments.
@@ -278,7 +279,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _get_attr(self, name: str, indices: Sequence[int]) -> list[Any]:
         """Read an attribute or a parameter of some environments."""
         self._open_pool("get_attr")
-        return [attribute(self._engine.single(index), name) for index in indices]
+        name = checked_name(name)
+        return [self._engine.read(name, index) for index in indices]
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.
@@ -330,7 +332,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute of some environments."""
-        env = self._engine.single(0)
+        env = self._prototype
         if not hasattr(env, name):  # no hook can know of it: the name is misspelt
             public = [known for known in dir(env) if not known.startswith("_")]
             names = public + list(env.fmu.description.variables)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,8 +62,12 @@ class Engine(ABC):
         """Return the seed of an environment's generator."""
 
     @abstractmethod
-    def single(self, index: int) -> FMUEnv:
-        """Return one environment as a single one, to read it and call its methods."""
+    def single(self, index: int) -> AbstractContextManager[FMUEnv]:
+        """Lend one environment as a single one, to read it and call its methods."""
+
+    @abstractmethod
+    def read(self, name: str, index: int) -> Any:
+        """Read an attribute, or else a parameter of the FMU, of one environment."""
 
     @abstractmethod
     def call(

@@ -12,7 +12,9 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
+from fmugym.task.readings import Readings, reading
 from fmugym.task.values import LateDict
+from fmugym.vector.contents import borrowed
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks import results
@@ -20,7 +22,7 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
 from fmugym.vector.hooks.trace import trace_hooks
 from fmugym.vector.infos import not_finite
-from fmugym.vector.views import light_copy
+from fmugym.vector.views import copied
 
 __all__ = ["CompiledEngine", "find_programs"]
 
@@ -49,7 +51,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
     try:
         _require_playable(env)
         programs = trace_hooks(env)
-        _require_same(sample_states(env), programs)
+        _require_same(env, sample_states(env), programs)
     except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
@@ -70,14 +72,14 @@ def _require_playable(env: FMUEnv) -> None:
         )
 
 
-def _require_same(batch: FMUEnv, programs: tuple[Program, Program]) -> None:
-    with np.errstate(all="ignore"):
-        inputs = np.array(evaluate(programs[0], batch))
-        batch.inputs = inputs
+def _require_same(env: FMUEnv, batch: Readings, programs: tuple[Program, Program]) -> None:
+    with np.errstate(all="ignore"), borrowed(env):
+        batch.inputs = inputs = np.array(evaluate(programs[0], batch))
         done, truncated, reward = evaluate(programs[1], batch)
         batch.done = done != 0.0
-        hooks = (batch._is_done(), batch._is_truncated(), batch._reward_policy())
-        expected_inputs = batch._get_inputs()
+        with reading(env, batch):
+            hooks = (env._is_done(), env._is_truncated(), env._reward_policy())
+            expected_inputs = env._get_inputs()
     for value, expected in zip((done, truncated, reward), hooks, strict=True):
         if not _equal(value, expected):
             raise UntraceableError("the program gives other values than the hooks")
@@ -149,17 +151,14 @@ class CompiledEngine(BatchEngine):
         """Compile the hooks anew, because the programs contain the old values of the attributes."""
         super()._assign(attributes)
         try:
+            if self._columns:
+                raise UntraceableError("environments have attributes of their own")
             programs = trace_hooks(self.env)
-            _require_same(self._copy_for_hooks(), programs)
+            _require_same(self.env, copied(Readings.of(self.env)), programs)
         except Exception as reason:  # as in find_programs
             logger.debug("the hooks cannot be compiled any more: %s", reason)
             programs = None
         self._prepare(programs)
-
-    def _copy_for_hooks(self) -> FMUEnv:
-        batch = light_copy(self.env)
-        batch._in_hooks = True
-        return batch
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -17,8 +18,8 @@ from fmugym.task.values import EpisodeVariables
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.column import PoolColumn
+from fmugym.vector.copies import copied_attributes, light_copy
 from fmugym.vector.engines.base import Engine, StepResult
-from fmugym.vector.views import copied_attributes, light_copy
 
 __all__ = ["PerEnvEngine"]
 
@@ -60,9 +61,14 @@ class PerEnvEngine(Engine):
         """See ``Engine.seed_of``."""
         return self._envs[index].np_random_seed
 
-    def single(self, index: int) -> FMUEnv:
+    @contextmanager
+    def single(self, index: int) -> Iterator[FMUEnv]:
         """See ``Engine.single``."""
-        return self._envs[index]
+        yield self._envs[index]
+
+    def read(self, name: str, index: int) -> Any:
+        """See ``Engine.read``."""
+        return attribute(self._envs[index], name)
 
     def call(
         self,

@@ -15,9 +15,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray
 from fmugym.pool.extension import has_native_pool
+from fmugym.task.readings import Readings
 
 __all__ = [
     "MOST_INSTRUCTIONS",
@@ -143,18 +143,18 @@ _BOUNDS: Final[Mapping[str, Callable[[float, float, float], float]]] = {
 """Bounds of the magnitudes of results; comparisons and logic give 0 or 1."""
 
 
-def evaluate(program: Program, batch: FMUEnv) -> list[FloatArray]:
+def evaluate(program: Program, batch: Readings) -> list[FloatArray]:
     """Evaluate a program with numpy, to compare it with the hooks.
 
     Args:
         program: The program.
-        batch: An environment whose attributes hold arrays of M environments.
+        batch: What hooks read in a batch of M environments.
 
     Returns:
         The results, each of shape (M,); Booleans are 0 and 1.
     """
     rows = {
-        "output": batch._values,
+        "output": batch.values,
         "input": batch.inputs,
         "action": [batch.action.astype(np.float64)],
         "parameter": list(batch.parameters.values()),

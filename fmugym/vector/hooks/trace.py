@@ -17,14 +17,15 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.task.values import NamedValues
+from fmugym.task.readings import Readings, reading
+from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks.program import (
     MOST_INSTRUCTIONS,
     OPERATIONS,
     Program,
     UntraceableError,
 )
-from fmugym.vector.views import light_copy
 
 __all__ = ["trace_hooks"]
 
@@ -202,38 +203,38 @@ def trace_hooks(env: FMUEnv) -> tuple[Program, Program]:
         UntraceableError: If the hooks do what a program cannot do; the text names it.
     """
     _require_simple(env)
-    try:
-        return _traced(_symbolic(env))
-    except UntraceableError:
-        raise
-    except Exception as error:  # hooks do with numbers what symbols cannot do
-        raise UntraceableError(f"it fails on symbols: {error}") from error
+    with borrowed(env) as contents, reading(env, _symbolic(env)):
+        try:
+            programs = _traced(env)
+        except UntraceableError:
+            raise
+        except Exception as error:  # hooks do with numbers what symbols cannot do
+            raise UntraceableError(f"it fails on symbols: {error}") from error
+        changed = contents.changed()
+    if changed is not None:
+        raise UntraceableError(f"a hook changes self.{changed}")
+    return programs
 
 
 def _traced(symbolic: FMUEnv) -> tuple[Program, Program]:
-    before = set(symbolic.__dict__)
     inputs = _values(symbolic._get_inputs(), len(symbolic._interface.inputs))
     symbolic.inputs = tuple(inputs)
     done = _flag(symbolic._is_done())
     symbolic.done = done
     truncated = _flag(symbolic._is_truncated())
     reward = _symbol(symbolic._reward_policy())
-    if set(symbolic.__dict__) != before:
-        raise UntraceableError("a hook sets attributes")
     return _compile(inputs), _compile([done, truncated, reward])
 
 
 def _require_simple(env: FMUEnv) -> None:
     space = env.observation_space
-    own_observation = type(env)._get_observation is not FMUEnv._get_observation
     is_flat = isinstance(space, spaces.Box) and space.dtype == np.float32
     obstacles = {
         "the actions are no single integers": not isinstance(env.action_space, spaces.Discrete),
-        "the observation is not the default one": own_observation or not is_flat,
-        "it has a hook _update": env._has_update,
+        "the observation is not the default one": env._own.get_observation or not is_flat,
+        "it has a hook _update": env._own.update,
         "its steps have an info": env._has_info,
-        "it is a goal task": env._is_goal_task,
-        "environments have attributes of their own": env._per_env_attributes,
+        "it is a goal task": env._own.goal_reward,
         "it has episode variables": env.config.episode_variables,
         "it has inputs that are not Real": not env._real_inputs,
     }
@@ -242,24 +243,26 @@ def _require_simple(env: FMUEnv) -> None:
             raise UntraceableError(obstacle)
 
 
-def _symbolic(env: FMUEnv) -> FMUEnv:
-    """Copy an environment: symbols replace what programs can load, and the rest is missing."""
-    symbolic = light_copy(env)
+def _symbolic(env: FMUEnv) -> Readings:
+    """Make readings in which symbols stand for what programs can load; the rest is missing."""
     names = list(env._interface.parameters)
     values = tuple(Symbol("output", index) for index in range(len(env.out)))
-    symbolic._values = values
-    symbolic.state = values[: env._output_count]
-    symbolic.out = NamedValues("output", list(env.out), lambda: values)
-    symbolic.action = Symbol("action", 0)
-    symbolic.inputs = tuple(Symbol("input", index) for index in range(len(env._start_inputs)))
-    symbolic.parameters = MappingProxyType(
-        {name: Symbol("parameter", index) for index, name in enumerate(names)}
+    return Readings(
+        values=values,
+        out=NamedValues("output", list(env.out), lambda: values),
+        state=values[: env._output_count],
+        previous_state=_Missing(),
+        inputs=tuple(Symbol("input", index) for index in range(len(env._start_inputs))),
+        action=Symbol("action", 0),
+        previous_action=_Missing(),
+        step_count=Symbol("step_count", 0),
+        done=False,
+        after_end=False,
+        parameters=MappingProxyType(
+            {name: Symbol("parameter", index) for index, name in enumerate(names)}
+        ),
+        variables=EpisodeVariables({}),
     )
-    symbolic.step_count = Symbol("step_count", 0)
-    symbolic.after_end = False
-    symbolic.previous_state = symbolic.previous_action = _Missing()
-    symbolic._in_hooks = True
-    return symbolic
 
 
 class _Missing:
