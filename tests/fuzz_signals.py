@@ -5,8 +5,14 @@
 In each case a timer sends a signal after some microseconds or milliseconds of calls of one
 environment: steps, resets, or opening and closing it. The handler raises ``KeyboardInterrupt`` or
 an ordinary exception. Nothing else may come out. Afterwards a reset begins an episode that equals
-one without a signal, bit for bit. When and where a signal arrives depends on the machine, so a case
-cannot be repeated exactly. See ``fuzz_driver.py``. Not for Windows, which has no such timers.
+one without a signal, bit for bit, and no file is left.
+
+Two things are not the package's to mend. Python drops what is raised in a destructor, and so does
+lxml while it reads a file. And an ordinary exception that arrives while an environment is opened
+may count as one of what is being tried then, such as a hook on arrays.
+
+When and where a signal arrives depends on the machine, so a case cannot be repeated exactly. See
+``fuzz_driver.py``. Not for Windows, which has no such timers.
 """
 
 import collections
@@ -18,12 +24,15 @@ import sys
 import traceback
 
 import numpy as np
-from fuzz_driver import Case, main, require
+from fuzz_driver import Case, CaseError, main, require
 
 import fmugym
 from fmugym.envs import CartPoleEnv
 
 NUM_ENVS = 3
+LOSING = ("weakref.py", "in __del__", "etree.parse(")
+"""Where Python or lxml drops what a signal handler raises, as lines of a stack have it."""
+
 CALLS = 400
 """At most so many calls wait for the signal."""
 
@@ -48,11 +57,16 @@ class Alarm:
     def _ring(self, *_):
         if self._armed:
             self._armed, self._rang = False, True
-            self._where = "".join(traceback.format_stack()[-9:-1])
+            self._where = "".join(traceback.format_stack())
             raise self._error
 
-    def interrupt(self, work):
-        """Do some work; fail unless what the handler raises comes out of it."""
+    def interrupt(self, work, strict=True):
+        """Do some work; fail unless what the handler raises comes out of it.
+
+        Args:
+            work: A function.
+            strict: Whether this goes for ordinary exceptions, too.
+        """
         before = signal.signal(signal.SIGALRM, self._ring)
         came_out = None
         try:
@@ -65,22 +79,26 @@ class Alarm:
         self._armed = False
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-        if came_out is not None and not self._is_ours(came_out):
-            raise came_out
-        require(came_out is not None or not self._rang, f"lost in {self._where}")
+        may_be_lost = any(place in self._where for place in LOSING) or not (
+            strict or isinstance(self._error, KeyboardInterrupt)
+        )
+        if came_out is not None and not may_be_lost and not self._is_ours(came_out):
+            raise CaseError(f"{type(came_out).__name__}: {came_out}") from came_out
+        is_lost = came_out is None and self._rang and not may_be_lost
+        require(not is_lost, f"lost in {self._where[-2000:]}")
 
     def _is_ours(self, error):
-        """Whether an error is that of the handler, or one of the family for which it is the cause.
+        """Whether an error is that of the handler, or was made of it.
 
-        Errors of hooks come out in an error of the family, and a signal may arrive in a hook.
+        Python itself makes another one of it in a codec. What hooks or odd values raise comes out
+        as an error of the family, and a signal may arrive in a hook.
         """
         seen = error
         while seen is not None and seen is not self._error:
             seen = seen.__cause__ or seen.__context__
-        is_wrapped = isinstance(error, fmugym.FMUGymError) and not isinstance(
-            self._error, KeyboardInterrupt
-        )
-        return error is self._error or (is_wrapped and seen is self._error)
+        if isinstance(self._error, KeyboardInterrupt):
+            return isinstance(error, KeyboardInterrupt) and seen is self._error
+        return seen is self._error or isinstance(error, fmugym.FMUGymError)
 
 
 def single(**options):
@@ -164,7 +182,7 @@ def in_life(way, stage, alarm):
                 env.reset(seed=0)
 
     stage.env(way)
-    alarm.interrupt(live)
+    alarm.interrupt(live, strict=False)
     stage.check(way)
     gc.collect()  # an environment that was never returned is in a cycle with its exception
 
@@ -185,7 +203,7 @@ def program():
 
     with contextlib.closing(stage):
         yield make
-        gc.collect()
+    gc.collect()
 
 
 if __name__ == "__main__":

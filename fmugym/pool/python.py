@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,9 @@ from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.slot import Slot, Snapshot
 
 __all__ = ["PythonPool"]
+
+_WARNING: Final = int(Status.WARNING)
+"""An enumeration's member has Python code, in which numpy drops what a signal handler raises."""
 
 
 class PythonPool(CountedPool):
@@ -115,7 +119,7 @@ class PythonPool(CountedPool):
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
         self.step(None, None, self.observations)
-        return int(np.count_nonzero(self.statuses > Status.WARNING))
+        return int(np.count_nonzero(self.statuses > _WARNING))
 
     def save(self) -> list[Snapshot]:
         """See ``Pool.save``."""
