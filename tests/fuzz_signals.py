@@ -201,9 +201,13 @@ def program():
             lambda: call(way, stage, alarm), f"{call.__name__}, {way}", f"{delay:.1e} s", keeps=True
         )
 
-    with contextlib.closing(stage):
-        yield make
-    gc.collect()
+    before, sys.unraisablehook = sys.unraisablehook, lambda unraisable: None
+    try:
+        with contextlib.closing(stage):
+            yield make
+        gc.collect()
+    finally:
+        sys.unraisablehook = before
 
 
 if __name__ == "__main__":
