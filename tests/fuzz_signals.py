@@ -8,8 +8,9 @@ an ordinary exception. Nothing else may come out. Afterwards a reset begins an e
 one without a signal, bit for bit, and no file is left.
 
 Two things are not the package's to mend. Python drops what is raised in a destructor, lxml does so
-while it reads a file, and ``zipfile`` may raise something else. And an ordinary exception that arrives while an environment is opened
-may count as one of what is being tried then, such as a hook on arrays.
+while it reads a file, and ``zipfile`` may raise something else. And an ordinary exception that
+arrives while an environment is opened may count as one of what is being tried then, such as a hook
+on arrays.
 
 When and where a signal arrives depends on the machine, so a case cannot be repeated exactly. See
 ``fuzz_driver.py``. Not for Windows, which has no such timers.
@@ -31,7 +32,7 @@ from fmugym.envs import CartPoleEnv
 
 NUM_ENVS = 3
 LOSING = ("weakref.py", "in __del__", "etree.parse(", "zipfile.py")
-"""Where Python or lxml may drop or replace what a signal handler raises, as lines of a stack have it."""
+"""Where Python or lxml may drop or replace what a signal handler raises, as a stack names it."""
 
 CALLS = 400
 """At most so many calls wait for the signal."""
