@@ -17,6 +17,7 @@ from fmugym.errors import ConfigError, FMUGymError, SimulationError, shown, unkn
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.health import fault_rates
+from fmugym.pool.patience import failed_reset
 from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
@@ -145,7 +146,7 @@ class FMUEnv(Constructed):
         try:
             pool.reset(plan.model_variables, episode.start_values)
             if pool.statuses.item(0) > Status.WARNING:
-                raise SimulationError(pool.failure(0))
+                raise failed_reset(pool.failure(0))
             self._begin_episode(episode)
             observation, info = self._observation_and_info()
         except BaseException:

@@ -31,6 +31,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -139,6 +140,7 @@ class NativePool(CountedPool):
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self.step_own = self._pool.step_own
+        self._attendant = Attendant.of(spec, log)
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
@@ -174,6 +176,8 @@ class NativePool(CountedPool):
                     "restores": method == ResetMethod.RESTORE,
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
+                    "one_initialization": spec.one_initialization,
+                    "pace": (spec.initialization_interval, *spec.turn),
                 },
                 variables={
                     "inputs": self._access(spec.inputs),
@@ -213,8 +217,8 @@ class NativePool(CountedPool):
 
     @property
     def can_play(self) -> bool:
-        """See ``Pool.can_play``."""
-        return True
+        """See ``Pool.can_play``; nobody waits for licences within a step."""
+        return not self._spec.licence_wait
 
     # The contract of Pool.
 
@@ -222,7 +226,10 @@ class NativePool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        self.reset_into(variables, values, mask)
+        if self._attendant is None:
+            self.reset_into(variables, values, mask)
+        else:
+            self._attendant.reset(self, self.reset_into, variables, values, mask)
         return self._result
 
     def step(

@@ -18,6 +18,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import fault_rates
+from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
@@ -239,7 +240,7 @@ class BatchEngine(Engine):
     def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
         for index in indices.tolist():
             if statuses[index] > Status.WARNING:
-                raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+                raise failed_reset(f"environment {index}: {self._pool.failure(index)}")
 
     def _draw(self, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
         """Draw episodes into the rows of the parameters and variables.
