@@ -11,6 +11,7 @@ SLOW_MODULES = {
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
+    "test_fuzz_signals",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_native_build",

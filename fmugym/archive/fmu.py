@@ -25,7 +25,7 @@ from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
 from fmugym.archive.reading import read_model_description
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
-from fmugym.archive.temporary import make_folder, remove_folder
+from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 
@@ -234,8 +234,9 @@ class FMU(LoadableFMU):
             return ()
         if self._folder is not None:
             return self._missing_in(self._folder)
-        folder = make_folder()
+        folder = folder_name()
         try:
+            make_folder(folder)
             self._extract_to(folder, only="binaries")
             return self._missing_in(folder)
         finally:
@@ -258,9 +259,10 @@ class FMU(LoadableFMU):
         if self._folder is not None:
             return self._folder
         self._check_library()
-        folder = make_folder()
+        folder = folder_name()
         self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
         try:
+            make_folder(folder)
             self._extract_to(folder)
         except BaseException:
             self.close()

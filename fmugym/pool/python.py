@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,9 @@ from fmugym.pool.pacing import Pacer
 from fmugym.pool.slot import Slot, Snapshot
 
 __all__ = ["PythonPool"]
+
+_WARNING: Final = int(Status.WARNING)
+"""An enumeration's member has Python code, in which numpy drops what a signal handler raises."""
 
 
 class PythonPool(AttendedPool):
@@ -116,7 +120,7 @@ class PythonPool(AttendedPool):
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
         self.step(None, None, self.observations)
-        return int(np.count_nonzero(self.statuses > Status.WARNING))
+        return int(np.count_nonzero(self.statuses > _WARNING))
 
     def save(self) -> list[Snapshot]:
         """See ``Pool.save``."""

@@ -194,12 +194,14 @@ def _raise_any(replies: Iterable[Any]) -> None:
 
 def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, patience: float) -> None:
     deadline = time.monotonic() + patience
-    for supervisor in supervisors:
-        supervisor.begin_closing()
-    for supervisor in supervisors:
-        supervisor.close(deadline)
-    memory.close()
-    fmu.close()
+    try:
+        for supervisor in supervisors:
+            supervisor.begin_closing()
+        for supervisor in supervisors:
+            supervisor.close(deadline)
+    finally:  # also after KeyboardInterrupt
+        memory.close()
+        fmu.close()
 
 
 def _forget_crews() -> None:
