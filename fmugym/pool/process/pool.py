@@ -58,8 +58,8 @@ class ProcessPool(AttendedPool):
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
-            may take ten times as long. None for ever. A worker
-            that takes longer is ended, unless a debugger holds it.
+            may take ten times as long. None for ever. A worker that takes longer is ended, unless
+            a debugger holds it.
 
     Attributes:
         workers: How many processes there are.
