@@ -84,6 +84,9 @@ PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_recycle(PyObject *object, PyObject *unused);
 PyObject *py_costs(PyObject *object, PyObject *unused);
+PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_pack(PyObject *object, PyObject *index);
+PyObject *py_adopt(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_uses_states(PyObject *object, PyObject *unused);
 
 PyObject *py_save(PyObject *object, PyObject *unused);
