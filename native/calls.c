@@ -48,11 +48,12 @@ size_t pool_step_or_reset(Pool *pool, const Call *call) {
     return run_with_starts(&task, pool->settings.count);
 }
 
-size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
+size_t pool_play(Pool *pool, const Call *call, size_t *ended, bool *outside) {
     Task task = {.pool = pool, .call = call, .operation = PLAY};
     const size_t troubled = run_with_starts(&task, pool->settings.count);
 
     *ended = (size_t)atomic_get(&task.ended);
+    *outside = atomic_get(&task.outside) != 0;
     return troubled;
 }
 

@@ -224,8 +224,9 @@ size_t pool_reset(Pool *pool, const Call *call);
 /* Resets the instances in the mask and steps the others. Writes all observations. */
 size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
- * turn before and after. Writes all observations and how many episodes have just ended. */
-size_t pool_play(Pool *pool, const Call *call, size_t *ended);
+ * turn before and after. Writes all observations, how many episodes have just ended, and whether
+ * a hook looked up an index outside of a table. */
+size_t pool_play(Pool *pool, const Call *call, size_t *ended, bool *outside);
 
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);

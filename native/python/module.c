@@ -1,6 +1,6 @@
 /* The extension module fmugym._native. See fmugym/_native.pyi. */
 
-#include "python.h"
+#include "programs.h"
 
 #include "threads.h"
 
@@ -47,6 +47,8 @@ static PyObject *statistics(PyObject *module, PyObject *unused) {
 
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
+    {"evaluate", py_evaluate, METH_VARARGS, NULL},
+    {"is_free_loop", py_is_free_loop, METH_O, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
     {NULL, NULL, 0, NULL},
@@ -84,7 +86,7 @@ PyMODINIT_FUNC PyInit__native(void) {
     if (!find_error() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         !add_type(module, &snapshot_type, &snapshot_spec) ||
-        PyModule_AddIntConstant(module, "MOST_INSTRUCTIONS", PROGRAM_LENGTH) < 0) {
+        PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {
         Py_DECREF(module);
         return NULL;
     }

@@ -7,18 +7,22 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task import spaces as fmu_spaces
 from fmugym.task.values import LateDict
+from fmugym.vector.actions import checked_actions
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.check import sample_states
-from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
-from fmugym.vector.hooks.trace import trace_hooks
-from fmugym.vector.infos import not_finite
+from fmugym.vector.hooks.compare import require_same
+from fmugym.vector.hooks.program import Row, UntraceableError
+from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 from fmugym.vector.views import light_copy
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -26,13 +30,14 @@ __all__ = ["CompiledEngine", "find_programs"]
 logger = logging.getLogger(__name__)
 
 _FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
-_REWARD = 2
-"""The index of the reward among the results of the second program."""
+
+_SCALES = (1.0, -0.3, 10.0, 300.0, -1e5)
+"""The magnitudes of the states that programs are compared with hooks on."""
 
 _make_tuple: Any = tuple.__new__  # takes a third of the time of a NamedTuple's constructor
 
 
-def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program] | None:
+def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
     """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
 
     Args:
@@ -40,22 +45,22 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
         required: Whether hooks that cannot be compiled are an error.
 
     Returns:
-        The program for the inputs and the program for done, truncated and reward; or None.
+        The programs, or None.
 
     Raises:
         ConfigError: If the programs are required, but the hooks cannot be compiled.
     """
     try:
         _require_playable(env)
-        programs = trace_hooks(env)
-        _require_same(sample_states(env), programs)
+        task = trace_hooks(env)
+        require_same(sample_states(env, _SCALES), task)
     except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
-        logger.debug("%s", text)
+        logger.info("%s. They run on arrays, which is slower", text)
         return None
-    return programs
+    return task
 
 
 def _require_playable(env: FMUEnv) -> None:
@@ -69,27 +74,6 @@ def _require_playable(env: FMUEnv) -> None:
         )
 
 
-def _require_same(batch: FMUEnv, programs: tuple[Program, Program]) -> None:
-    with np.errstate(all="ignore"):
-        inputs = np.array(evaluate(programs[0], batch))
-        batch.inputs = inputs
-        done, truncated, reward = evaluate(programs[1], batch)
-        batch.done = done != 0.0
-        hooks = (batch._is_done(), batch._is_truncated(), batch._reward_policy())
-        expected_inputs = batch._get_inputs()
-    for value, expected in zip((done, truncated, reward), hooks, strict=True):
-        if not _equal(value, expected):
-            raise UntraceableError("the program gives other values than the hooks")
-    if not _equal(inputs, expected_inputs):
-        raise UntraceableError("the program gives other inputs than the hook")
-
-
-def _equal(value: FloatArray, expected: Any) -> bool:
-    """Whether values are the same to the last bit, NaN included."""
-    floats = np.asarray(expected, np.float64)
-    return np.array_equal(value, np.broadcast_to(floats, value.shape), equal_nan=True)
-
-
 class CompiledEngine(BatchEngine):
     """A ``BatchEngine`` in which the native pool does whole steps, hooks included.
 
@@ -101,59 +85,169 @@ class CompiledEngine(BatchEngine):
         env: The prototype, made with a native pool of N instances.
         num_envs: N.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
-        programs: From ``find_programs``.
+        task: From ``find_programs``.
     """
 
     def __init__(
-        self,
-        env: FMUEnv,
-        num_envs: int,
-        max_episode_steps: int | None,
-        programs: tuple[Program, Program],
+        self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
         self._shape = num_envs, env._output_count
         self._stream_version = -1
-        self._prepare(programs)
+        self._kept = np.zeros_like(self._pool.outputs)
+        shape = (num_envs, *(env.action_space.shape or ()))
+        dtype = env.action_space.dtype
+        self._actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
+        self._rows: dict[str, npt.NDArray[Any]] = {}
+        self._before: dict[str, npt.NDArray[Any]] = {}
+        self._prepare(task)
 
-    def _prepare(self, programs: tuple[Program, Program] | None) -> None:
+    def _prepare(self, task: TracedTask | None) -> None:
         """Give the pool everything it needs for a step, if it can draw the episodes."""
         plan, streams = self.env._plan, self._streams
-        self._programs = programs
+        self._task = task
         self._prepared = False
-        if programs is None or plan.num_uniform is None or plan.num_uniform != streams.num_draws:
+        if task is None or plan.num_uniform is None or plan.num_uniform != streams.num_draws:
             return
-        space: Any = self.env.action_space
-        self._may_overflow = not is_always_finite(programs[1], _REWARD)
+        if any(task.variables.get(name, np.float64) != np.float64 for name in plan.drawn_names):
+            return
         self._names = plan.drawn_names
-        rows = [plan.parameter_names.index(name) for name in self._names]
-        self._drawn_shape = len(rows), self._n
+        self._drawn_shape = len(self._names), self._n
+        self._keeps_actions = task.judgement.loads("load_action") or task.loads(
+            "load_previous_action"
+        )
+        self._make_rows(task)
+        self._layout = _Layout(task, self.env, self._n)
         self._play = self._pool.prepare_play(
             plan.model_variables,
-            programs,
-            (int(space.start), int(space.start + space.n - 1)),
+            (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
+            self._action_group(),
             self._start_values,
-            (streams.block, streams.used, *plan.limits, np.array(rows, np.int64)),
+            (streams.block, streams.used, *plan.limits, self._drawn_rows()),
             (self.env.step_count, self.ended, self._limit),
+            self._surroundings(task),
         )
         self._play_with_resets = self._pool.watched(self._play)
         self._prepared = True
 
+    def _make_rows(self, task: TracedTask) -> None:
+        """Make the arrays that stay in place: variables, and what hooks read of the step before."""
+        variables = self.env.variables
+        self._rows, self._before = {}, {}
+        for name, dtype in task.variables.items():
+            self._rows[name] = np.ascontiguousarray(self._row(name), dtype).copy()
+            self._before[name] = self._rows[name].copy()
+            variables[name] = self._rows[name]
+        self._show()
+
+    def _show(self) -> None:
+        """Let hooks on arrays read what the pool keeps."""
+        env = self.env
+        if self._keeps_actions:
+            env.action, env.previous_action = (np.moveaxis(a, 0, -1) for a in self._actions)
+        self._kept[: env._output_count] = env.previous_state
+        env.previous_state = self._kept[: env._output_count]
+
+    def _take_over(self) -> None:
+        """Take over what a step on arrays has left in arrays of its own."""
+        env = self.env
+        for name, row in self._rows.items():
+            row[...] = env.variables[name]
+            env.variables[name] = row
+        if self._keeps_actions:
+            for own, theirs in zip(self._actions, (env.action, env.previous_action), strict=True):
+                own[...] = np.moveaxis(theirs, -1, 0)
+        self._show()
+
+    def _find(self, row: Row) -> Any:
+        """The array of a row that a program loads or stores."""
+        kind, *rest = row
+        index: Any = rest[-1]
+        name: Any = rest[0]
+        match kind:
+            case "output":
+                return self._pool.outputs[index]
+            case "kept":
+                return self._kept[index]
+            case "input":
+                return self._pool.inputs[index]
+            case "parameter":
+                return self._parameters[name]
+            case "step_count":
+                return self.env.step_count
+        arrays = self._rows if kind == "variable" else self._before
+        return arrays[name].reshape(-1, self._n)[index]
+
+    def _drawn_rows(self) -> npt.NDArray[np.int64]:
+        """Where the draws go: start values by their number, then the episode variables."""
+        plan = self.env._plan
+        places = {name: index for index, name in enumerate(plan.parameter_names)}
+        floats = [name for name, row in self._rows.items() if row.dtype == np.float64]
+        places |= {name: len(places) + index for index, name in enumerate(floats)}
+        return np.array([places[name] for name in plan.drawn_names], np.int64)
+
+    def _action_group(self) -> dict[str, Any]:
+        """How the pool checks and keeps actions."""
+        env, dtype = self.env, self._actions[0].dtype
+        space: Any = env.action_space
+        is_discrete = isinstance(space, spaces.Discrete)
+        check = 1 if is_discrete else 2 if dtype == np.float64 else 3 if dtype == np.float32 else 0
+        low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
+        flat = [actions.reshape(-1) for actions in self._actions]
+        return {
+            "shape": self._actions[0].shape[1:],
+            "letter": {"f": "d", "i": "q", "u": "Q", "b": "?"}[dtype.kind],
+            "size": dtype.itemsize,
+            "check": check,
+            "lowest": low,
+            "highest": high,
+            "current": flat[0] if self._keeps_actions else None,
+            "previous": flat[1] if self._keeps_actions else None,
+            "none": np.array(env._no_action, dtype).reshape(-1),
+        }
+
+    def _surroundings(self, task: TracedTask) -> dict[str, Any]:
+        """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
+        env, plan = self.env, self.env._plan
+        names = plan.parameter_names
+        flat = {name: row.reshape(-1, self._n) for name, row in self._rows.items()}
+        before = {name: row.reshape(-1, self._n) for name, row in self._before.items()}
+        constants = plan.constant_variables
+        keeps = not task.judgement.is_always_finite or not env._pool_observes
+        return {
+            "kept": self._kept,
+            "keeps_always": keeps or task.judgement.loads("kept") or env._has_info,
+            "copies": tuple(
+                pair for name in flat for pair in zip(flat[name], before[name], strict=True)
+            ),
+            "input_starts": tuple(
+                (names.index(name), start) if name in names else (-1, start)
+                for name, start in env._start_inputs
+            ),
+            "variables": tuple(row[0] for row in flat.values() if row.dtype == np.float64),
+            "variable_starts": tuple(
+                (row, np.array(value, row.dtype).tobytes())
+                for name, start in constants.items()
+                for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
+            ),
+        }
+
     def set_parameter(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_parameter``."""
         super().set_parameter(name, values)
-        self._prepare(self._programs)
+        self._prepare(self._task)
 
     def _assign(self, attributes: Mapping[str, tuple[Any, bool]]) -> None:
         """Compile the hooks anew, because the programs contain the old values of the attributes."""
         super()._assign(attributes)
+        task: TracedTask | None = None
         try:
-            programs = trace_hooks(self.env)
-            _require_same(self._copy_for_hooks(), programs)
+            task = trace_hooks(self.env)
+            require_same(self._copy_for_hooks(), task)
         except Exception as reason:  # as in find_programs
-            logger.debug("the hooks cannot be compiled any more: %s", reason)
-            programs = None
-        self._prepare(programs)
+            logger.info("the hooks cannot be compiled any more: %s", reason)
+            task = None
+        self._prepare(task)
 
     def _copy_for_hooks(self) -> FMUEnv:
         batch = light_copy(self.env)
@@ -170,48 +264,133 @@ class CompiledEngine(BatchEngine):
             self._stream_version = self._streams.version
         return result
 
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """See ``Engine.call``."""
+        returned = super().call(name, indices, arguments, keywords)
+        if self._prepared:
+            self._take_over()
+        return returned
+
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         if self._any_foreign or not self._prepared:
-            return super().step(actions, resetting)
+            return self._step_on_arrays(actions, resetting)
         self._longest = self._limit  # this path does not count steps
-        if self._may_overflow:
-            self._outputs_before = self._pool.outputs.copy()
-        observations = np.empty(self._shape, _FLOAT32)
+        layout = self._layout
+        seen: Any = layout.new_arrays() if layout.has_own else np.empty(self._shape, _FLOAT32)
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
-        arrays = observations, rewards, terminated, truncated
+        judged = rewards, terminated, truncated
         drawn = np.empty(self._drawn_shape)
         play = self._play if resetting is None else self._play_with_resets
         try:
-            troubled, ended = play(actions, *arrays, drawn)
+            troubled, ended = play(actions, seen, *judged, drawn)
         except (TypeError, ValueError, BufferError):
-            actions = np.require(self._checked(actions), np.int64, ["C", "A"])
-            troubled, ended = play(actions, *arrays, drawn)
+            troubled, ended = play(self._flat(actions), seen, *judged, drawn)
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
+        observations = seen
+        if layout.has_own:
+            observations, infos = layout.divided(seen, self._n)
         if resetting is not None:
             told = LateDict.of(_told, self._names, drawn, resetting)  # rarely read
-            infos = {"drawn": told, "_drawn": resetting}
-        result: StepResult = _make_tuple(StepResult, (*arrays, infos))
-        if troubled or (self._may_overflow and not_finite(rewards) is not None):
-            self._mend(actions, result, resetting)
+            infos |= {"drawn": told, "_drawn": resetting}
+        result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
+        if troubled:
+            self._mend(result, resetting)
         return result
 
-    def _mend(self, actions: Any, result: StepResult, resetting: MaskArray | None) -> None:
-        """Handle FMUs that failed or asked to stop: they are rare, so numpy is fast enough."""
-        statuses = self._pool.statuses
+    def _flat(self, actions: Any) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, environments first.
+
+        Raises:
+            ConfigError: If they do not fit.
+        """
+        space: Any = self.env.action_space
+        with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
+            array = checked_actions(space, self._n, actions).astype(space.dtype, copy=False)
+        return np.require(array, requirements=["C", "A"])
+
+    def _step_on_arrays(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        result = super().step(actions, resetting)
+        if self._prepared:
+            self._take_over()
+        return result
+
+    def _mend(self, result: StepResult, resetting: MaskArray | None) -> None:
+        """Handle failures and numbers that are not finite: rare, so numpy is fast enough."""
+        env, statuses = self.env, self._pool.statuses
         if resetting is not None:
             self._require_started(np.flatnonzero(resetting), statuses)
-        self._require_finite_inputs(resetting)
-        stopped = self._stopped(statuses)
-        if stopped.any():
-            result.terminated[stopped] = True
-            self.env.action, self.env.done = self._checked(actions), result.terminated
-            rewards = results.rewards(self.env._reward_policy(), self._n)
-            result.rewards[stopped] = rewards[stopped]
-        self._handle_faults(result, statuses, True)
+            self._require_finite_start(result.observations, resetting)
+        self._require_possible_inputs(resetting)
+        env.done = result.terminated.copy()
+        self._outputs_before, self._variables_before = self._kept, self._before
+        env._in_hooks = True
+        try:
+            self._handle_faults(result, statuses, True)
+        finally:
+            env._in_hooks = False
         self.note_ends(result.terminated, result.truncated)
+
+    def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
+        """Refuse inputs that are not finite, which they also are outside of their type's range."""
+        inputs = self._pool.inputs
+        if not self.env._real_inputs and not np.isfinite(inputs).all():
+            wanted = np.array(inputs)
+            results.write_inputs(self.env._get_inputs(), wanted)
+            for index in self._stepping(resetting):
+                fmu_spaces.to_input_types(self.env._interface.inputs, wanted[:, index])
+        self._require_finite_inputs(resetting)
+
+
+class _Layout:
+    """The arrays that a program stores, and the observations and infos that they make.
+
+    Args:
+        task: The programs.
+        env: The prototype.
+        num_envs: N.
+    """
+
+    def __init__(self, task: TracedTask, env: FMUEnv, num_envs: int) -> None:
+        self.has_own = not env._pool_observes or bool(task.seen)
+        self._observes = env._pool_observes
+        self._shapes = [((num_envs, *array.shape), array.dtype) for array in task.seen]
+        self._paths = [array.path for array in task.seen]
+        self._is_plain = self._paths == [("observation",)]
+
+    def new_arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """New arrays for a step."""
+        return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
+
+    def divided(self, arrays: Any, num_envs: int) -> tuple[Any, dict[str, Any]]:
+        """The observations and the infos."""
+        if self._is_plain:
+            return arrays[0], {}
+        tree: dict[str, Any] = {"observation": {}, "info": {}}
+        for path, array in zip(self._paths, arrays, strict=True):
+            *parents, name = path
+            place = tree
+            for parent in parents:
+                place = place.setdefault(parent, {})
+            place[name] = array
+        return tree["observation"], _masked(tree["info"], num_envs)
+
+
+def _masked(infos: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Infos of all environments, with their masks."""
+    values = {
+        name: _masked(value, count) if type(value) is dict else value
+        for name, value in infos.items()
+    }
+    return values | {f"_{name}": np.ones(count, np.bool_) for name in values}
 
 
 def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
