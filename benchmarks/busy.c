@@ -4,8 +4,9 @@
  *
  *     mean * exp(sigma * z - sigma^2 / 2)
  *
- * where z is standard normal, from a hash of "seed" and the number of the step. "busy" is the sum in
- * us of the times that steps have taken. It uses the wall clock, since reading a clock of processor
+ * where z is standard normal, from a hash of "seed" and the number of the step. With the probability
+ * "rare", a step takes "rare_time" us instead. "busy" is the sum in us of the times that steps have
+ * taken. It uses the wall clock, since reading a clock of processor
  * time costs up to a microsecond. If more than LAPSE us have passed since the last reading, another
  * process had the processor, and this time does not count. The value references are those of the
  * enumeration. */
@@ -19,7 +20,7 @@
 #include <string.h>
 #include <time.h>
 
-enum { INPUT, BUSY, MEAN, SIGMA, SEED, COUNT };
+enum { INPUT, BUSY, MEAN, SIGMA, SEED, RARE, RARE_TIME, COUNT };
 
 typedef struct {
     double values[COUNT];
@@ -39,9 +40,13 @@ static double uniform(uint64_t x) {
     return ((double)(mix(x) >> 11) + 0.5) / 9007199254740992.0;
 }
 
+static uint64_t hash(const Busy *me) {
+    return mix((uint64_t)(me->values[SEED] * 4294967296.0)) + 2 * me->steps;
+}
+
 /* Standard normal, by Box and Muller. */
 static double normal(const Busy *me) {
-    const uint64_t x = mix((uint64_t)(me->values[SEED] * 4294967296.0)) + 2 * me->steps;
+    const uint64_t x = hash(me);
     return sqrt(-2.0 * log(uniform(x))) * cos(6.283185307179586 * uniform(x + 1));
 }
 
@@ -100,6 +105,9 @@ int fmi2DoStep(Busy *me, double time, double step_size, int no_set_state) {
     (void)time, (void)step_size, (void)no_set_state;
     if (sigma > 0) {
         us *= exp(sigma * normal(me) - sigma * sigma / 2);
+    }
+    if (uniform(hash(me)) < me->values[RARE]) {
+        us = me->values[RARE_TIME];
     }
     me->steps++;
     me->values[BUSY] += be_busy(us);

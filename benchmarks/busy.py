@@ -1,52 +1,16 @@
-"""An environment over an FMU with long steps, which is compiled here from ``busy.c``."""
+"""An environment over an FMU with long steps."""
 
 from __future__ import annotations
 
-import zipfile
+import logging
 from pathlib import Path
 from typing import Any
 
-import fmpy
-from c_limit import compile_c
 from gymnasium import spaces
 
 import fmugym
 
-__all__ = ["BusyEnv", "build"]
-
-NAMES = ("u:input", "busy:output", "mean:parameter", "sigma:parameter", "seed:parameter")
-"""Variables in the order of their value references."""
-
-
-def build(folder: Path) -> Path:
-    """Compile and pack the FMU.
-
-    Raises:
-        MissingError: See ``compile_c``.
-    """
-    library = folder / f"Busy{fmpy.sharedLibraryExtension}"
-    compile_c(Path(__file__).with_suffix(".c"), library, "-shared", "-fPIC", "-lm")
-    path = folder / "Busy.fmu"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", _model_description())
-        archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
-    return path
-
-
-def _model_description() -> str:
-    variables = "".join(_variable(index, *row.split(":")) for index, row in enumerate(NAMES))
-    return (
-        '<fmiModelDescription fmiVersion="2.0" modelName="Busy" guid="{busy}">'
-        '<CoSimulation modelIdentifier="Busy" canHandleVariableCommunicationStepSize="true"/>'
-        f"<ModelVariables>{variables}</ModelVariables><ModelStructure/></fmiModelDescription>"
-    )
-
-
-def _variable(index: int, name: str, causality: str) -> str:
-    start = "" if causality == "output" else ' start="0"'
-    variability = "fixed" if causality == "parameter" else "continuous"
-    head = f'name="{name}" valueReference="{index}" causality="{causality}"'
-    return f'<ScalarVariable {head} variability="{variability}"><Real{start}/></ScalarVariable>'
+__all__ = ["BusyEnv"]
 
 
 class BusyEnv(fmugym.FMI2CSEnv):
@@ -56,17 +20,28 @@ class BusyEnv(fmugym.FMI2CSEnv):
         path: The FMU.
         mean: Mean time of a step in us.
         sigma: Standard deviation of the logarithm of this time; 0 for a constant time.
+        rare: The probability of a step of another time.
+        rare_time: This time in us.
     """
 
-    def __init__(self, path: Path, mean: float, sigma: float) -> None:
+    def __init__(
+        self, path: Path, mean: float, sigma: float = 0.0, rare: float = 0.0, rare_time: float = 0.0
+    ) -> None:
         seed = fmugym.Uniform(0.0, 1.0)
         config = {
             "model_input_names": "u",
             "model_output_names": "busy",
-            "model_parameters": {"mean": mean, "sigma": sigma, "seed": seed},
+            "model_parameters": {
+                "mean": mean,
+                "sigma": sigma,
+                "seed": seed,
+                "rare": rare,
+                "rare_time": rare_time,
+            },
             "time_step": 1.0,
         }
-        super().__init__(path, config)
+        # Its outputs are measured times: that they differ each time needs no warning.
+        super().__init__(path, config, logging.ERROR)
 
     def _get_action_space(self) -> spaces.Space[Any]:
         return spaces.Discrete(2)

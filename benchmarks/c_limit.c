@@ -1,13 +1,21 @@
-/* The limit: a bare C loop over the functions of an FMI 2.0 cart-pole, and nothing else.
+/* The limit: a bare C loop over the functions of an FMU of FMI 2.0, and nothing else.
  *
- * Each thread steps its own instances and never waits for another. For each instance, it sets an
- * input, does a step, gets four outputs and writes them as float32. If the pole has fallen, it resets
- * the instance and initializes it with new start values. c_limit.py compiles the program and passes
+ * Each thread steps its own instances and never waits for another. For each instance, it sets the
+ * inputs, does a step, gets the outputs and writes them as float32. If an output is beyond its limit,
+ * it resets the instance and initializes it with new start values. c_limit.py compiles the program
+ * and passes
  *
- *     library token instances threads seconds step input output*4 start*4 r:parameter=value...
+ *     library token instances threads seconds step item...
  *
- * where inputs, outputs and parameters are value references. It prints steps per second, by the wall
- * clock and by processor time. */
+ * where an item is a kind, a value reference and a number:
+ *
+ *     u:reference=magnitude  an input, which gets this number with a random sign
+ *     y:reference=limit      an output, and the largest absolute value before a reset
+ *     s:reference=width      a start value, drawn from an interval of this width around 0
+ *     r:reference=value      a Real parameter
+ *     i:reference=value      an Integer or Enumeration parameter
+ *
+ * It prints steps per second, by the wall clock and by processor time. */
 
 #define _GNU_SOURCE
 
@@ -21,7 +29,7 @@
 #include <string.h>
 #include <time.h>
 
-enum { OUTPUTS = 4, MOST_PARAMETERS = 16 };
+enum { MOST_ITEMS = 64 };
 
 typedef struct {
     void (*logger)(void *, const char *, int, const char *, const char *, ...);
@@ -48,11 +56,14 @@ static GetReal *get_real;
 static SetReal *set_real;
 static SetInteger *set_integer;
 
-static uint32_t input, outputs[OUTPUTS], starts[OUTPUTS];
-static uint32_t reals[MOST_PARAMETERS], integers[MOST_PARAMETERS];
-static double real_values[MOST_PARAMETERS];
-static int integer_values[MOST_PARAMETERS];
-static size_t number_of_reals, number_of_integers;
+/* Variables of one kind. */
+typedef struct {
+    size_t count;
+    uint32_t references[MOST_ITEMS];
+    double numbers[MOST_ITEMS];
+} Items;
+
+static Items inputs, outputs, starts, reals, integers;
 static double step_size, seconds;
 
 typedef struct {
@@ -88,15 +99,21 @@ static uint64_t draw(Part *part) {
 
 static void initialize(Part *part, size_t index) {
     void *component = part->components[index];
-    double values[OUTPUTS];
+    double values[MOST_ITEMS];
+    int whole[MOST_ITEMS];
 
-    for (size_t i = 0; i < OUTPUTS; i++) {
-        values[i] = ((double)(draw(part) >> 11) / 9007199254740992.0 - 0.5) * 0.1;
+    for (size_t i = 0; i < starts.count; i++) {
+        values[i] = ((double)(draw(part) >> 11) / 9007199254740992.0 - 0.5) * starts.numbers[i];
+    }
+    for (size_t i = 0; i < integers.count; i++) {
+        whole[i] = (int)integers.numbers[i];
     }
     check(set_up(component, 0, 0.0, 0.0, 0, 0.0), "setup");
-    check(set_real(component, reals, number_of_reals, real_values), "parameters");
-    check(set_integer(component, integers, number_of_integers, integer_values), "integers");
-    check(set_real(component, starts, OUTPUTS, values), "start values");
+    check(set_real(component, reals.references, reals.count, reals.numbers), "parameters");
+    if (integers.count > 0) {
+        check(set_integer(component, integers.references, integers.count, whole), "integers");
+    }
+    check(set_real(component, starts.references, starts.count, values), "start values");
     check(enter(component), "enter");
     check(leave(component), "exit");
     part->steps[index] = 0;
@@ -104,16 +121,21 @@ static void initialize(Part *part, size_t index) {
 
 static void step(Part *part, size_t index) {
     void *component = part->components[index];
-    const double force = draw(part) & 1 ? 10.0 : -10.0;
-    double values[OUTPUTS];
+    const double sign = draw(part) & 1 ? 1.0 : -1.0;
+    double given[MOST_ITEMS], values[MOST_ITEMS];
+    int is_beyond = 0;
 
-    check(set_real(component, &input, 1, &force), "input");
-    check(do_step(component, (double)part->steps[index]++ * step_size, step_size, 1), "step");
-    check(get_real(component, outputs, OUTPUTS, values), "outputs");
-    for (size_t i = 0; i < OUTPUTS; i++) {
-        part->observations[index * OUTPUTS + i] = (float)values[i];
+    for (size_t i = 0; i < inputs.count; i++) {
+        given[i] = sign * inputs.numbers[i];
     }
-    if (fabs(values[0]) > 2.4 || fabs(values[2]) > 0.20943951023931953) {
+    check(set_real(component, inputs.references, inputs.count, given), "inputs");
+    check(do_step(component, (double)part->steps[index]++ * step_size, step_size, 1), "step");
+    check(get_real(component, outputs.references, outputs.count, values), "outputs");
+    for (size_t i = 0; i < outputs.count; i++) {
+        part->observations[index * outputs.count + i] = (float)values[i];
+        is_beyond |= fabs(values[i]) > outputs.numbers[i];
+    }
+    if (is_beyond) {
         check(reset(component), "reset");
         initialize(part, index);
     }
@@ -165,20 +187,35 @@ static void load(const char *path) {
     do_step = (DoStep *)find(library, "fmi2DoStep");
     get_real = (GetReal *)find(library, "fmi2GetReal");
     set_real = (SetReal *)find(library, "fmi2SetReal");
-    set_integer = (SetInteger *)find(library, "fmi2SetInteger");
+    if (integers.count > 0) {
+        set_integer = (SetInteger *)find(library, "fmi2SetInteger");
+    }
 }
 
-static void take_parameter(const char *text) {
-    const uint32_t reference = (uint32_t)strtoul(text + 2, NULL, 10);
-    const double value = atof(strchr(text, '=') + 1);
-
-    if (text[0] == 'r') {
-        reals[number_of_reals] = reference;
-        real_values[number_of_reals++] = value;
-    } else {
-        integers[number_of_integers] = reference;
-        integer_values[number_of_integers++] = (int)value;
+static Items *items_of(char kind) {
+    switch (kind) {
+    case 'u':
+        return &inputs;
+    case 'y':
+        return &outputs;
+    case 's':
+        return &starts;
+    case 'r':
+        return &reals;
+    default:
+        return &integers;
     }
+}
+
+static void take_item(const char *text) {
+    Items *items = items_of(text[0]);
+
+    if (items->count == MOST_ITEMS) {
+        fprintf(stderr, "more than %d variables of one kind\n", MOST_ITEMS);
+        exit(1);
+    }
+    items->references[items->count] = (uint32_t)strtoul(text + 2, NULL, 10);
+    items->numbers[items->count++] = atof(strchr(text, '=') + 1);
 }
 
 static void prepare(Part *part, const char *token, size_t count, size_t seed) {
@@ -186,7 +223,7 @@ static void prepare(Part *part, const char *token, size_t count, size_t seed) {
     part->random = 88172645463325252u + 1000003u * seed;
     part->components = calloc(count, sizeof *part->components);
     part->steps = calloc(count, sizeof *part->steps);
-    part->observations = calloc(count * OUTPUTS, sizeof *part->observations);
+    part->observations = calloc(count * outputs.count + 1, sizeof *part->observations);
     for (size_t i = 0; i < count; i++) {
         part->components[i] = instantiate("c", 1, token, "file:///", &callbacks, 0, 0);
         initialize(part, i);
@@ -194,20 +231,15 @@ static void prepare(Part *part, const char *token, size_t count, size_t seed) {
 }
 
 int main(int argc, char *argv[]) {
-    if (argc < 16) {
+    if (argc < 7) {
         fprintf(stderr, "see c_limit.py\n");
         return 1;
     }
     const size_t count = (size_t)atol(argv[3]), threads = (size_t)atol(argv[4]);
     seconds = atof(argv[5]);
     step_size = atof(argv[6]);
-    input = (uint32_t)atol(argv[7]);
-    for (int i = 0; i < OUTPUTS; i++) {
-        outputs[i] = (uint32_t)atol(argv[8 + i]);
-        starts[i] = (uint32_t)atol(argv[8 + OUTPUTS + i]);
-    }
-    for (int i = 8 + 2 * OUTPUTS; i < argc && i < 8 + 2 * OUTPUTS + MOST_PARAMETERS; i++) {
-        take_parameter(argv[i]);
+    for (int i = 7; i < argc; i++) {
+        take_item(argv[i]);
     }
     load(argv[1]);
     Part *parts = calloc(threads, sizeof *parts);

@@ -1,8 +1,9 @@
-"""The upper limit for all configurations: a C program that only steps the cart-pole FMU.
+"""The upper limit for all configurations: a C program that only steps an FMU.
 
     python benchmarks/c_limit.py --num-envs 1024 --threads 1
 
-It needs a C compiler: ``cc``, ``gcc`` or ``clang``, or the package ``ziglang``.
+Called like this, it steps the cart-pole. It needs a C compiler: ``cc``, ``gcc`` or ``clang``, or
+the package ``ziglang``.
 """
 
 from __future__ import annotations
@@ -23,20 +24,44 @@ from measure import MissingError
 
 import fmugym
 
-__all__ = ["Rates", "build", "compile_c", "measure"]
+__all__ = ["Loop", "Rates", "build", "build_folder", "cart_pole", "compile_c", "measure"]
 
 SOURCE = Path(__file__).with_suffix(".c")
-TIME_STEP = 0.02
-REALS = {
-    "m_cart": 1.0,
-    "m_pole": 0.1,
-    "pole_length": 1.0,
-    "g": 9.8,
-    "max_step": 1.0,
-    "theta_0": math.pi / 2,
-}
-INTEGERS = {"pole_type": 2, "solver": 1}
-"""Gymnasium's cart-pole: a uniform rod, explicit Euler."""
+
+
+class Loop(NamedTuple):
+    """What the program does with an FMU of FMI 2.0; each dict is by variable name.
+
+    Attributes:
+        fmu: The FMU; its folder lives as long as the object.
+        time_step: The communication step size in s.
+        inputs: The magnitudes of the inputs; their sign is random.
+        outputs: The largest absolute values of the outputs; a larger one leads to a reset.
+        starts: The widths of the intervals around 0 from which start values are drawn.
+        parameters: The fixed parameters; an int is for an Integer or an Enumeration.
+    """
+
+    fmu: fmugym.FMU
+    time_step: float
+    inputs: dict[str, float]
+    outputs: dict[str, float]
+    starts: dict[str, float]
+    parameters: dict[str, float]
+
+    def items(self) -> list[str]:
+        """The variables as the program takes them."""
+        named: dict[str, dict[str, float]] = {
+            "u": self.inputs,
+            "y": self.outputs,
+            "s": self.starts,
+            "r": {k: v for k, v in self.parameters.items() if isinstance(v, float)},
+            "i": {k: v for k, v in self.parameters.items() if isinstance(v, int)},
+        }
+        return [
+            f"{kind}:{self.fmu.variable(name).value_reference}={value!r}"
+            for kind, values in named.items()
+            for name, value in values.items()
+        ]
 
 
 class Rates(NamedTuple):
@@ -74,37 +99,63 @@ def _compiler() -> list[str]:
 
 
 @functools.cache
-def build() -> tuple[Path, fmugym.FMU]:
-    """Compile the program once. The FMU is kept, because its folder lives as long as it does.
+def build_folder() -> Path:
+    """A folder for what is compiled, which is deleted when Python ends."""
+    folder = Path(tempfile.mkdtemp(prefix="fmugym-benchmarks-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+@functools.cache
+def build() -> Path:
+    """Compile the program once.
 
     Raises:
         MissingError: See ``compile_c``.
     """
-    folder = Path(tempfile.mkdtemp(prefix="c-limit-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    program = folder / "c_limit"
+    program = build_folder() / "c_limit"
     compile_c(SOURCE, program, "-lm", "-ldl", "-lpthread")
-    fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
-    fmu.extract()
-    return program, fmu
+    return program
 
 
-def measure(num_envs: int, threads: int = 1, seconds: float = 1.0) -> Rates:
+@functools.cache
+def cart_pole() -> Loop:
+    """Gymnasium's cart-pole: a uniform rod, explicit Euler."""
+    return Loop(
+        fmugym.FMU(fmugym.bundled_fmu("CartPole")),
+        time_step=0.02,
+        inputs={"f": 10.0},
+        outputs={"x": 2.4, "x_dot": math.inf, "phi": math.radians(12.0), "phi_dot": math.inf},
+        starts={"x_0": 0.1, "x_dot_0": 0.1, "phi_0": 0.1, "phi_dot_0": 0.1},
+        parameters={
+            "m_cart": 1.0,
+            "m_pole": 0.1,
+            "pole_length": 1.0,
+            "g": 9.8,
+            "max_step": 1.0,
+            "theta_0": math.pi / 2,
+            "pole_type": 2,
+            "solver": 1,
+        },
+    )
+
+
+def measure(loop: Loop, num_envs: int, threads: int = 1, seconds: float = 1.0) -> Rates:
     """Run the program.
 
     Args:
+        loop: What it steps.
         num_envs: Number of instances of all threads together.
         threads: Number of threads; each steps its share of the instances without waiting.
         seconds: Length of the run.
+
+    Raises:
+        MissingError: See ``compile_c``.
     """
-    program, fmu = build()
-    names = ["f", "x", "x_dot", "phi", "phi_dot", "x_0", "x_dot_0", "phi_0", "phi_dot_0"]
-    references = [str(fmu.variable(name).value_reference) for name in names]
-    parameters = [f"r:{fmu.variable(n).value_reference}={v!r}" for n, v in REALS.items()]
-    parameters += [f"i:{fmu.variable(n).value_reference}={v}" for n, v in INTEGERS.items()]
-    command = [str(program), str(fmu.extract() / fmu.library), fmu.description.instantiation_token]
-    command += [str(num_envs), str(threads), str(seconds), str(TIME_STEP), *references]
-    result = subprocess.run([*command, *parameters], check=True, capture_output=True, text=True)
+    fmu = loop.fmu
+    command = [str(build()), str(fmu.extract() / fmu.library), fmu.description.instantiation_token]
+    command += [str(num_envs), str(threads), str(seconds), str(loop.time_step), *loop.items()]
+    result = subprocess.run(command, check=True, capture_output=True, text=True)
     return Rates(*map(float, result.stdout.split()))
 
 
@@ -115,7 +166,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=1.0)
     arguments = parser.parse_args()
-    rates = measure(arguments.num_envs, arguments.threads, arguments.seconds)
+    rates = measure(cart_pole(), arguments.num_envs, arguments.threads, arguments.seconds)
     print(f"{rates.wall / 1e6:.2f} M steps/s, {rates.cpu / 1e6:.2f} M steps/CPU-s")
 
 

@@ -198,7 +198,7 @@ def c_limit_run(num_envs: int, threads: int) -> Run:
     c_limit.build()
 
     def run(seconds: float) -> Sample:
-        rates = c_limit.measure(num_envs, threads, seconds)
+        rates = c_limit.measure(c_limit.cart_pole(), num_envs, threads, seconds)
         return Sample(rates.wall * seconds, seconds, rates.wall * seconds / rates.cpu)
 
     return run

@@ -28,6 +28,7 @@ import loaded
 import memory
 import reset
 import single
+import tasks
 import vector
 from measure import Effort, processors
 from tables import Table
@@ -35,6 +36,7 @@ from tables import Table
 SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "single": single.tables,
     "vector": vector.tables,
+    "tasks": tasks.tables,
     "reset": reset.tables,
     "heavy": heavy.tables,
     "isolation": isolation.tables,

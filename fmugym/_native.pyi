@@ -88,6 +88,7 @@ class Library(TypedDict):
     private: bool
     logging: bool
     states: bool
+    categories: tuple[bytes, ...]
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -142,9 +143,8 @@ class Pool:
 
     A call that is given the very array ``inputs`` or ``observations`` of the pool uses it without
     a look at its buffer. Any method may be called from any thread at any time; calls take turns.
-    Afterwards the messages of the FMU go to ``callback``. If that raises an ``Exception``, this is
-    reported as unraisable; anything else, such as ``KeyboardInterrupt``, comes out of the method,
-    whose work is done by then.
+    Afterwards the messages of the FMU go to ``callback``. What that raises comes out of the method,
+    whose work is done by then. The next call reports the other messages.
 
     Raises:
         OSError: If the FMU cannot be loaded or instantiated.

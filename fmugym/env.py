@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from math import floor, hypot, isfinite, nan
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Never
+from typing import Any, ClassVar, Final, Never, cast
 
 import numpy as np
 from gymnasium import logger as gymnasium_logger
@@ -38,8 +38,9 @@ from fmugym.task.actions import (
     no_action,
 )
 from fmugym.task.episode import Episode, EpisodePlan
+from fmugym.task.hooks import OwnHooks
 from fmugym.task.interface import checked, output_variable, resolve, start_variable
-from fmugym.task.opening import open_fmu, open_pool
+from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.results import (
     FLOAT32_LIMIT,
@@ -121,18 +122,22 @@ class FMUEnv(Pictured):
     """The keys that ``reset`` takes in its options."""
 
     _values: Any
+    _number: int
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
-    _per_env_attributes: Mapping[str, Any] = MappingProxyType({})
-    """In a vector environment: attributes that hold one value for each environment."""
-
     _has_info: bool
+    _pool_tells = False
     _pool: Pool | None = None
+    _is_closed = False
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUEnv:
-        """Keep the arguments, because an environment pickles as its class and arguments."""
+        """Keep the arguments, because an environment pickles as its class and arguments.
+
+        The number tells a vector environment which environments are new.
+        """
         env = super().__new__(cls)
         env._constructor_arguments = args, kwargs
+        env._number = next(env_numbers)
         return env
 
     def __init__(
@@ -161,14 +166,19 @@ class FMUEnv(Pictured):
         self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
-        self._pool = open_pool(
+        self._opening = PoolOpening(
             self.fmu, self._spec, self.config, self._plan, self.logger, backend, isolation
         )
-        self._step_pool = self._pool.step_own
-        self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
-        self._observation_row = self._pool.observations[0]
-        self._halt = self._pool.halt
-        self._pool_tells = bool(self._pool.info())
+        if not pools_are_deferred():
+            self._use(self._opening.open())
+
+    def _use(self, pool: Pool) -> None:
+        """Let a pool of one step this environment, or one of N if a vector environment does it."""
+        self._pool = pool
+        self._step_pool, self._halt = pool.step_own, pool.halt
+        self._input_row, self._output_row = pool.inputs[:, 0], pool.outputs[:, 0]
+        self._observation_row = pool.observations[0]
+        self._pool_tells = bool(pool.info())
         self._has_info = self._has_info or self._pool_tells
 
     @property
@@ -237,18 +247,17 @@ class FMUEnv(Pictured):
                     "expected a gymnasium.spaces.Space"
                 )
         self._no_action = no_action(self.action_space)
-        # A subclass with its own step may take other actions.
-        is_own = type(self).step is not FMUEnv.step
-        self._elements = None if is_own else elements_of(self.action_space)
 
     def _prepare_hooks(self) -> None:
         """Find out which hooks the class overrides, and prepare the defaults of the others."""
-        interface, cls = self._interface, type(self)
-        derived = cls._get_action_space is FMUEnv._get_action_space
+        interface, space = self._interface, self.observation_space
+        self._own = own = OwnHooks.of(self, FMUEnv)
+        # A subclass with its own step may take other actions.
+        self._elements = None if own.step else elements_of(self.action_space)
+        derived = not own.get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
         self._action_values = values
-        default = cls._get_observation is FMUEnv._get_observation
-        space = self.observation_space
+        default = not own.get_observation
         make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
         self._observe = make(interface, space)
         self._is_finite = finiteness_of(space)
@@ -256,10 +265,7 @@ class FMUEnv(Pictured):
         self._pool_observes = (
             default and isinstance(space, spaces.Box) and space.dtype == np.float32
         )
-        self._is_goal_task = cls._goal_reward is not FMUEnv._goal_reward
-        self._has_update = cls._update is not FMUEnv._update
-        self._has_truncation = cls._is_truncated is not FMUEnv._is_truncated
-        self._has_info = cls._get_info is not FMUEnv._get_info
+        self._has_info = own.get_info or self._pool_tells
         self._real_inputs = all(v.kind == "real" for v in interface.inputs)
         self._takes_one_real = [v.kind for v in interface.inputs] == ["real"]
 
@@ -288,6 +294,8 @@ class FMUEnv(Pictured):
                 or the environment is closed.
         """
         pool = self._open_pool("reset")
+        if not self._was_reset:
+            self._prepare_hooks()  # the constructor of the class may have set some as attributes
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
         episode = plan.draw(self.np_random)
@@ -416,8 +424,12 @@ class FMUEnv(Pictured):
 
     def _open_pool(self, method: str) -> Pool:
         if self._pool is None:
-            raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-        return self._pool
+            if self._is_closed:
+                raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
+            self._opening = self._opening.apart()
+            self.fmu = self._opening.fmu
+            self._use(self._opening.open())
+        return cast(Pool, self._pool)
 
     def _take_action(self, action: Any) -> None:
         elements = self._elements
@@ -442,7 +454,7 @@ class FMUEnv(Pictured):
         """Whether ``_get_inputs`` failed because of an action outside of the action space."""
         if isinstance(error, FMUGymError) or not isinstance(error, Exception):
             return False
-        if type(self).step is not FMUEnv.step:  # then its actions may be others
+        if self._own.step:  # then its actions may be others
             return False
         return is_misfit(action, self.action_space, error)
 
@@ -473,16 +485,16 @@ class FMUEnv(Pictured):
         if status > _WARNING and not stopped:
             return self._fault(pool.failure(0))
         self.after_end = self._ended
-        before = self._values, self.variables.copy() if self._has_update else {}
+        before = self._values, self.variables.copy() if self._own.update else {}
         self._set_values()
-        if self._has_update:
+        if self._own.update:
             self._update()
         done = self._is_done()
         if done is not True and done is not False:
             done = as_flag("_is_done", done)
         self.done = terminated = stopped or done
         truncated = self.step_count >= self._step_limit
-        if self._has_truncation:
+        if self._own.is_truncated:
             truncated = as_flag("_is_truncated", self._is_truncated()) or truncated
         reward = self._reward_policy()
         if type(reward) is not float:
@@ -571,7 +583,7 @@ class FMUEnv(Pictured):
         Raises:
             AttributeError: If this is no goal task, as Stable-Baselines3 expects it.
         """
-        if not self._is_goal_task:
+        if not self._own.goal_reward:
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
         return lambda achieved, desired, info: self._goal_reward(achieved, desired)
 
@@ -605,13 +617,17 @@ class FMUEnv(Pictured):
 
     def close(self) -> None:
         """Free the FMU and its temporary folder; more than one call is fine."""
-        if self._pool is not None:
-            self._pool.close()
-            self._pool = None
+        self._is_closed = True
+        self._close_pool()
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
         super().close()
+
+    def _close_pool(self) -> None:
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
         return _rebuild, (type(self), *self._constructor_arguments)

@@ -80,13 +80,23 @@ static bool load_libraries(Pool *pool, char *error, size_t size) {
     return loaded;
 }
 
+/* Appends what the FMU said. If that is too long, only its end is kept. */
+static void explain_refusal(Pool *pool, size_t index, char *error, size_t size) {
+    char *said = log_said(&pool->log, index);
+    const size_t length = (size_t)snprintf(error, size, "it refused to be instantiated" LOG_SAID);
+    const size_t said_length = said == NULL ? 0 : strlen(said);
+    const size_t room = size - 1 - length;
+
+    if (said != NULL) {
+        strcpy(error + length, said + (said_length > room ? said_length - room : 0));
+    }
+    free(said);
+}
+
 static bool build_all(Pool *pool, char *error, size_t size) {
     for (size_t i = 0; i < pool->settings.count; i++) {
         if (!instance_build(pool, &pool->instances[i])) {
-            char *said = log_said(&pool->log, i);
-            snprintf(error, size, "it refused to be instantiated%s%s",
-                     said == NULL ? "" : "; the FMU said: ", said == NULL ? "" : said);
-            free(said);
+            explain_refusal(pool, i, error, size);
             return false;
         }
     }
@@ -106,7 +116,7 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     pool->floats = floats_now();
     link_pool(pool);
     snprintf(error, size, "out of memory");
-    if (!log_open(&pool->log, settings->count) || !allocate(pool)) {
+    if (!log_open(&pool->log, settings->count, !settings->logging) || !allocate(pool)) {
         return false;
     }
     for (size_t i = 0; i < settings->count; i++) {

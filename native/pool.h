@@ -29,7 +29,9 @@ typedef struct {
     const char *resources;
     const char *const *paths; /* path of the library, or of one private copy per instance */
     bool private_libraries;   /* whether each instance has its own library */
-    bool logging;
+    bool logging;             /* whether FMUs are asked to log everything */
+    const char *const *categories; /* the log categories of errors and warnings */
+    size_t number_of_categories;
     bool can_save;
     bool restores; /* whether episodes begin by a restored state where the start values are the same
                     */
@@ -87,6 +89,12 @@ typedef struct {
     size_t number_of_values;
 } Failure;
 
+typedef enum {
+    HEARING_LITTLE, /* only what the FMU logs without being asked */
+    HEARING_ERRORS, /* also the categories of errors and warnings */
+    HEARING_ALL     /* everything, since the FMU failed without a message */
+} Hearing;
+
 typedef struct {
     Library *library;
     void *component;
@@ -99,6 +107,7 @@ typedef struct {
     uint8_t phase;
     bool unsavable; /* the FMU once refused to save its state */
     bool due;       /* whether the next reset replaces it */
+    uint8_t hearing;
 } Instance;
 
 /* Threads that work on neighbouring instances must not write to the same cache line. */
@@ -149,6 +158,8 @@ typedef struct Pool {
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Atomic states_too_large;
+    Atomic deaf;     /* whether the FMU has refused the categories of its own */
+    Atomic heard;    /* how often an instance was asked to log everything */
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

@@ -71,7 +71,7 @@ static Atomic started;
 static Mutex lock; /* guards going to sleep and starting helpers */
 static Condition work_arrived;
 static _Alignas(CACHE_LINE) Atomic jobs;
-static Atomic wakes, chunks;
+static Atomic wakes, early_wakes, chunks;
 
 static size_t next_item(uint64_t ticket) {
     return (size_t)(ticket & UINT32_MAX);
@@ -197,6 +197,7 @@ static void wake_some(Slot *slot) {
         if (atomic_add(&slot->woken, 1) >= atomic_get(&slot->limit)) {
             return;
         }
+        atomic_add(&early_wakes, atomic_get(&slot->done) == 0);
         wake_one();
     }
 }
@@ -388,7 +389,10 @@ void threads_run(const Job *job) {
 }
 
 ThreadStatistics threads_statistics(void) {
-    return (ThreadStatistics){atomic_get(&jobs), atomic_get(&wakes), atomic_get(&chunks)};
+    return (ThreadStatistics){.jobs = atomic_get(&jobs),
+                              .wakes = atomic_get(&wakes),
+                              .early_wakes = atomic_get(&early_wakes),
+                              .chunks = atomic_get(&chunks)};
 }
 
 void threads_reset(void) {

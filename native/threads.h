@@ -21,9 +21,10 @@ void threads_run(const Job *job);
 
 /* Counters of this process. */
 typedef struct {
-    uint64_t jobs;   /* jobs that helpers could join */
-    uint64_t wakes;  /* wake-ups of sleeping helpers */
-    uint64_t chunks; /* chunks of these jobs */
+    uint64_t jobs;        /* jobs that helpers could join */
+    uint64_t wakes;       /* wake-ups of sleeping helpers */
+    uint64_t early_wakes; /* wake-ups before any item of the job was done */
+    uint64_t chunks;      /* chunks of these jobs */
 } ThreadStatistics;
 
 ThreadStatistics threads_statistics(void);

@@ -32,7 +32,5 @@ STUB(CancelStep)
 STUB(GetStatus)
 STUB(GetRealStatus)
 STUB(GetIntegerStatus)
-#ifndef OWN_BOOLEAN_STATUS
 STUB(GetBooleanStatus)
-#endif
 STUB(GetStringStatus)

@@ -85,6 +85,10 @@ ACTIONS = {
 }
 
 
+class ReceiverError(Exception):
+    """Raised by a receiver of messages."""
+
+
 class Receiver(logging.Handler):
     """Raises now and then, as receivers may, and calls the pool back."""
 
@@ -96,7 +100,7 @@ class Receiver(logging.Handler):
     def emit(self, record):
         dice = self._rng.random()
         if dice < 0.05:
-            raise RuntimeError("a receiver fails")
+            raise ReceiverError("a receiver fails")
         if dice < 0.1:
             raise KeyboardInterrupt
         if dice < 0.3 and self.pool is not None:
@@ -227,7 +231,7 @@ class Ring:
     def _make(self, recipe):
         while True:
             self.seed += 1
-            with contextlib.suppress(KeyboardInterrupt, SimulationError):
+            with contextlib.suppress(KeyboardInterrupt, ReceiverError, SimulationError):
                 return Subject(*recipe, np.random.default_rng(self.seed))
 
     def act(self, rng):
@@ -240,6 +244,8 @@ class Ring:
                 counts["closed"] += 1
         except KeyboardInterrupt:
             counts["interrupted"] += 1
+        except ReceiverError:
+            counts["refused message"] += 1
         counts[name] += 1
 
 
@@ -321,7 +327,9 @@ def main():
     crowd.join()
     sys.stdout.write(json.dumps(counts) + "\n")
     sys.stdout.flush()
-    missing = {*ACTIONS, "played", "message", "interrupted", "unraisable", "closed"} - {*counts}
+    missing = {*ACTIONS, "played", "message", "refused message", "interrupted", "closed"} - {
+        *counts
+    }
     if missing or crowd.trouble:
         sys.exit(f"never done: {sorted(missing)}; trouble: {crowd.trouble}")
     if with_python:

@@ -32,6 +32,20 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 """The begin of a program that obeys Ctrl-C although its parent ignores it, as in the background."""
 
 
+def run_python(*command, timeout=100):
+    """Run Python in a process of its own."""
+    path = os.pathsep.join(filter(None, [str(fmu_tools.HERE), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path, "MALLOC_PERTURB_": "85"}
+    return subprocess.run(
+        [sys.executable, *command],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
 @functools.cache
 def _library():
     with tempfile.TemporaryDirectory() as folder:

@@ -1,11 +1,15 @@
 """The benchmarks run and print their tables; what they measure is not asserted."""
 
+import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import fmugym
 
 RUN = Path(__file__).parent.parent / "benchmarks" / "run.py"
 
@@ -87,3 +91,46 @@ def test_isolation_is_measured_with_its_faults():
     rows = tables_in(result.stdout)
     assert len(rows["1 cart-pole"]) == 4
     assert any("hangs" in row for row in rows)
+
+
+@pytest.fixture(name="tasks", scope="module")
+def fixture_tasks():
+    """The module of the tasks; modules of the benchmarks import each other by their names."""
+    sys.path.insert(0, str(RUN.parent))
+    try:
+        yield importlib.import_module("tasks")
+    finally:
+        sys.path.remove(str(RUN.parent))
+
+
+def leaves(observations):
+    return (
+        [v for _, v in sorted(observations.items())]
+        if isinstance(observations, dict)
+        else [observations]
+    )
+
+
+@pytest.mark.parametrize("index", range(8))
+def test_a_task_by_hand_is_the_same_task(tasks, index):
+    task = tasks.TASKS[index]
+    envs = fmugym.FMUVectorEnv(task.make, 5, max_episode_steps=60)
+    prototype = task.make()
+    hand = task.by_hand(prototype, 5, 60)
+    envs.action_space.seed(0)
+    observations, infos = envs.reset(seed=0)
+    drawn = {name: values for name, values in infos["drawn"].items() if name[0] != "_"}
+    for one, other in zip(leaves(observations), leaves(hand.reset(drawn)), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6)
+    alive = np.ones(5, bool)  # until the first episode ends: then both draw anew
+    for _ in range(60):
+        actions = envs.action_space.sample()
+        one, other = envs.step(actions), hand.step(actions)
+        for a, b in zip(leaves(one[0]), leaves(other[0]), strict=True):
+            np.testing.assert_allclose(b[alive], a[alive], rtol=1e-4, atol=1e-4)
+        for a, b in zip(one[1:4], other[1:4], strict=True):
+            np.testing.assert_allclose(b[alive], a[alive], rtol=1e-4, atol=1e-4)
+        alive &= ~(one[2] | one[3])
+    assert not alive.any()
+    for each in (envs, prototype, hand):
+        each.close()

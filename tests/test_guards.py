@@ -386,7 +386,7 @@ class TestLeaks:
 
     def test_small_leaks_at_the_default_limit(self, make, backend, caplog):
         pool = make(2, 1, way=backend, leak_limit=DEFAULT_LEAK_LIMIT)
-        assert self.play(pool, 20_000, leak=3600) < 1.25 * DEFAULT_LEAK_LIMIT
+        assert self.play(pool, 30_000, leak=3600) < 1.25 * DEFAULT_LEAK_LIMIT
         assert pool.health()["recyclings"][0] == 1
         assert caplog.text == ""
 
@@ -429,8 +429,7 @@ class TestLeaks:
         recyclings = pool.health()["recyclings"][0]
         assert growth < 5 * self.LIMIT
         assert (10 if leak else 0) <= recyclings < (60 if leak else 8)
-        # The heap of a process that has run other tests may hold back what recycling frees.
-        assert len(caplog.records) <= 1
+        assert caplog.text == ""
 
     def test_that_it_does_not_help_is_said_once(self, make, backend, caplog):
         pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
@@ -486,8 +485,8 @@ class TestLeaks:
     def test_without_knowledge_of_the_heap(self, make, monkeypatch, backend, caplog):
         monkeypatch.setattr("fmugym.pool.memory._mallinfo", lambda: None)
         pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
-        assert self.play(pool, leak=self.LEAK) < 6 * self.LIMIT
-        assert len(caplog.records) <= 1  # the watch has to guess what recycling frees
+        assert self.play(pool, leak=self.LEAK) < 4 * self.LIMIT
+        assert caplog.text == ""
 
 
 def test_bundled_fmus_are_not_watched():

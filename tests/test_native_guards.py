@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zoo_tools
+from process_tools import run_python
 from test_native_pool import LOG, make, on_linux
-from test_native_threads import run_python
 
 import fmugym
 from fmugym import FMU, bundled_fmu

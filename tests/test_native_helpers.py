@@ -5,8 +5,8 @@ import sys
 
 import numpy as np
 import pytest
+from process_tools import run_python
 from test_native_pool import NativePool, busy_fmu, make, on_linux
-from test_native_threads import run_python
 
 from fmugym import pool as pools
 from fmugym.pool.processors import available_processors, processor_quota
@@ -60,6 +60,14 @@ def test_a_short_job_wakes_few_of_many_helpers(count):
     counted = count(64, 12, 1)
     assert counted["jobs"] == counted["rounds"]
     assert 0 < counted["wakes"] <= 8 * counted["rounds"]
+
+
+@needs_native
+@pytest.mark.parametrize(("threads", "n", "work"), [(64, 12, 1), (2, 2, 200), (4, 400, 5)])
+def test_the_caller_does_its_first_chunk_before_it_wakes_any_helper(count, threads, n, work):
+    counted = count(threads, n, work)
+    assert counted["wakes"] > 0
+    assert counted["early_wakes"] == 0
 
 
 @needs_native

@@ -1,11 +1,11 @@
 """The native pool against threads, exceptions and signals: nothing that callers do breaks it."""
 
+import contextlib
 import gc
 import json
 import logging
 import os
 import signal
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -13,34 +13,27 @@ from pathlib import Path
 import foreign_tank
 import numpy as np
 import pytest
+from fmu_tools import PlainEnv, probe_config
+from gymnasium import spaces
+from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 from test_native_pool import busy_fmu, make
 
 from fmugym import FMU, SimulationError
 from fmugym import pool as pools
 from fmugym.pool import PoolSpec
+from fmugym.pool.python import PythonPool
+from fmugym.vector import FMUVectorEnv
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():
     from fmugym.pool.native import NativePool
+else:
+    NativePool = None
 
 HERE = Path(__file__).parent
 on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 on_posix = pytest.mark.skipif(os.name != "posix", reason="Windows has no timer signals")
-
-
-def run_python(*command, timeout=100):
-    """Run Python in a process of its own."""
-    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
-    environment = os.environ | {"PYTHONPATH": path, "MALLOC_PERTURB_": "85"}
-    return subprocess.run(
-        [sys.executable, *command],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-    )
 
 
 # All calls against each other
@@ -132,6 +125,9 @@ REENTRANT = """
 import builtins, os, sys
 import foreign_tank
 import numpy as np
+from fmu_tools import PlainEnv, probe_config
+from gymnasium import spaces
+from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 from test_native_pool import NativePool, make
 
@@ -260,33 +256,67 @@ class Raising(logging.Handler):
             raise self.error
 
 
-def logging_pool(probe, error, at, count=3):
+@pytest.fixture(name="pool_class", params=[NativePool, PythonPool])
+def fixture_pool_class(request):
+    return request.param
+
+
+def logging_pool(pool_class, probe, error, at, count=3):
     """A pool whose instances say something in each step."""
     log = logging.Logger("raising")
     handler = Raising(error, at)
     log.addHandler(handler)
     fmu = FMU(probe())
-    pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), count, log)
+    pool = pool_class(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), count, log)
     pool.reset((fmu.variable("log_status"),), np.ones((1, count)))
     return pool, handler
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3)], ids=repr)
-def test_an_exit_comes_out_of_the_step_that_was_done(probe, error):
-    pool, handler = logging_pool(probe, error, at=2)
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3), ValueError("!")], ids=repr)
+def test_an_exception_comes_out_of_the_step_that_was_done(pool_class, probe, error):
+    """It may be one of a signal handler, which runs wherever the main thread is."""
+    pool, handler = logging_pool(pool_class, probe, error, at=2)
     with pytest.raises(type(error)) as caught:
         pool.step()
     assert caught.value is error
     assert pool.outputs.tolist() == [[1.0, 1.0, 1.0]]
-    assert len(handler.texts) == 2
     pool.step()
-    names = [text.split(":")[0] for text in handler.texts]
-    assert names == [f"Probe_{i}" for i in (0, 1, 2, 0, 1, 2)], "those left come first"
+    numbers = [int(text.split(":")[0].split("_")[1]) for text in handler.texts]
+    first = min(numbers)
+    assert [n - first for n in numbers] == [0, 1, 2, 0, 1, 2], "those left come first"
     pool.close()
 
 
-def test_an_exit_while_closing_leaves_nothing_open(probe, temp_root):
-    pool, _ = logging_pool(probe, KeyboardInterrupt(), at=1)
+class Talkative(PlainEnv):
+    """Its FMU says something in each step."""
+
+    def __init__(self, path):
+        config = probe_config(model_output_names="sum", model_parameters={"log_status": 1})
+        super().__init__(path, config, logging.WARNING)
+
+    def _get_action_space(self):
+        return spaces.Discrete(2)
+
+    def _get_inputs(self):
+        return 0.5 * self.action
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("!")], ids=repr)
+def test_an_exception_does_not_repeat_a_step_of_a_vector_environment(probe, hooks, error):
+    with contextlib.closing(FMUVectorEnv(lambda: Talkative(probe()), 2, hooks=hooks)) as envs:
+        envs.reset()
+        handler = Raising(error, at=2)
+        logger = envs.get_attr("logger")[0]
+        logger.addHandler(handler)
+        with pytest.raises(type(error)):
+            envs.step(np.array([0, 1]))
+        logger.removeHandler(handler)
+        assert envs.step(np.array([0, 1]))[0].tolist() == [[0.0], [pytest.approx(0.1)]]
+
+
+def test_an_exception_while_closing_leaves_nothing_open(pool_class, probe, temp_root):
+    pool, _ = logging_pool(pool_class, probe, KeyboardInterrupt(), at=1)
     with pytest.raises(KeyboardInterrupt):
         pool.step()
     pool.close()
@@ -295,13 +325,13 @@ def test_an_exit_while_closing_leaves_nothing_open(probe, temp_root):
 
 
 SIGNALS = """
-import contextlib, logging, signal, sys, time
+import builtins, contextlib, logging, signal, sys, time
 import numpy as np
 from fmugym import FMU
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 
-error = {"KeyboardInterrupt": KeyboardInterrupt, "SystemExit": SystemExit}[sys.argv[2]]
+error = getattr(builtins, sys.argv[2])
 log = logging.Logger("signals")
 log.addHandler(logging.NullHandler())
 fmu = FMU(sys.argv[1])
@@ -325,7 +355,7 @@ print("ten signals")
 
 
 @on_posix
-@pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemExit"])
+@pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemExit", "TimeoutError"])
 def test_a_signal_ends_a_loop_of_steps_that_log(probe, error):
     """Each step logs, so the handler mostly runs inside of the receiver.
 

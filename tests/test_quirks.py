@@ -1,19 +1,19 @@
 """FMUs that are useful but break a promise: every episode equals that of a fresh instance.
 
-The reference is FMPy, making the same calls on a new instance of a new copy of the library.
+The reference is FMPy, making the same calls on a new instance of a new copy of the library. The
+table is in quirk_table.py and in docs/reliability.md.
 """
 
 import functools
 import os
-import shutil
-import subprocess
 import sys
+from pathlib import Path
 
-import fmpy
+import fresh
 import numpy as np
 import pytest
-from fmpy.fmi2 import FMU2Slave
-from fmu_tools import HERE, library_name, write_fmu
+import quirk_table
+from quirk_table import OUTPUTS, QUIRKS
 
 import fmugym
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -24,51 +24,24 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
-OUTPUTS = {"y": 1, "clock": 4, "calls": 5}
-XML = """<fmiModelDescription fmiVersion="2.0" modelName="Quirks" guid="{token}">
-<CoSimulation modelIdentifier="Quirks" canGetAndSetFMUstate="true"
-  canHandleVariableCommunicationStepSize="true"/>
-<ModelVariables>
-<ScalarVariable name="u" valueReference="0" causality="input">
-<Real start="0" min="-1" max="1"/></ScalarVariable>
-<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
-<ScalarVariable name="gain" valueReference="2" causality="parameter" variability="fixed">
-<Real start="1"/></ScalarVariable>
-<ScalarVariable name="tau" valueReference="3" causality="parameter" variability="fixed">
-<Real start="0.5"/></ScalarVariable>
-<ScalarVariable name="clock" valueReference="4" causality="output"><Real/></ScalarVariable>
-<ScalarVariable name="calls" valueReference="5" causality="output"><Real/></ScalarVariable>
-<ScalarVariable name="returns" valueReference="6" causality="output"><Real/></ScalarVariable>
-</ModelVariables><ModelStructure/></fmiModelDescription>"""
+DOCUMENT = Path(__file__).parent.parent / "docs" / "reliability.md"
 STEP = 0.05
 LENGTHS = (3, 12, 12, 5)
-
-METHODS = {
-    "well behaved": "restore",
-    "restore forgets": "restore",  # found at the first restore, and given up
-    "restore keeps the time": "restore",  # likewise
-    "reset does nothing": "instance",
-    "reset keeps the state": "instance",
-    "reset keeps inputs": "restore",
-    "reset keeps parameters": "restore",
-    "reset keeps the time": "instance",
-    "stops, reset keeps that": "instance",
-    "second reset fails": "restore",
-    "reset frees twice": "instance",
-    "reset is not exact": "instance",
-    "library keeps": "library",
-}
-"""The reset method that the trial finds."""
+NUM_ENVS = 3
+WAYS = {"default": {}, "one": {"threads": 1}, "two": {"threads": 2}}
+WAYS["process"] = {"isolation": "process"}
+CASES = [(version, quirk) for quirk in QUIRKS for version in quirk.versions]
+cases = pytest.mark.parametrize(("version", "quirk"), CASES, ids=str)
 
 
-class QuirkEnv(fmugym.FMI2CSEnv):
+class QuirkEnv(fmugym.FMUEnv):
     """Reads all outputs; the gain differs from episode to episode."""
 
     def __init__(self, path, gain=None, way=None, **config):
         gain = fmugym.Uniform(0.5, 2.0) if gain is None else gain
         config = {
             "model_input_names": "u",
-            "model_output_names": list(OUTPUTS),
+            "model_output_names": OUTPUTS,
             "model_parameters": {"gain": gain, "tau": 0.3},
             "time_step": STEP,
         } | config
@@ -78,184 +51,143 @@ class QuirkEnv(fmugym.FMI2CSEnv):
         return self.out["y"] > 1e9
 
 
-@functools.cache
-def library(folder):
-    path = folder / "Quirks.so"
-    command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
-    subprocess.run([*command, str(HERE / "quirks.c"), "-o", str(path)], check=True)
-    return path.read_bytes()
-
-
 @pytest.fixture(scope="module")
 def make_fmu(tmp_path_factory):
     folder = tmp_path_factory.mktemp("quirks")
 
     @functools.cache
-    def make(token):
-        files = {
-            "modelDescription.xml": XML.format(token=token),
-            library_name(2, "Quirks"): library(folder),
-        }
-        return write_fmu(folder / token.replace(" ", "_") / "Quirks.fmu", files)
+    def make(token, version=2):
+        return quirk_table.quirk_fmu(folder / f"{token} {version}", version, token)
 
     return make
 
 
 @pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path_factory):
+def trials(monkeypatch, tmp_path, tmp_path_factory):
     """Trials as users have them; the cache serves all tests of a session."""
     monkeypatch.delenv("FMUGYM_PROBE", raising=False)
     cache = os.path.join(tmp_path_factory.getbasetemp(), "quirk verdicts")
     monkeypatch.setenv("FMUGYM_CACHE_DIR", cache)
+    monkeypatch.chdir(tmp_path)
 
 
-def inputs_of(length, index):
+def inputs_of(length, index=0):
     """Inputs of one episode of one environment, within [-1, 1]."""
     return np.sin(0.9 * np.arange(length) + index).astype(np.float32)
 
 
-def reference(path, gain, inputs):
-    """Play an episode with FMPy on a fresh instance of a fresh copy of the library."""
-    folder = fmpy.extract(str(path))
-    description = fmpy.read_model_description(str(path))
-    try:
-        fmu = FMU2Slave(
-            guid=description.guid,
-            unzipDirectory=folder,
-            modelIdentifier="Quirks",
-            instanceName="reference",
-        )
-        fmu.instantiate()
-        fmu.setupExperiment(startTime=0.0)
-        fmu.setReal([2, 3], [gain, 0.3])
-        fmu.enterInitializationMode()
-        fmu.exitInitializationMode()
-        rows = [fmu.getReal(list(OUTPUTS.values()))]
-        for step, value in enumerate(inputs):
-            fmu.setReal([0], [float(value)])
-            try:
-                fmu.doStep(step * STEP, STEP)
-            except fmpy.fmi1.FMICallException:  # it asks to stop; its outputs are valid
-                rows.append(fmu.getReal(list(OUTPUTS.values())))
-                break
-            rows.append(fmu.getReal(list(OUTPUTS.values())))
-        fmu.terminate()
-        fmu.freeInstance()
-        return rows
-    finally:
-        shutil.rmtree(folder)
+@functools.cache
+def reference(path, gain, length, index=0):
+    """The outputs of an episode as FMPy plays it."""
+    rows = [{"u": value} for value in inputs_of(length, index)]
+    return fresh.play(path, OUTPUTS, rows, STEP, {"gain": gain, "tau": 0.3})
 
 
-def play_single(env, length):
-    """Play an episode; returns the gain and the outputs."""
+def play(env, length):
+    """Play an episode; returns the outputs."""
     env.reset()
     rows = [list(env.state)]
-    for value in inputs_of(length, 0):
+    for value in inputs_of(length):
         _, _, terminated, truncated, _ = env.step(np.array([value]))
         rows.append(list(env.state))
         if terminated or truncated:
             break
-    return env.parameters["gain"], rows
+    return rows
 
 
-@pytest.mark.parametrize("token", METHODS)
-class TestEpisodes:
-    def test_single(self, make_fmu, token):
-        env = QuirkEnv(make_fmu(token))
-        env.reset(seed=5)
-        for length in LENGTHS:
-            gain, rows = play_single(env, length)
-            assert rows == reference(make_fmu(token), gain, inputs_of(length, 0))
-        env.close()
-
-    def test_single_with_the_same_start_values(self, make_fmu, token):
-        env = QuirkEnv(make_fmu(token), gain=1.5)
-        for length in LENGTHS:
-            _, rows = play_single(env, length)
-            assert rows == reference(make_fmu(token), 1.5, inputs_of(length, 0))
-        env.close()
-
-    @pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 2}, {"isolation": "process"}])
-    def test_vector(self, make_fmu, token, options):
-        path = make_fmu(token)
-        envs = fmugym.FMUVectorEnv(
-            lambda: QuirkEnv(path), 3, autoreset_mode="Disabled", hooks="array", **options
-        )
-        envs.reset(seed=3)
-        for length in LENGTHS:
-            _, infos = envs.reset()
-            gains = infos["drawn"]["gain"]
-            actions = np.stack([inputs_of(length, index) for index in range(3)], axis=1)[..., None]
-            expected = [reference(path, gains[i], actions[:, i, 0]) for i in range(3)]
-            states = [np.array(envs.get_attr("state"))]
-            for action in actions[: len(expected[0]) - 1]:
-                envs.step(action)
-                states.append(np.array(envs.get_attr("state")))
-            for index in range(3):
-                assert [list(state[index]) for state in states] == expected[index]
-        envs.close()
-
-
-@pytest.mark.parametrize(("token", "method"), METHODS.items())
-def test_reset_method(make_fmu, token, method):
-    env = QuirkEnv(make_fmu(token))
-    assert env.reset_method == method
-    env.close()
-
-
-class TestNeighbours:
-    """Several instances: right by default, whatever that takes."""
-
-    @pytest.mark.parametrize(
-        ("token", "need"),
-        [
-            ("well behaved", Neighbours.INDEPENDENT),
-            ("globals", Neighbours.LIBRARIES),
-            ("one in a process", Neighbours.LIBRARIES),
-            ("strtok", Neighbours.ONE_THREAD),
-        ],
-    )
-    def test_in_a_vector_environment(self, make_fmu, token, need):
-        path = make_fmu(token)
-        envs = fmugym.FMUVectorEnv(
-            lambda: QuirkEnv(path), 4, autoreset_mode="Disabled", hooks="array", threads=None
-        )
-        for length in LENGTHS:
-            _, infos = envs.reset(seed=length)
-            actions = np.stack([inputs_of(length, i) for i in range(4)], axis=1)[..., None]
-            for action in actions:
-                envs.step(action)
-            for index, state in enumerate(envs.get_attr("state")):
-                gain = infos["drawn"]["gain"][index]
-                assert list(state) == reference(path, gain, actions[:, index, 0])[-1]
-        spec, starts = envs.get_attr("_spec")[0], envs.get_attr("_plan")[0].starts()
-        envs.close()
-        fmu = fmugym.FMU(path)
-        verdict = examine(Candidate.of(fmu), spec, starts, several=True)
-        assert verdict.neighbours is need
-
-    def test_inputs_stay_within_their_limits(self, make_fmu):
-        """An FMU may not bear others, and what follows is no sign of shared globals."""
-        fmu = fmugym.FMU(make_fmu("well behaved"))
-        u = fmu.variable("u")
-        spec = PoolSpec((u,), (), STEP, input_limits=((-0.5, 0.25),))
-        rows = [start_inputs(spec), neighbour_inputs(spec), *moving_inputs(spec, 50, 1.0)]
-        assert np.min(rows) < -0.4
-        assert np.max(rows) == 0.25
-        assert np.all((np.array(rows) >= -0.5) & (np.array(rows) <= 0.25))
-
-
-def test_an_fmu_that_overruns_its_memory_is_isolated(make_fmu, caplog):
-    env = QuirkEnv(make_fmu("overruns"))
-    assert "Quirks.fmu harms its process" in caplog.text
+def assert_right(env, path):
+    """Play episodes, each of which must equal that of a fresh instance; then close."""
     for length in LENGTHS:
-        gain, rows = play_single(env, length)
-        assert rows == reference_of(make_fmu("well behaved"), gain, length)
+        rows = play(env, length)
+        assert rows == reference(path, env.parameters["gain"], length)
     env.close()
 
 
-def reference_of(path, gain, length):
-    return reference(path, gain, inputs_of(length, 0))
+def make_vector(path, gain=None, **options):
+    config = {"gain": gain, "probe_timeout": options.pop("probe_timeout", 30.0)}
+    return fmugym.FMUVectorEnv(
+        lambda: QuirkEnv(path, **config),
+        NUM_ENVS,
+        autoreset_mode="Disabled",
+        hooks="array",
+        **options,
+    )
+
+
+def assert_vector_right(envs, path, gains=None):
+    """The same for a vector environment, by default with the gains that are drawn."""
+    for length in LENGTHS:
+        _, infos = envs.reset()
+        now = infos["drawn"]["gain"] if gains is None else gains
+        expected = [reference(path, now[i], length, i) for i in range(NUM_ENVS)]
+        rows = [np.array(envs.get_attr("state"))]
+        actions = np.stack([inputs_of(length, i) for i in range(NUM_ENVS)], axis=1)
+        for action in actions[: len(expected[0]) - 1]:
+            envs.step(action[:, None])
+            rows.append(np.array(envs.get_attr("state")))
+        assert np.swapaxes(rows, 0, 1).tolist() == expected
+    envs.close()
+
+
+@cases
+class TestEpisodes:
+    def test_single(self, make_fmu, version, quirk):
+        path = make_fmu(quirk.token, version)
+        env = QuirkEnv(path, probe_timeout=quirk.probe_timeout)
+        assert env.reset_method == quirk.method_of(version)
+        env.reset(seed=5)
+        assert_right(env, path)
+
+    def test_with_the_same_start_values(self, make_fmu, version, quirk):
+        """So that states are restored."""
+        path = make_fmu(quirk.token, version)
+        assert_right(QuirkEnv(path, gain=1.5, probe_timeout=quirk.probe_timeout), path)
+
+    @pytest.mark.parametrize("way", WAYS)
+    def test_vector(self, make_fmu, version, quirk, way):
+        if (quirk.neighbours, way) == ("one thread", "two"):
+            way = "default"  # the caller knows better than to insist
+        path = make_fmu(quirk.token, version)
+        envs = make_vector(path, probe_timeout=quirk.probe_timeout, **WAYS[way])
+        envs.reset(seed=3)
+        assert_vector_right(envs, path)
+
+    @pytest.mark.parametrize("way", ["default", "process"])
+    def test_vector_with_the_same_start_values(self, make_fmu, version, quirk, way):
+        """Each environment has its own, in all episodes."""
+        path, gains = make_fmu(quirk.token, version), [0.5, 1.0, 2.0]
+        envs = make_vector(path, gain=1.0, probe_timeout=quirk.probe_timeout, **WAYS[way])
+        envs.set_attr("gain", gains)
+        assert_vector_right(envs, path, gains)
+
+
+@cases
+def test_verdict(make_fmu, version, quirk, caplog):
+    """What several instances need, and what the log tells."""
+    path = make_fmu(quirk.token, version)
+    envs = make_vector(path, probe_timeout=quirk.probe_timeout)
+    spec, starts = envs.get_attr("_spec")[0], envs.get_attr("_plan")[0].starts()
+    envs.close()
+    candidate = Candidate.of(fmugym.FMU(path, probe_timeout=quirk.probe_timeout))
+    verdict = examine(candidate, spec, starts, several=True, must_survive=False)
+    assert verdict.neighbours == quirk.neighbours
+    warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert quirk.log in " ".join(warnings)
+    assert bool(warnings) == bool(quirk.log)
+
+
+def test_the_document_has_this_table():
+    assert quirk_table.markdown() in DOCUMENT.read_text(), "python tests/quirk_table.py prints it"
+
+
+def test_inputs_stay_within_their_limits(make_fmu):
+    """An FMU may not bear others, and what follows is no sign of shared globals."""
+    fmu = fmugym.FMU(make_fmu("well behaved"))
+    spec = PoolSpec((fmu.variable("u"),), (), STEP, input_limits=((-0.5, 0.25),))
+    rows = [start_inputs(spec), neighbour_inputs(spec), *moving_inputs(spec, 50, 1.0)]
+    assert np.min(rows) < -0.4
+    assert np.max(rows) == 0.25
+    assert np.all((np.array(rows) >= -0.5) & (np.array(rows) <= 0.25))
 
 
 def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
@@ -266,12 +198,10 @@ def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
 
 class TestConfig:
     def test_demands_a_method(self, make_fmu):
-        env = QuirkEnv(make_fmu("well behaved"), reset_method="library")
+        path = make_fmu("well behaved")
+        env = QuirkEnv(path, reset_method="library")
         assert env.reset_method == "library"
-        for length in LENGTHS:
-            gain, rows = play_single(env, length)
-            assert rows == reference_of(make_fmu("well behaved"), gain, length)
-        env.close()
+        assert_right(env, path)
 
     def test_refuses_others(self, make_fmu):
         with pytest.raises(fmugym.ConfigError, match="did you mean 'restore'"):

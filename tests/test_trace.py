@@ -157,7 +157,7 @@ def selected(self):
     [
         (branch, "branches on a value"),
         (matrix, "uses numpy.matmul: the order of its sums"),
-        (remembered, "sets attributes"),
+        (remembered, "changes self.worst"),
         (number, "a flag is no Boolean"),
         (array, "operands could not be broadcast|shape mismatch"),
         (wide, "uses numpy.sort"),

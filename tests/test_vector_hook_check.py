@@ -22,7 +22,7 @@ from vector_tools import (
 from fmugym import ConfigError, ContractError
 from fmugym.testing import check_hooks
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.views import differs
+from fmugym.vector.contents import differs
 
 
 class Branching(Drawing):

@@ -57,8 +57,14 @@ def compiler():
 
 
 @functools.cache
-def library(version, *definitions):
-    """The compiled library of an FMI version; made once a session, in a tenth of a second."""
+def library(version, *definitions, model="zoo"):
+    """The compiled library of an FMI version; made once a session, in a tenth of a second.
+
+    Args:
+        version: Of FMI.
+        definitions: For the compiler.
+        model: The C file in ``FOLDER`` without its ending.
+    """
     flags = ["-shared", "-fPIC", "-O1", "-g0", "-Wall", "-Wextra", "-Wno-unused-parameter"]
     macros = [f"-D{name}" for name in (f"FMI_VERSION={version}", *definitions)]
     shim = FOLDER / f"fmi{version}.c"
@@ -67,7 +73,7 @@ def library(version, *definitions):
         prefix = "Zoo_fmi" if version == 1 else f"fmi{version}"
         (path.parent / "stubs.h").write_text(fmu_tools.stubs(version, prefix, shim))
         command = [*compiler(), *flags, *macros, f"-I{folder}", '-DSTUBS="stubs.h"']
-        command += [FOLDER / "zoo.c", shim, "-o", path, "-lm", "-lpthread"]
+        command += [FOLDER / f"{model}.c", shim, "-o", path, "-lm", "-lpthread"]
         subprocess.run(command, check=True)
         return path.read_bytes()
 
@@ -96,6 +102,19 @@ def spoil(path, how):
 
 
 def _description(version, token):
+    variables = [("u", "input", 'start="0"'), ("y", "output", "")]
+    variables += [(name, "parameter", 'start="0"') for name in PARAMETERS]
+    return describe(version, token, variables)
+
+
+def describe(version, token, variables):
+    """A model description.
+
+    Args:
+        version: Of FMI.
+        token: The instantiation token.
+        variables: Names, causalities and further attributes, in the order of value references.
+    """
     head = f'fmiVersion="{version}.0" modelName="Zoo"'
     head += f' {"instantiationToken" if version == 3 else "guid"}="{token}"'
     interface = '<CoSimulation modelIdentifier="Zoo" canGetAndSetFMU{}tate="true"/>'
@@ -105,22 +124,20 @@ def _description(version, token):
         end += "</CoSimulation_StandAlone></Implementation>"
     else:
         interface, end = interface.format("s" if version == 2 else "S"), "<ModelStructure/>"
-    variables = "".join(_variables(version))
-    inside = f"{interface}<ModelVariables>{variables}</ModelVariables>{end}"
+    elements = [_element(version, index, *row) for index, row in enumerate(variables)]
+    inside = f"{interface}<ModelVariables>{''.join(elements)}</ModelVariables>{end}"
     return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
 
 
-def _variables(version):
-    kind = {1: 'causality="internal" variability="parameter"'}
-    parameter = kind.get(version, 'causality="parameter" variability="fixed"')
-    kinds = ['causality="input"', 'causality="output"', *[parameter] * len(PARAMETERS)]
-    for index, (name, rest) in enumerate(zip(("u", "y", *PARAMETERS), kinds, strict=True)):
-        start = "" if name == "y" else 'start="0"'
-        common = f'name="{name}" valueReference="{index}" {rest}'
-        if version == 3:
-            yield f"<Float64 {common} {start}/>"
-        else:
-            yield f"<ScalarVariable {common}><Real {start}/></ScalarVariable>"
+def _element(version, index, name, causality, attributes):
+    kind = f'causality="{causality}"'
+    if causality == "parameter":
+        kind = 'causality="internal" variability="parameter"' if version == 1 else kind
+        kind += "" if version == 1 else ' variability="fixed"'
+    common = f'name="{name}" valueReference="{index}" {kind}'
+    if version == 3:
+        return f"<Float64 {common} {attributes}/>"
+    return f"<ScalarVariable {common}><Real {attributes}/></ScalarVariable>"
 
 
 # The environments

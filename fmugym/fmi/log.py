@@ -13,7 +13,8 @@ import ctypes
 import itertools
 import logging
 from collections import deque
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Final, ParamSpec
 
 import fmpy
 from fmpy.fmi1 import fmi1CallbackFunctions
@@ -22,14 +23,50 @@ from fmpy.fmi3 import fmi3LogMessageCallback
 from fmpy.logging import addLoggerProxy
 
 from fmugym.errors import printable
+from fmugym.fmi.status import Status
+from fmugym.fmi.words import Message, quoted
 
-__all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message"]
+__all__ = [
+    "Hearing",
+    "MessageLog",
+    "fmi1_callbacks",
+    "fmi2_callbacks",
+    "fmi3_log_message",
+    "raise_caught",
+]
+
+P = ParamSpec("P")
 
 logger = logging.getLogger(__name__)
 
 _LEVELS = (logging.INFO, logging.WARNING, logging.WARNING, logging.ERROR, logging.CRITICAL)
 _receivers: dict[int, MessageLog] = {}
 _ids = itertools.count(1)
+_caught: list[BaseException] = []
+
+
+_IDLE_LIMIT: Final = 1000
+"""Messages that nobody wants, until the FMU is asked to log less."""
+
+_MOST_HEARD: Final = 4
+"""How many instances of a library may log all; it may take long to make them, and fail often."""
+
+
+class Hearing:
+    """What the instances of a library are asked to log if the log has no room for everything.
+
+    Attributes:
+        deaf: Whether they are not asked for errors: one has refused, or has logged too much.
+    """
+
+    def __init__(self) -> None:
+        self.deaf = False
+        self._heard = 0
+
+    def may_hear_all(self) -> bool:
+        """Whether one more instance may log everything."""
+        self._heard += 1
+        return self._heard <= _MOST_HEARD
 
 
 class MessageLog:
@@ -43,6 +80,8 @@ class MessageLog:
         environment: A number that is unique in the process.
         instance_name: A name that is unique in the process.
         recent: The last messages, for errors.
+        idle: How many messages nobody wanted: those with the status OK, if only errors were asked
+            for.
         muted: Whether messages are dropped.
     """
 
@@ -51,7 +90,8 @@ class MessageLog:
     def __init__(self, model: str, target: logging.Logger) -> None:
         self.environment = next(_ids)
         self.instance_name = f"{model}_{self.environment}"
-        self.recent: deque[str] = deque(maxlen=10)
+        self.recent: deque[Message] = deque(maxlen=10)
+        self.idle = 0
         self._target = target
         _receivers[self.environment] = self
 
@@ -64,17 +104,49 @@ class MessageLog:
         """Pass a message on, at the level of its status."""
         if self.muted:
             return
-        self.recent.append(message)
+        self.recent.append((status, message))
+        if status == Status.OK and not self.wants_debug:
+            self.idle += 1
+            return
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         self._target.log(level, "%s: [%s] %s", self.instance_name, category, message)
 
+    @property
+    def is_too_long(self) -> bool:
+        """Whether the FMU has logged too much that nobody wants."""
+        return self.idle > _IDLE_LIMIT
+
     def said(self) -> str:
         """The recent messages, to end an error's text."""
-        return f"; the FMU said: {' | '.join(self.recent)}" if self.recent else ""
+        return quoted(tuple(self.recent))
 
     def close(self) -> None:
         """Stop receiving; later messages go to this module's logger."""
         _receivers.pop(self.environment, None)
+
+
+def raise_caught() -> None:
+    """Raise the first exception that a receiver of messages has raised since the last call.
+
+    It may come from a signal handler, such as that of Ctrl-C. ctypes cannot pass it through the
+    FMU, so it has to be raised after the FMU has returned.
+    """
+    if _caught:
+        first = _caught[0]
+        _caught.clear()
+        raise first
+
+
+def _keeping_errors(function: Callable[P, None]) -> Callable[P, None]:
+    """Make a callback of a function: it keeps what the function raises for ``raise_caught``."""
+
+    def called(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            function(*args, **kwargs)
+        except BaseException as error:
+            _caught.append(error)
+
+    return called
 
 
 def _deliver(environment: int | None, status: int, category: bytes, message: bytes) -> None:
@@ -96,7 +168,7 @@ def _make_callbacks(structure: Any) -> Any:
     """Fill a callback structure. The members used here are the same in FMI 1.0 and 2.0."""
     types = dict(structure._fields_)
     callbacks = structure()
-    callbacks.logger = types["logger"](_by_name)
+    callbacks.logger = types["logger"](_keeping_errors(_by_name))
     callbacks.allocateMemory = ctypes.cast(fmpy.calloc, types["allocateMemory"])
     callbacks.freeMemory = ctypes.cast(fmpy.free, types["freeMemory"])
     addLoggerProxy(ctypes.byref(callbacks))
@@ -105,4 +177,4 @@ def _make_callbacks(structure: Any) -> Any:
 
 fmi1_callbacks = _make_callbacks(fmi1CallbackFunctions)
 fmi2_callbacks = _make_callbacks(fmi2CallbackFunctions)
-fmi3_log_message = fmi3LogMessageCallback(_deliver)
+fmi3_log_message = fmi3LogMessageCallback(_keeping_errors(_deliver))

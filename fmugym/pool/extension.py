@@ -1,11 +1,11 @@
-"""Whether the C extension exists, and a warning if it does not."""
+"""Whether the C extension exists, and which of its errors mean what."""
 
 from __future__ import annotations
 
 import functools
 import logging
 
-__all__ = ["HOW_TO_BUILD", "has_native_pool", "warn_of_slow_path"]
+__all__ = ["HOW_TO_BUILD", "has_native_pool", "require_refusal", "warn_of_slow_path"]
 
 logger = logging.getLogger(__name__)
 
@@ -30,3 +30,18 @@ def has_native_pool() -> bool:
 def warn_of_slow_path() -> None:
     """Warn once per process that Python steps the FMUs."""
     logger.warning("FMUs are stepped by Python, which is slow: %s", HOW_TO_BUILD)
+
+
+def require_refusal(error: Exception) -> None:
+    """Raise an error again unless the C code has refused the arguments of a call.
+
+    A refused call may be repeated with other arguments. Errors of the receiver of messages and of
+    signal handlers come after the work was done. They have passed Python functions; those of the C
+    code have not.
+
+    Args:
+        error: What a call of the C code has raised, in the function that made the call.
+    """
+    trace = error.__traceback__
+    if trace is not None and trace.tb_next is not None:
+        raise error

@@ -45,6 +45,9 @@ _REPLACING_CALLS: Final = 16
 _PLAIN_CALLS: Final = 32
 """Calls that replace none, for a measurement of what they allocate."""
 
+_TOLERANCE: Final = 1 / 8
+"""Share of what a reset allocates; two measurements of it may differ by that much."""
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -150,10 +153,12 @@ class LeakWatch:
         self._resets = _Total(counts, Column.RESETS)
         self._recyclings = _Total(counts, Column.RECYCLINGS)
         self._first: int | None = None  # bytes after the first resets
-        self._lowest = self._latest = 0  # bytes since the last attempt, and at the last look
+        self._base = self._latest = 0  # bytes where growth starts, and at the last look
         self._allowance = limit  # growth that does not call for an attempt
+        self._mark = 4 * limit  # growth since the first resets that calls for a measurement
         self._rate = 0.0  # bytes per reset that recycling gives back
-        self._since = 0  # resets until the last attempt
+        self._since = self._num_instances  # resets when the present instances had begun
+        self._until = 0  # resets until the last attempt
         self._interval = self._calls_left = 1
         self._replacing: _Measurement | None = None
         self._plain: _Measurement | None = None
@@ -193,23 +198,25 @@ class LeakWatch:
         now = grown_bytes()
         if self._first is None:
             if resets > _FIRST_RESETS * self._num_instances:
-                self._first = self._lowest = self._latest = now
-                self._since = resets
+                self._first = self._base = self._latest = now
             return
         is_fast = now - self._latest > _FAST * self._limit
         self._interval = 1 if is_fast else min(2 * self._interval, _LONGEST_INTERVAL)
         self._calls_left = self._interval
-        self._latest, self._lowest = now, min(self._lowest, now)
-        growth = now - self._lowest
+        self._latest = now
+        if heap_is_known():
+            self._base = min(self._base, now)
+        growth = now - self._base
         leaked = self._rate * (resets - self._since)
         if leaked >= self._limit or (growth >= self._allowance and not self.has_snapshots):
             self._attempt(growth)
         elif growth >= self._allowance:
+            self._allowance = 2 * growth
             self._listen(growth)
 
     def _attempt(self, growth: int) -> None:
         """Recycle the instances and measure what that frees."""
-        self._calls_left = 0
+        self._calls_left, self._until = 0, self._resets.read()
         self._replacing = _Measurement(
             *(self._resets, self._recyclings, growth, _REPLACING_CALLS),
             count=self._num_instances,
@@ -218,9 +225,9 @@ class LeakWatch:
         self._recycle()
 
     def _listen(self, growth: int) -> None:
-        """Measure what resets allocate; there is no attempt until twice as much is taken."""
+        """Measure what resets allocate."""
         self._calls_left = 0
-        self._allowance = 2 * max(growth, self._allowance)
+        self._mark = 2 * max(self._mark, self.growth)
         self._plain = _Measurement(self._resets, self._resets, growth, _PLAIN_CALLS)
 
     def _take(self, measurement: _Measurement) -> None:
@@ -232,7 +239,19 @@ class LeakWatch:
             self._plain = None
             self._blame(measurement.each)
         if self._plain is None:
-            self._lowest = self._latest = grown_bytes()
+            self._latest = grown_bytes()
+            self._begin_anew(measurement.growth)
+
+    def _begin_anew(self, growth: int) -> None:
+        """Count growth from here on.
+
+        Where the heap is not known, memory that was freed and that the process keeps does not show.
+        Growth begins at the highest level so far then.
+        """
+        if heap_is_known():
+            self._base = self._latest
+        elif growth >= self._limit:
+            self._base += growth
 
     def _judge(self, growth: int, freed: float) -> None:
         """Learn from an attempt when the next one is worth it.
@@ -242,20 +261,21 @@ class LeakWatch:
             freed: What recycling all instances frees, in bytes.
         """
         is_due = growth >= self._allowance
-        if not heap_is_known():  # then it helps until the process grows nevertheless
-            freed = 0.0 if is_due and self._rate else float(self._limit)
-        resets = self._resets.read()
-        self._rate, self._since = freed / max(1, resets - self._since), resets
+        if not heap_is_known() and not (is_due and self._rate):  # then it is taken to help
+            freed = self._rate * (self._until - self._since) or float(self._limit)
+        self._rate = freed / max(1, self._until - self._since)
+        self._since = self._resets.read()
         if is_due:
-            if freed >= growth / 2:
-                self._allowance = self._limit
-            else:
+            helped = freed >= growth / 2
+            self._allowance = self._limit if helped else 2 * growth
+            if not helped or self.growth >= self._mark:
                 self._listen(growth)
 
     def _blame(self, allocated: float) -> None:
         """Recycle now and then, or say that it does not help, if each reset allocates so much."""
-        lost = (allocated - self._rate) * self._resets.read()
-        if lost < self._limit:
+        kept = allocated - self._rate
+        lost = kept * self._resets.read()
+        if kept < _TOLERANCE * allocated or lost < self._limit:
             return
         if self.has_snapshots and not self._rate:
             self._rate = allocated

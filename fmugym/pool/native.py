@@ -30,6 +30,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
+from fmugym.fmi.words import quoted, unpacked
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -37,6 +38,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import CountedPool, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
@@ -68,6 +70,8 @@ _LEVELS: Final = (
 )
 _MOST_CACHED: Final = 64
 _NO_STRING: Final = 2**32 - 1
+_SAID: Final = "\x1d"
+"""Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 
 FloatArray32 = npt.NDArray[np.float32]
 IndexArray = npt.NDArray[np.int64]
@@ -158,6 +162,7 @@ class NativePool(CountedPool):
                     "private": private_libraries,
                     "logging": log.isEnabledFor(logging.INFO),
                     "states": description.capabilities.can_get_and_set_fmu_state,
+                    "categories": tuple(c.encode() for c in description.error_categories),
                 },
                 experiment={
                     "start_time": spec.start_time,
@@ -189,7 +194,10 @@ class NativePool(CountedPool):
                 callback=_Receiver(log, description.model_identifier, self._first_index),
             )
         except OSError as error:
-            raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
+            reason, _, said = str(error).partition(_SAID)
+            raise FMULoadError(
+                f"{fmu.path.name} cannot be loaded: {reason}{quoted(unpacked(said))}"
+            ) from None
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""
@@ -253,6 +261,7 @@ class NativePool(CountedPool):
         try:
             pool.restore(snapshot, mask)
         except ValueError as error:
+            require_refusal(error)
             raise SimulationError(str(error)) from None
         return self._result
 
@@ -266,7 +275,7 @@ class NativePool(CountedPool):
             variables = self._spec.inputs if "inputs" in doing else self._spec.outputs
             return f"{doing}: {_not_finite(variables, values)}"
         text = self._sentence(index, doing, status, time, string)
-        text += f"; the FMU said: {printable(said)}" if said else ""
+        text += quoted(unpacked(said))
         return f"the warm-up failed: {text}" if in_warm_up else text
 
     def _sentence(self, index: int, doing: str, status: int, time: float, string: int) -> str:
@@ -335,7 +344,8 @@ class NativePool(CountedPool):
         """
         try:
             return self._pool.step(inputs, skip, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             pool = self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             return pool.step(inputs, _as_mask(skip), observations)
@@ -361,7 +371,8 @@ class NativePool(CountedPool):
         access = self._accesses.get(variables) or self._access(variables)
         try:
             return self._reset(access, values, mask, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             self._open_pool()
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
@@ -392,7 +403,8 @@ class NativePool(CountedPool):
         access = self._accesses.get(variables) or self._access(variables)
         try:
             return self._step_or_reset(inputs, access, values, mask, observations)
-        except (TypeError, BufferError, ValueError):
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
             self._open_pool()
             inputs = None if inputs is None else np.asarray(inputs, np.float64)
             values = np.asarray(values, np.float64)

@@ -13,6 +13,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import SimulationError
 from fmugym.fmi.library import Library
+from fmugym.fmi.log import raise_caught
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
@@ -61,6 +62,7 @@ class PythonPool(CountedPool):
                 Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i])
                 for i in range(num_instances)
             ]
+            raise_caught()
         except BaseException:
             self._library.close()
             raise
@@ -85,6 +87,7 @@ class PythonPool(CountedPool):
         for index, slot in enumerate(self._slots):
             if mask is None or mask[index]:
                 self._note(index, slot.reset(variables, values[:, index]))
+        raise_caught()
 
     def step(
         self,
@@ -100,6 +103,7 @@ class PythonPool(CountedPool):
                 self._note(index, slot.step())
         if observations is not None:
             np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
+        raise_caught()
         return self.outputs, self.statuses
 
     def _note(self, index: int, status: int) -> None:
@@ -118,9 +122,11 @@ class PythonPool(CountedPool):
         if self._watch is not None:
             self._watch.has_snapshots = True
         try:
-            return [slot.save() for slot in self._slots]
+            snapshot = [slot.save() for slot in self._slots]
         finally:
             restore_arithmetic()
+        raise_caught()
+        return snapshot
 
     def restore(
         self, snapshot: list[Snapshot], mask: MaskArray | None = None
@@ -133,6 +139,7 @@ class PythonPool(CountedPool):
             self._slots[index].require_own(snapshot[index])
         for index in chosen:
             self._note(index, self._slots[index].restore(snapshot[index]))
+        raise_caught()
         return self.outputs, self.statuses
 
     def failure(self, index: int) -> str:
@@ -142,9 +149,11 @@ class PythonPool(CountedPool):
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         try:
-            return np.stack([slot.read(variables) for slot in self._slots], axis=1)
+            values = np.stack([slot.read(variables) for slot in self._slots], axis=1)
         finally:
             restore_arithmetic()
+        raise_caught()
+        return values
 
     def _count_steps(self) -> None:
         for slot in self._slots:
@@ -161,6 +170,7 @@ class PythonPool(CountedPool):
         """See ``Pool.close``."""
         self._library.close()
         restore_arithmetic()
+        raise_caught()
 
 
 def _recycle(slots: Sequence[Slot]) -> None:

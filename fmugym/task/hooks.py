@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -19,7 +20,39 @@ from fmugym.task.interface import Interface
 if TYPE_CHECKING:
     from fmugym.rendering import Scene
 
-__all__ = ["Hooks"]
+__all__ = ["Hooks", "OwnHooks"]
+
+
+@dataclass(frozen=True, slots=True)
+class OwnHooks:
+    """Which methods an environment does not have from ``FMUEnv``, but from its class or itself.
+
+    A hook may also be an attribute of the environment, such as a function.
+    """
+
+    step: bool
+    reset: bool
+    update: bool
+    is_truncated: bool
+    get_observation: bool
+    get_info: bool
+    goal_reward: bool
+    get_action_space: bool
+
+    @classmethod
+    def of(cls, env: Hooks, base: type[Any]) -> OwnHooks:
+        """Compare the methods of an environment with those of its base class ``FMUEnv``."""
+        return cls(*[_is_own(env, base, field.name) for field in fields(cls)])
+
+    def __contains__(self, hook: str) -> bool:
+        """Whether the environment has a hook of its own, by the hook's name."""
+        return bool(getattr(self, hook.removeprefix("_")))
+
+
+def _is_own(env: Hooks, base: type[Any], name: str) -> bool:
+    name = name if name in {"step", "reset"} else f"_{name}"
+    found = getattr(env, name)
+    return getattr(found, "__func__", found) is not getattr(base, name)
 
 
 class Hooks(gymnasium.Env[Any, Any], ABC):
@@ -43,7 +76,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
     _interface: Interface
     _action_values: Sequence[int] | None
-    _is_goal_task: bool
+    _own: OwnHooks
     _observe: Callable[[Any], Any]
 
     # In the order of a step.
@@ -81,7 +114,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
             otherwise. For a goal task, ``_goal_reward`` of this observation.
         """
         positive, negative = self.config.positive_reward, self.config.negative_reward
-        if self._is_goal_task:
+        if self._own.goal_reward:
             return self._reward_for_goals(self._get_observation())
         if isinstance(self.done, bool):
             return negative if self.done else positive

@@ -34,6 +34,7 @@ from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMULoadError
+from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.cache import recall, remember
@@ -149,8 +150,8 @@ class _Outcome:
 
     @property
     def said(self) -> str:
-        """The last lines of output, to end an error's text."""
-        return f"; its last lines: {' | '.join(self.last_lines)}" if self.last_lines else ""
+        """The telling ones of the last lines of output, to end an error's text."""
+        return quoted(as_messages(self.last_lines), "its last lines")
 
 
 def meet(fmu: FMU) -> None:

@@ -25,6 +25,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.local import local_pool
+from fmugym.pool.process.output import print_line_by_line
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
@@ -34,9 +35,6 @@ from fmugym.trial.verdict import Grade, Neighbours
 
 _NO_DIALOGUES: Final = 0x0003
 """``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""
-
-_LINE_BUFFERED: Final = 1
-"""``_IOLBF`` of glibc, musl and macOS."""
 
 
 class Notes:
@@ -90,15 +88,7 @@ def _prepare(timeout: float) -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        _print_line_by_line()
-
-
-def _print_line_by_line() -> None:
-    """Flush C's output to a pipe after each line; a crash would lose what is buffered."""
-    library = ctypes.CDLL(None)
-    name = "__stdoutp" if sys.platform == "darwin" else "stdout"
-    stream = ctypes.c_void_p.in_dll(library, name)
-    library.setvbuf(stream, None, _LINE_BUFFERED, ctypes.c_size_t(0))
+        print_line_by_line()
 
 
 def _try_alone(candidate: Candidate, notes: Notes) -> bool:

@@ -1,29 +1,29 @@
 """Methods of single environments, called where N environments share their attributes.
 
-A single environment of a batch is a view: what a method assigns to it has to be found and taken
-over by the batch.
+The prototype stands in for each of them in turn: what a method assigns to it has to be found and
+taken over by the batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.task.readings import READINGS
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.views import copied_attributes, differs
+from fmugym.vector.contents import Contents
 
 __all__ = ["TOGETHER", "MethodCall", "attribute", "checked_name", "require_settable"]
 
 TOGETHER: Final = frozenset({"close", "reset", "step"})
 """Methods that one environment cannot do alone."""
 
-_KEPT_FOR_ALL: Final = frozenset(
-    {"action", "action_space", "after_end", "config", "done", "fmu", "inputs", "logger"}
-    | {"metadata", "observation_space", "out", "parameters", "previous_action", "previous_state"}
-    | {"render_mode", "spec", "state", "step_count", "variables"}
-)
+_KEPT_FOR_ALL: Final = frozenset(READINGS) | {
+    *("action_space", "config", "fmu", "logger", "metadata", "observation_space"),
+    *("render_mode", "spec"),
+}
 """Attributes that ``FMUEnv`` sets itself."""
 
 
@@ -64,49 +64,55 @@ def attribute(env: FMUEnv, name: Any) -> Any:
 
 
 class MethodCall:
-    """Calls a method of one environment, and finds what the method has assigned.
+    """What a method of one environment of a batch has assigned.
 
-    Args:
-        env: A view of the environment; its attributes become copies.
-        index: Its number.
+    Attributes:
+        index: The number of the environment.
+        attributes: The attributes that the method has assigned, by name.
+        variables: The episode variables that it has assigned, by name.
     """
 
-    def __init__(self, env: FMUEnv, index: int) -> None:
+    def __init__(self, index: int) -> None:
         self.index = index
-        self._env = env
-        own = copied_attributes(env)
-        own.pop("variables", None)  # these are the view's own already
-        vars(env).update(own)
-        self._attributes = vars(env) | copied_attributes(env)
-        self._same = dict(vars(env))
-        self._variables = dict(env.variables)
+        self.attributes: dict[str, Any] = {}
+        self.variables: dict[str, Any] = {}
 
-    def __call__(self, name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Any:
-        """Call the method, or return the attribute if it is none."""
-        value = attribute(self._env, name)
-        return value(*arguments, **keywords) if callable(value) else value
+    def run(
+        self, env: FMUEnv, name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]
+    ) -> Any:
+        """Call the method, or return the attribute if it is none.
 
-    def assigned_attributes(self) -> dict[str, Any]:
-        """The attributes that the method has assigned, by name.
+        Args:
+            env: The prototype, which reads the values of this environment. Afterwards it is as
+                before, also in the objects that it holds.
+            name: The name of the method.
+            arguments: The arguments of the method by position.
+            keywords: Those by name.
 
         Raises:
-            ConfigError: If one is the environment's own, or the method changed one in place.
+            ConfigError: If the method assigns what the environment keeps itself, or changes an
+                attribute in place.
         """
-        assigned = {}
-        for name, value in vars(self._env).items():
-            if name == "variables":
-                continue
-            if name not in self._same or value is not self._same[name]:
+        contents, before = Contents(env), dict(vars(env))
+        variables = dict(env.variables)
+        try:
+            value = attribute(env, name)
+            returned = value(*arguments, **keywords) if callable(value) else value
+            self._note_attributes(before, vars(env), contents.changed_in_place())
+            self.variables = {n: v for n, v in env.variables.items() if variables[n] is not v}
+        finally:
+            contents.restore()
+        return returned
+
+    def _note_attributes(
+        self, before: Mapping[str, Any], after: Mapping[str, Any], in_place: Collection[str]
+    ) -> None:
+        for name, value in after.items():
+            if name not in before or value is not before[name]:
                 require_settable(name)
-                assigned[name] = value
-            elif differs(self._attributes[name], value):
+                self.attributes[name] = value
+            elif name in in_place:
                 raise ConfigError(
                     f"a method changes self.{name} in place, which all environments share: let it "
                     "assign a number instead, or make the vector environment with hooks='per_env'"
                 )
-        return assigned
-
-    def assigned_variables(self) -> dict[str, Any]:
-        """The episode variables that the method has assigned, by name."""
-        before = self._variables
-        return {n: value for n, value in self._env.variables.items() if before[n] is not value}

@@ -41,8 +41,10 @@ static PyObject *statistics(PyObject *module, PyObject *unused) {
 
     (void)module;
     (void)unused;
-    return Py_BuildValue("{sKsKsK}", "jobs", (unsigned long long)s.jobs, "wakes",
-                         (unsigned long long)s.wakes, "chunks", (unsigned long long)s.chunks);
+    return Py_BuildValue("{sKsKsKsK}", "jobs", (unsigned long long)s.jobs, "wakes",
+                         (unsigned long long)s.wakes, "early_wakes",
+                         (unsigned long long)s.early_wakes, "chunks",
+                         (unsigned long long)s.chunks);
 }
 
 static PyMethodDef functions[] = {

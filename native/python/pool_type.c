@@ -12,18 +12,14 @@ PyObject *decode(const char *text) {
 
 /* Messages go to Python after a call, on the thread that made the call. */
 
-/* An ordinary exception in the receiver must not stop the pool. Any other, such as one from
- * Ctrl-C or sys.exit, goes to the caller. */
+/* The caller gets what the receiver raises: it may come from a signal handler that ran in it. */
 static bool report(PyPool *self, const Message *message) {
     PyObject *result =
         PyObject_CallFunction(self->callback, "niNN", (Py_ssize_t)message->index, message->status,
                               decode(message->category), decode(message->text));
 
-    if (result == NULL && PyErr_ExceptionMatches(PyExc_Exception)) {
-        PyErr_WriteUnraisable(self->callback);
-    }
     Py_XDECREF(result);
-    return !PyErr_Occurred();
+    return result != NULL;
 }
 
 static bool report_dropped(PyPool *self) {
@@ -32,18 +28,16 @@ static bool report_dropped(PyPool *self) {
     return report(self, &message);
 }
 
-/* If an exception interrupts this, the next call reports the remaining messages. Signals are
- * checked before each message. Otherwise the exception of a signal handler would count as the
- * receiver's. */
+/* If an exception interrupts this, the next call reports the remaining messages. */
 static bool drain(PyPool *self) {
     size_t dropped;
     Message *left = log_take(&self->pool.log, &dropped);
-    bool good = PyErr_CheckSignals() == 0;
+    bool good = true;
 
     while (good && left != NULL) {
         Message *message = left;
         left = message->next;
-        good = report(self, message) && PyErr_CheckSignals() == 0;
+        good = report(self, message);
         message_free(message);
     }
     if (good && dropped > 0) {
@@ -146,6 +140,7 @@ static void pool_dealloc(PyObject *object) {
         release_buffer(&self->buffers[i]);
     }
     free(self->paths);
+    free(self->categories);
     free(self->strings);
     Py_XDECREF(self->playing);
     Py_XDECREF(self->streams);
@@ -157,7 +152,7 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
@@ -178,12 +173,12 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 }
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
-    static char *names[] = {"version", "model",   "token",  "resources", "paths",
-                            "private", "logging", "states", NULL};
+    static char *names[] = {"version", "model",   "token",  "resources",  "paths",
+                            "private", "logging", "states", "categories", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iyyyO!ppp:library", names, &a->version, &s->model, &s->token,
+    return parse_group(group, "$iyyyO!pppO!:library", names, &a->version, &s->model, &s->token,
                        &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save);
+                       &a->can_save, &PyTuple_Type, &a->categories);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -252,19 +247,35 @@ static bool take_optional(PyObject *object, bool *given, double *value) {
     return !PyErr_Occurred();
 }
 
+/* Returns the texts of a tuple of bytes. Returns NULL with an exception if it holds others. */
+static const char **take_texts(PyObject *tuple) {
+    const Py_ssize_t count = PyTuple_Size(tuple);
+    const char **texts = calloc((size_t)count + 1, sizeof *texts);
+
+    if (texts == NULL) {
+        PyErr_NoMemory();
+    }
+    for (Py_ssize_t i = 0; i < count && texts != NULL; i++) {
+        texts[i] = PyBytes_AsString(PyTuple_GetItem(tuple, i));
+        if (texts[i] == NULL) {
+            free(texts);
+            return NULL;
+        }
+    }
+    return texts;
+}
+
+static bool take_categories(PyPool *self, PyObject *categories) {
+    self->categories = take_texts(categories);
+    return self->categories != NULL;
+}
+
 static bool take_paths(PyPool *self, PyObject *paths, Py_ssize_t wanted) {
     const Py_ssize_t count = PyTuple_Size(paths);
 
-    self->paths = calloc((size_t)count + 1, sizeof *self->paths);
+    self->paths = take_texts(paths);
     if (self->paths == NULL) {
-        PyErr_NoMemory();
         return false;
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        self->paths[i] = PyBytes_AsString(PyTuple_GetItem(paths, i));
-        if (self->paths[i] == NULL) {
-            return false;
-        }
     }
     if (count != wanted) {
         PyErr_Format(PyExc_ValueError, "%zd libraries are wanted, not %zd", wanted, count);
@@ -332,6 +343,8 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->count = (size_t)a->count;
     s->threads = (size_t)a->threads;
     s->paths = self->paths;
+    s->categories = self->categories;
+    s->number_of_categories = (size_t)PyTuple_Size(a->categories);
     s->strings = self->strings;
     s->number_of_strings = (size_t)PyTuple_Size(a->strings);
     s->output_values = self->buffers[OUTPUTS].buf;
@@ -343,7 +356,7 @@ static bool settle(PyPool *self, const Arguments *a) {
 
 static bool open_pool(PyPool *self) {
     const Settings settings = self->pool.settings;
-    char error[2048];
+    char error[8192];
     bool opened;
 
     self->opened = true;
@@ -385,7 +398,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     self->arguments = copy_of_groups(kwargs);
     if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
         check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
-        take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
+        take_categories(self, a.categories) && take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
         open_pool(self)) {
         return (PyObject *)self;
     }

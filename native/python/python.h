@@ -31,7 +31,7 @@ typedef struct {
     PyObject *callback;  /* borrowed from arguments, as are the arrays */
     PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
-    const char **paths;
+    const char **paths, **categories;
     StringValue *strings;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
     PyObject *streams;

@@ -1,4 +1,4 @@
-/* The animals of the zoo as FMUs of FMI 1.0. */
+/* The models as FMUs of FMI 1.0. */
 
 #include "zoo.h"
 
@@ -10,7 +10,7 @@ typedef struct {
 void *Zoo_fmiInstantiateSlave(const char *name, const char *token, const char *location,
                               const char *type, double timeout, char visible, char interactive,
                               Callbacks callbacks, char logging) {
-    return zoo_instantiate(name, token, callbacks.logger, NULL);
+    return zoo_instantiate(name, token, location, callbacks.logger, NULL);
 }
 
 void Zoo_fmiFreeSlaveInstance(Animal *me) {
@@ -30,7 +30,7 @@ int Zoo_fmiResetSlave(Animal *me) {
 }
 
 int Zoo_fmiDoStep(Animal *me, double time, double step_size, char new_step) {
-    return zoo_step(me, step_size);
+    return zoo_step(me, step_size, false);
 }
 
 int Zoo_fmiGetReal(Animal *me, const unsigned *references, size_t count, double *values) {

@@ -1,4 +1,4 @@
-/* The animals of the zoo as FMUs of FMI 2.0. */
+/* The models as FMUs of FMI 2.0. */
 
 #include "zoo.h"
 
@@ -9,7 +9,7 @@ typedef struct {
 
 void *fmi2Instantiate(const char *name, int type, const char *token, const char *location,
                       const Callbacks *callbacks, int visible, int logging) {
-    return zoo_instantiate(name, token, callbacks->logger, callbacks->environment);
+    return zoo_instantiate(name, token, location, callbacks->logger, callbacks->environment);
 }
 
 void fmi2FreeInstance(Animal *me) {
@@ -38,7 +38,12 @@ int fmi2Reset(Animal *me) {
 }
 
 int fmi2DoStep(Animal *me, double time, double step_size, int no_set_state) {
-    return zoo_step(me, step_size);
+    return zoo_step(me, step_size, no_set_state);
+}
+
+int fmi2GetBooleanStatus(Animal *me, int kind, int *value) {
+    *value = zoo_stops(me);
+    return OK;
 }
 
 int fmi2GetReal(Animal *me, const unsigned *references, size_t count, double *values) {

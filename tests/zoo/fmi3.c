@@ -1,4 +1,4 @@
-/* The animals of the zoo as FMUs of FMI 3.0. */
+/* The models as FMUs of FMI 3.0. */
 
 #include "zoo.h"
 
@@ -6,7 +6,7 @@ void *fmi3InstantiateCoSimulation(const char *name, const char *token, const cha
                                   bool visible, bool logging, bool event_mode, bool early_return,
                                   const unsigned *intermediate, size_t intermediate_count,
                                   void *environment, Logger logger, void *intermediate_update) {
-    return zoo_instantiate(name, token, logger, environment);
+    return zoo_instantiate(name, token, resources, logger, environment);
 }
 
 void fmi3FreeInstance(Animal *me) {
@@ -32,9 +32,12 @@ int fmi3Reset(Animal *me) {
 
 int fmi3DoStep(Animal *me, double time, double step_size, bool no_set_state, bool *events,
                bool *stop, bool *early, double *last) {
-    *events = *stop = *early = false;
+    const int status = zoo_step(me, step_size, no_set_state);
+
+    *events = *early = false;
+    *stop = zoo_stops(me);
     *last = time + step_size;
-    return zoo_step(me, step_size);
+    return status;
 }
 
 int fmi3GetFloat64(Animal *me, const unsigned *references, size_t count, double *values,

@@ -1,3 +1,9 @@
+/* FMUs that do wrong what they are told to.
+
+   y' = u, read with each step. The parameters say what happens ("fault"), in which call ("call"),
+   and after how many steps ("at"); "status" is what STATUS returns. Parameters come too late for
+   some faults, which the instantiation token asks for: see zoo_instantiate. */
+
 #define _GNU_SOURCE
 #include "zoo.h"
 
@@ -17,6 +23,40 @@
 
 enum { LEAKED_BYTES = 4 << 20, PAGE = 4096, LINES = 20000, MESSAGES = 200, DESCRIPTORS = 200,
        SECONDS = 30 };
+
+enum variable { U, Y, FAULT, CALL, AT, STATUS_CODE, VARIABLES };
+
+enum fault {
+    NONE,
+    SEGV,
+    FPE,
+    ILL,
+    BUS,
+    ABORT,
+    LEAVE,
+    OVERFLOW,
+    LOOP,
+    SLEEP,
+    CLOSE_STANDARD,
+    CLOSE_OTHERS,
+    STATUS,
+    NOT_A_NUMBER,
+    INFINITE,
+    PRINT,
+    PRINT_NO_NEWLINE,
+    PRINT_MUCH,
+    LOG_FROM_THREAD,
+    ROUND_UP,
+    FLUSH_DENORMALS,
+    CHANGE_DIRECTORY,
+    CHANGE_ENVIRONMENT,
+    LEAK,
+    DO_NOTHING,
+    FORK,
+    FORK_AND_CRASH,
+    FORK_AND_LOOP,
+    FORK_A_TWIN
+};
 
 struct Animal {
     double values[VARIABLES];
@@ -247,7 +287,8 @@ static int take_parameters(Animal *me, const char *token) {
 /* Tokens: "{zoo}"; "{zoo alone}" for one instance at a time; "{zoo share}" for y in a global
    variable; "{zoo FAULT CALL STATUS}" for a fault in a call before parameters are set. An
    instantiation with another status than OK gives NULL. */
-Animal *zoo_instantiate(const char *name, const char *token, Logger logger, void *environment) {
+Animal *zoo_instantiate(const char *name, const char *token, const char *location, Logger logger,
+                        void *environment) {
     Animal *me = calloc(1, sizeof *me);
     if (me == NULL) {
         return NULL;
@@ -294,7 +335,11 @@ int zoo_initialize(Animal *me) {
     return is_fine(status) ? zoo_exit(me) : status;
 }
 
-int zoo_step(Animal *me, double step_size) {
+bool zoo_stops(const Animal *me) {
+    return false;
+}
+
+int zoo_step(Animal *me, double step_size, bool no_set_state) {
     me->steps++;
     shared_y += step_size * me->values[U];
     me->values[Y] = me->shares ? shared_y : me->values[Y] + step_size * me->values[U];

@@ -140,6 +140,7 @@ class ProcessPool(CountedPool):
             block = supervisor.block
             told = None if number in supervisor.known else variables
             supervisor.known.add(number)
+            supervisor.forget_output()
             supervisor.tell("reset", number, told, values[:, block], mask[block])
 
         for supervisor, growth in self._crew.run("a reset", alive, tell).items():
@@ -256,7 +257,7 @@ class ProcessPool(CountedPool):
                     "a question", [supervisor], lambda s: s.tell("failure", within)
                 )
                 for text in texts.values():
-                    return str(text)
+                    return f"{text}{supervisor.printed}"
             return supervisor.reason
 
     def _count_steps(self) -> None:

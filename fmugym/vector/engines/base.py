@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,11 +31,13 @@ class Engine(ABC):
     Attributes:
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
+        has_moved: Whether the last step or reset got as far as the FMUs.
     """
 
     def __init__(self, num_envs: int) -> None:
         self.ended = np.zeros(num_envs, np.bool_)
         self.any_ended = False
+        self.has_moved = False
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""
@@ -61,8 +64,16 @@ class Engine(ABC):
         """Return the seed of an environment's generator."""
 
     @abstractmethod
-    def single(self, index: int) -> FMUEnv:
-        """Return one environment as a single one, to read it and call its methods."""
+    def close(self) -> None:
+        """Close the environments, but not the pool."""
+
+    @abstractmethod
+    def single(self, index: int) -> AbstractContextManager[FMUEnv]:
+        """Lend one environment as a single one, to read it and call its methods."""
+
+    @abstractmethod
+    def read(self, name: str, index: int) -> Any:
+        """Read an attribute, or else a parameter of the FMU, of one environment."""
 
     @abstractmethod
     def call(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from types import MappingProxyType
+from functools import partial
+from types import MappingProxyType, MethodType
 from typing import Any
 
 import numpy as np
@@ -18,13 +20,15 @@ from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import fault_rates
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.readings import Readings, reading
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
+from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results
 from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of, within
 from fmugym.vector.streams import EpisodeStreams
-from fmugym.vector.views import batched, column
+from fmugym.vector.views import batched, column, take
 
 __all__ = ["BatchEngine"]
 
@@ -49,10 +53,9 @@ class BatchEngine(Engine):
         self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
         self._foreign = np.zeros(num_envs, np.bool_)
-        batched(env, num_envs)
-        env._values, env.inputs = self._pool.outputs, self._pool.inputs
-        env.state = self._pool.outputs[: env._output_count]
-        env._was_reset = True  # for the views of single environments
+        batched(env, num_envs, self._pool.outputs, self._pool.inputs).place_in(env)
+        env._was_reset = True  # for the calls on single environments
+        self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
         self._outputs_before: FloatArray = self._pool.outputs
         self._variables_before: dict[str, FloatArray] = {}
@@ -81,9 +84,32 @@ class BatchEngine(Engine):
         """See ``Engine.seed_of``."""
         return self._streams.seed_of(index)
 
-    def single(self, index: int) -> FMUEnv:
-        """See ``Engine.single``; the environment is a view."""
-        return column(self.env, index)
+    def close(self) -> None:
+        """See ``Engine.close``."""
+        self.env.close()
+
+    @contextmanager
+    def single(self, index: int) -> Iterator[FMUEnv]:
+        """See ``Engine.single``; the prototype stands in for the environment."""
+        env = self.env
+        own = {name: take(row, index) for name, row in self._columns.items()}
+        with reading(env, column(Readings.of(env), index)):
+            _set_all(env, own | {"_pool": PoolColumn(self._pool, index)})
+            try:
+                yield env
+            finally:
+                _set_all(env, self._columns | {"_pool": self._pool})
+
+    def read(self, name: str, index: int) -> Any:
+        """See ``Engine.read``; a method that is called later reads the values of that moment."""
+        with self.single(index) as env:
+            value = attribute(env, name)
+        if isinstance(value, MethodType) and value.__self__ is self.env:
+            return partial(self._call_one, name, index)
+        return value
+
+    def _call_one(self, name: str, index: int, *arguments: Any, **keywords: Any) -> Any:
+        return self.call(name, [index], arguments, keywords)[0]
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """See ``Engine.set_attribute``; values may only differ if they are numbers."""
@@ -92,7 +118,7 @@ class BatchEngine(Engine):
     def _of_all(self, name: str, values: Mapping[int, Any]) -> tuple[Any, bool]:
         """The value for all environments, and whether it is an array with one for each."""
         if len(values) < self._n:
-            present = {i: attribute(self.single(i), name) for i in range(self._n)}
+            present = {i: self.read(name, i) for i in range(self._n)}
             values = {**present, **values}
         each = [values[index] for index in range(self._n)]
         if all(value is each[0] for value in each):
@@ -100,12 +126,11 @@ class BatchEngine(Engine):
         return _row_of(name, each), True
 
     def _assign(self, attributes: Mapping[str, tuple[Any, bool]]) -> None:
-        rows = {n: row for n, row in self.env._per_env_attributes.items() if n not in attributes}
         for name, (value, is_row) in attributes.items():
             setattr(self.env, name, value)
+            self._columns.pop(name, None)
             if is_row:
-                rows[name] = value
-        self.env._per_env_attributes = rows
+                self._columns[name] = value
 
     def call(
         self,
@@ -115,15 +140,17 @@ class BatchEngine(Engine):
         keywords: Mapping[str, Any],
     ) -> list[Any]:
         """See ``Engine.call``."""
-        calls = [MethodCall(self.single(index), index) for index in indices]
-        returned = [call(name, arguments, keywords) for call in calls]
+        calls, returned = [MethodCall(index) for index in indices], []
+        for call in calls:
+            with self.single(call.index) as env:
+                returned.append(call.run(env, name, arguments, keywords))
         attributes = {
             attribute_name: self._of_all(attribute_name, values)
-            for attribute_name, values in _by_name(calls, MethodCall.assigned_attributes).items()
+            for attribute_name, values in _by_name(calls, lambda call: call.attributes).items()
         }
         variables = {
             variable: self._with(variable, values)
-            for variable, values in _by_name(calls, MethodCall.assigned_variables).items()
+            for variable, values in _by_name(calls, lambda call: call.variables).items()
         }
         if attributes:
             self._assign(attributes)
@@ -154,6 +181,7 @@ class BatchEngine(Engine):
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
+        self.has_moved = False
         indices = np.flatnonzero(mask)
         self._streams.seed(seeds, indices)
         drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
@@ -180,6 +208,7 @@ class BatchEngine(Engine):
     ) -> dict[str, FloatArray]:
         """Draw and start episodes; return the values for the info, by name."""
         values = self._draw(indices, plan)
+        self.has_moved = True
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
@@ -260,6 +289,7 @@ class BatchEngine(Engine):
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         env, pool = self.env, self._pool
+        self.has_moved = False
         actions = self._checked(actions)
         env._in_hooks = True
         try:
@@ -268,6 +298,7 @@ class BatchEngine(Engine):
             if resetting is not None:
                 drawn = self._begin(resetting, np.flatnonzero(resetting), env._plan)
             observed = self._new_observations()
+            self.has_moved = True
             pool.step(None, resetting, observed)
             env.step_count += 1
             if resetting is None:
@@ -332,7 +363,7 @@ class BatchEngine(Engine):
 
     def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
         env = self.env
-        if env._has_update:
+        if env._own.update:
             self._update(resetting, self._failed(self._pool.statuses))
         terminated = results.flags("_is_done", env._is_done(), self._n)
         statuses = self._pool.statuses
@@ -341,7 +372,7 @@ class BatchEngine(Engine):
             terminated |= self._stopped(statuses)
         env.done = terminated
         truncated = self._reached_limit()
-        if env._has_truncation:
+        if env._own.is_truncated:
             truncated |= results.flags("_is_truncated", env._is_truncated(), self._n)
         rewards = results.rewards(env._reward_policy(), self._n)
         if resetting is not None:
@@ -425,7 +456,8 @@ class BatchEngine(Engine):
             self._end_with_faults(result, dict(sorted(reasons.items())), failed)
 
     def _when(self, index: int) -> str:
-        return f" at t = {self.single(index).time:g} s"
+        with self.single(index) as env:
+            return f" at t = {env.time:g} s"
 
     def _end_with_faults(
         self, result: StepResult, reasons: Mapping[int, str], failed: MaskArray
@@ -454,7 +486,7 @@ class BatchEngine(Engine):
         """Return environments to the state before a step whose numbers are not finite."""
         env, pool = self.env, self._pool
         pool.outputs[:, mask] = self._outputs_before[:, mask]
-        if env._has_update:
+        if env._own.update:
             self._restore_variables(mask)
         for index in np.flatnonzero(mask).tolist():
             pool.note_fault(index)
@@ -473,6 +505,11 @@ class BatchEngine(Engine):
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
     """The indices of the environments in both masks; None stands for an empty mask."""
     return [] if rows is None else np.flatnonzero(rows & mask).tolist()
+
+
+def _set_all(env: FMUEnv, attributes: Mapping[str, Any]) -> None:
+    for name, value in attributes.items():
+        setattr(env, name, value)
 
 
 def _by_name(

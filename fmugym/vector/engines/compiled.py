@@ -13,7 +13,9 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.extension import require_refusal
 from fmugym.task import spaces as fmu_spaces
+from fmugym.task.readings import Readings
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.engines.base import StepResult
@@ -23,7 +25,6 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
-from fmugym.vector.views import light_copy
 
 __all__ = ["CompiledEngine", "find_programs"]
 
@@ -53,7 +54,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
     try:
         _require_playable(env)
         task = trace_hooks(env)
-        require_same(sample_states(env, _SCALES), task)
+        require_same(env, sample_states(env, _SCALES), task)
     except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
@@ -242,17 +243,14 @@ class CompiledEngine(BatchEngine):
         super()._assign(attributes)
         task: TracedTask | None = None
         try:
+            if self._columns:
+                raise UntraceableError("environments have attributes of their own")
             task = trace_hooks(self.env)
-            require_same(self._copy_for_hooks(), task)
+            require_same(self.env, Readings.of(self.env), task)
         except Exception as reason:  # as in find_programs
             logger.info("the hooks cannot be compiled any more: %s", reason)
             task = None
         self._prepare(task)
-
-    def _copy_for_hooks(self) -> FMUEnv:
-        batch = light_copy(self.env)
-        batch._in_hooks = True
-        return batch
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
@@ -289,10 +287,15 @@ class CompiledEngine(BatchEngine):
         judged = rewards, terminated, truncated
         drawn = np.empty(self._drawn_shape)
         play = self._play if resetting is None else self._play_with_resets
+        self.has_moved = True
         try:
             troubled, ended = play(actions, seen, *judged, drawn)
-        except (TypeError, ValueError, BufferError):
-            troubled, ended = play(self._flat(actions), seen, *judged, drawn)
+        except (TypeError, ValueError, BufferError) as error:
+            require_refusal(error)
+            self.has_moved = False
+            actions = self._flat(actions)
+            self.has_moved = True
+            troubled, ended = play(actions, seen, *judged, drawn)
         self.any_ended = ended > 0
         infos: dict[str, Any] = {}
         observations = seen

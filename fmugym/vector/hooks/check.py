@@ -16,9 +16,10 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.readings import Readings, reading
 from fmugym.vector.actions import is_array_space
-from fmugym.vector.views import batched, column, copied_attributes, differs, light_copy
+from fmugym.vector.contents import Contents, borrowed, differs
+from fmugym.vector.views import batched, column, copied
 
 __all__ = ["CURE", "find_difference", "sample_states"]
 
@@ -37,7 +38,18 @@ _HOOKS = (
     "_get_observation",
     "_get_info",
 )
-_READ_ONLY = ("state", "previous_state", "inputs", "action", "previous_action", "_values")
+_IDLE = ("_update", "_is_truncated", "_get_info")
+"""Hooks that do nothing by default."""
+
+_READ_ONLY = (
+    "state",
+    "previous_state",
+    "inputs",
+    "action",
+    "previous_action",
+    "step_count",
+    "done",
+)
 
 _EPISODES, _STEPS = 2, 3
 """How many states of the FMU are tried; each is tried at other magnitudes, too."""
@@ -59,29 +71,32 @@ def find_difference(env: FMUEnv) -> str | None:
     Returns:
         The hook and how it differs on arrays, or None if all hooks work on arrays.
     """
-    cls = type(env)
-    for method in ("step", "reset"):
-        if getattr(cls, method) is not getattr(FMUEnv, method):
-            return f"{method} is overridden, which is for one environment only"
-    if not is_array_space(env.action_space):
-        return f"actions of {env.action_space} do not make one array"
-    if not _makes_arrays(env.observation_space):
-        return f"observations of {env.observation_space} do not make arrays"
-    scales = (_SCALES[:1], _SCALES[1:], _WILD_SCALES)
-    kinds = [sample_states(env, some) for some in scales]
-    with np.errstate(all="ignore"), warnings.catch_warnings():
+    obstacle = _obstacle(env)
+    if obstacle is not None:
+        return obstacle
+    hooks = [hook for hook in _HOOKS if hook not in _IDLE or hook in env._own]
+    with np.errstate(all="ignore"), warnings.catch_warnings(), borrowed(env) as contents:
         warnings.simplefilter("ignore")
-        for name in filter(lambda hook: _does_something(cls, hook), _HOOKS):
+        kinds = [sample_states(env, some) for some in (_SCALES[:1], _SCALES[1:], _WILD_SCALES)]
+        for name in hooks:
             for index, batch in enumerate(kinds):
-                difference = _compare(name, batch, is_natural=index == 0)
+                comparison = _Comparison(env, contents, batch, name)
+                difference = comparison.run(is_natural=index == 0)
                 if difference is not None:
                     return f"{name} {difference}"
     return None
 
 
-def _does_something(cls: type[FMUEnv], hook: str) -> bool:
-    idle = hook in {"_update", "_is_truncated", "_get_info"}
-    return not idle or getattr(cls, hook) is not getattr(FMUEnv, hook)
+def _obstacle(env: FMUEnv) -> str | None:
+    """What keeps hooks from being called on arrays, whatever they compute."""
+    for method, is_own in (("step", env._own.step), ("reset", env._own.reset)):
+        if is_own:
+            return f"{method} is overridden, which is for one environment only"
+    if not is_array_space(env.action_space):
+        return f"actions of {env.action_space} do not make one array"
+    if not _makes_arrays(env.observation_space):
+        return f"observations of {env.observation_space} do not make arrays"
+    return None
 
 
 def _makes_arrays(space: spaces.Space[Any]) -> bool:
@@ -91,7 +106,7 @@ def _makes_arrays(space: spaces.Space[Any]) -> bool:
     return is_array_space(space)
 
 
-def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> FMUEnv:
+def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> Readings:
     """Make a batch of states that the FMU takes, each in several magnitudes.
 
     Args:
@@ -99,26 +114,23 @@ def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> FMUEnv:
         scales: The factors of the states, each with some noise.
 
     Returns:
-        A copy of the prototype for calling its hooks on arrays.
+        What hooks read in these states.
     """
     rng = np.random.default_rng(0)
     visited = _visit_states(env, rng)
     count = len(visited) * len(scales)
-    batch = light_copy(env)
-    batch.__dict__.update(copied_attributes(env))
-    batched(batch, count)
+    batch = batched(env, count)
     rows: dict[str, list[Any]] = {}
     for index in range(count):
-        _place_sample(batch, index, visited[index // len(scales)], rng, rows)
+        _place_sample(env, batch, index, visited[index // len(scales)], rng, rows)
         scale = scales[index % len(scales)]
         if scale != 1.0:
-            batch._values[:, index] *= scale * rng.uniform(0.5, 1.5, size=len(batch._values))
+            batch.values[:, index] *= scale * rng.uniform(0.5, 1.5, size=len(batch.values))
             batch.previous_state[:, index] *= scale
     for name, values in rows.items():
         if name in batch.variables:
             batch.variables[name] = np.array(values)
     batch.parameters = {n: np.array(v) for n, v in rows.items() if n not in batch.variables}
-    batch._in_hooks = True
     return batch
 
 
@@ -156,19 +168,20 @@ def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[_Visited]:
 
 
 def _place_sample(
-    batch: FMUEnv,
+    env: FMUEnv,
+    batch: Readings,
     index: int,
     visited: _Visited,
     rng: np.random.Generator,
     rows: dict[str, list[Any]],
 ) -> None:
-    before, batch._values[:, index], batch.inputs[:, index] = visited
-    batch.previous_state[:, index] = before[: batch._output_count]
+    before, batch.values[:, index], batch.inputs[:, index] = visited
+    batch.previous_state[:, index] = before[: env._output_count]
     batch.step_count[index] = 1 + index
     batch.done[index] = bool(rng.integers(2))
     for actions in (batch.action, batch.previous_action):
-        actions[..., index] = _sample(batch.action_space, rng)
-    episode = batch._plan.draw(rng)
+        actions[..., index] = _sample(env.action_space, rng)
+    episode = env._plan.draw(rng)
     for name, value in {**episode.parameters, **episode.variables}.items():
         rows.setdefault(name, []).append(value)
 
@@ -182,56 +195,57 @@ def _sample(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
         space._np_random = own
 
 
-def _compare(name: str, batch: FMUEnv, is_natural: bool) -> str | None:
-    """Say how a hook's results on arrays differ from those of single environments, or None."""
-    count = len(batch.step_count)
-    singles = [_single(batch, index) for index in range(count)]
-    before = [single.__dict__ | copied_attributes(single) for single in singles if is_natural]
-    one_by_one = [_call(single, name) for single in singles]
-    failures = sum(type(result) is _Failure for result in one_by_one)
-    if failures == count or (failures and not is_natural):
-        return None  # it fails either way: the first step will tell
-    for single, attributes in zip(singles, before, strict=is_natural):
-        changed = _changed(attributes, single)
-        if changed:
+class _Comparison(NamedTuple):
+    """Compares one hook on arrays with the same hook one environment at a time.
+
+    Attributes:
+        env: The prototype, whose hook is called.
+        contents: What the prototype holds; each call is undone.
+        batch: What hooks read.
+        name: The hook.
+    """
+
+    env: FMUEnv
+    contents: Contents
+    batch: Readings
+    name: str
+
+    def run(self, is_natural: bool) -> str | None:
+        """Say how the results differ, or None."""
+        count = len(self.batch.step_count)
+        calls = [self._call(column(self.batch, index)) for index in range(count)]
+        failures = sum(type(result) is _Failure for result, _ in calls)
+        if failures == count or (failures and not is_natural):
+            return None  # it fails either way: the first step will tell
+        changed = next((name for _, name in calls if name is not None), None)
+        if is_natural and changed is not None:
             return f"changes self.{changed}, which belongs in 'episode_variables'"
-    many = _independent(batch)
-    together = _call(many, name)
-    for attribute in _READ_ONLY:
-        if differs(getattr(batch, attribute), getattr(many, attribute)):
-            shown = "out" if attribute == "_values" else attribute
-            return f"changes the arrays in self.{shown} in place"
-    if type(together) is _Failure:
-        return f"fails on arrays ({together.text})"
-    for index, expected in enumerate(one_by_one):
-        if type(expected) is not _Failure and not _same(expected, together, index, count):
-            return "gives other values on arrays than one environment at a time"
-    return None
+        together, changed = self._call(copied(self.batch))
+        if changed == "out" or changed in _READ_ONLY:
+            return f"changes the arrays in self.{changed} in place"
+        if type(together) is _Failure:
+            return f"fails on arrays ({together.text})"
+        for index, (expected, _) in enumerate(calls):
+            if type(expected) is not _Failure and not _same(expected, together, index, count):
+                return "gives other values on arrays than one environment at a time"
+        return None
+
+    def _call(self, readings: Readings) -> tuple[Any, str | None]:
+        """Call the hook; return its result and the name of an attribute that it changes."""
+        before = _read_only(readings)
+        with reading(self.env, readings):
+            result = _result_of(self.env, self.name)
+            after = _read_only(Readings.of(self.env))
+        changed = [name for name, row in before.items() if differs(row, after[name])]
+        attribute = self.contents.changed()
+        self.contents.restore()
+        return result, changed[0] if changed else attribute
 
 
-def _single(batch: FMUEnv, index: int) -> FMUEnv:
-    single = column(batch, index)
-    attributes = copied_attributes(single)
-    del attributes["variables"]  # these are its own already
-    single.__dict__.update(attributes)
-    return single
-
-
-def _independent(batch: FMUEnv) -> FMUEnv:
-    """A copy whose variables and attributes a hook may change."""
-    copied = light_copy(batch)
-    copied.__dict__.update(copied_attributes(batch))
-    copied.variables = EpisodeVariables(batch.variables)
-    copied.variables.update({name: np.copy(value) for name, value in batch.variables.items()})
-    return copied
-
-
-def _changed(before: Mapping[str, Any], single: FMUEnv) -> str | None:
-    """The name of an attribute that a hook has changed."""
-    for name, value in single.__dict__.items():
-        if name != "variables" and (name not in before or differs(before[name], value)):
-            return name
-    return None
+def _read_only(readings: Readings) -> dict[str, Any]:
+    """Copy the readings that hooks must not change, by the names of the attributes."""
+    rows = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
+    return rows | {"out": np.copy(readings.values)}
 
 
 class _Failure(NamedTuple):
@@ -240,7 +254,7 @@ class _Failure(NamedTuple):
     text: str
 
 
-def _call(env: FMUEnv, name: str) -> Any:
+def _result_of(env: FMUEnv, name: str) -> Any:
     try:
         result = getattr(env, name)()
     except Exception as error:

@@ -10,45 +10,41 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.readings import Readings, reading
+from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.program import Row, UntraceableError, evaluate
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.views import copied_attributes, light_copy
+from fmugym.vector.views import copied
 
 __all__ = ["require_same"]
 
 
-def require_same(batch: FMUEnv, task: TracedTask) -> None:
+def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
     """Run programs in C and hooks on arrays, and compare all results to the last bit.
 
     Args:
-        batch: An environment whose attributes hold arrays of M environments; it is not changed.
+        env: The environment with the hooks.
+        batch: What the hooks read: arrays of M environments, which are not changed.
         task: The programs.
 
     Raises:
         UntraceableError: If a result differs. NaNs are equal, zeros of different sign are not.
     """
-    comparison = _Comparison(batch, task)
-    with np.errstate(all="ignore"):
+    own = copied(batch)
+    with np.errstate(all="ignore"), borrowed(env), reading(env, own):
+        comparison = _Comparison(env, task)
         comparison.compare_inputs()
         comparison.compare_judgement()
 
 
 class _Comparison:
-    def __init__(self, batch: FMUEnv, task: TracedTask) -> None:
-        self._task = task
-        self._count = len(batch.step_count)
-        env = self._env = light_copy(batch)
-        env.__dict__.update(copied_attributes(batch))
-        env._in_hooks = True
-        env._values = np.array(batch._values)
-        env.state = env._values[: env._output_count]
-        env.inputs = np.array(batch.inputs)
-        env.variables = EpisodeVariables(batch.config.episode_variables)
+    def __init__(self, env: FMUEnv, task: TracedTask) -> None:
+        self._env, self._task = env, task
+        self._count = len(env.step_count)
         self._stored: dict[Row, npt.NDArray[Any]] = {}
         for name, dtype in task.variables.items():
-            row = results.variable(name, batch.variables[name], self._count)
+            row = results.variable(name, env.variables[name], self._count)
             env.variables[name] = row.astype(dtype)
         self._before = {name: row.copy() for name, row in env.variables.items()}
         self._actions = (
@@ -109,7 +105,7 @@ class _Comparison:
         env, count = self._env, self._count
         seen = tuple(np.zeros((count, *a.shape), a.dtype) for a in self._task.seen)
         judged = evaluate(self._task.judgement, self._find, self._actions, seen)
-        if env._has_update:
+        if env._own.update:
             env._update()
         self._compare_variables()
         env.done = results.flags("_is_done", env._is_done(), count)

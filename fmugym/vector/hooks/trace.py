@@ -8,7 +8,7 @@ traced, and is called on arrays.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
@@ -19,7 +19,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import numpy_of
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
@@ -33,15 +35,8 @@ from fmugym.vector.hooks.symbols import (
     same_for_all,
     spread,
 )
-from fmugym.vector.views import copied_attributes, light_copy
 
 __all__ = ["SeenArray", "TracedTask", "trace_hooks"]
-
-_REPLACED: Final = frozenset(
-    {"state", "previous_state", "inputs", "action", "previous_action", "step_count", "done"}
-    | {"after_end"}
-)
-"""Attributes that become symbols anyway."""
 
 _MOST_TABLE: Final = 4096
 """The most elements of an attribute that hooks may look values up in."""
@@ -96,11 +91,10 @@ def trace_hooks(env: FMUEnv) -> TracedTask:
         UntraceableError: If the hooks do what a program cannot do; the text names the hook, the
             line and what it does.
     """
-    if env._per_env_attributes:
-        raise UntraceableError("environments have attributes of their own")
-    if getattr(env, "_pool_tells", False):
+    if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
-    return _Tracer(env).task()
+    with borrowed(env), reading(env, Readings.of(env)):
+        return _Tracer(env).task()
 
 
 class _Tracer:
@@ -113,7 +107,8 @@ class _Tracer:
     def __init__(self, env: FMUEnv) -> None:
         self._env = env
         self._graph = Graph()
-        self._symbolic = env
+        self._contents = Contents(env)
+        self._tables = dict(_tables(env))
         self._variables: dict[str, np.dtype[Any]] = {
             name: np.dtype(np.float64) for name in env.variables
         }
@@ -137,7 +132,7 @@ class _Tracer:
         done = self._flag("_is_done")
         stopped = self._graph.load("stopped", None, np.bool_, None)
         results = [self._or(done, stopped)]
-        self._symbolic.done = self._whole(results[0], np.dtype(np.bool_))
+        self._env.done = self._whole(results[0], np.dtype(np.bool_))
         results.append(self._flag("_is_truncated"))
         results.append(self._reward())
         seen, more = self._trace_seen()
@@ -146,17 +141,19 @@ class _Tracer:
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
-        self._symbolic = symbolic_env(self._env, self._graph, self._variables, judging)
+        for name, table in self._tables.items():
+            vars(self._env)[name] = lift(self._graph, table)
+        symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
+        self._contents = Contents(self._env)
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
         """Call a hook, and make nodes of what it returns."""
-        before = dict(vars(self._symbolic))
         try:
             with numpy_of(self._graph), np.errstate(all="ignore"):
-                value = getattr(self._symbolic, name)()
-            for attribute, now in vars(self._symbolic).items():
-                if now is not before.get(attribute, self):
-                    raise UntraceableError(f"it sets attributes: self.{attribute}")
+                value = getattr(self._env, name)()
+            changed = self._contents.changed()
+            if changed is not None:
+                raise UntraceableError(f"it changes self.{changed}")
             return of(value)
         except Exception as error:  # hooks do with numbers what symbols cannot do
             raise UntraceableError(_placed(self._env, name, error)) from error
@@ -224,18 +221,18 @@ class _Tracer:
 
     def _trace_update(self) -> tuple[list[Store], tuple[str, ...]]:
         """Trace ``_update``; environments that have not stepped keep their variables."""
-        if not self._env._has_update:
+        if not self._env._own.update:
             return [], ()
-        before = dict(self._symbolic.variables)
+        before = dict(self._env.variables)
         self._call("_update", lambda value: None)
         active = self._graph.load("active", None, np.bool_, None)
         stores, updated = [], []
         for name, old in before.items():
-            new = self._symbolic.variables[name]
+            new = self._env.variables[name]
             if new is old:
                 continue
             kept = self._kept_where_idle(name, new, old, active)
-            self._symbolic.variables[name] = kept
+            self._env.variables[name] = kept
             updated.append(name)
             nodes = same_for_all(kept).reshape(-1)
             stores += [Store(int(n), ("variable", name, i)) for i, n in enumerate(nodes)]
@@ -380,65 +377,58 @@ def _names(shape: tuple[int, ...], *head: Any) -> npt.NDArray[Any]:
     return names
 
 
-def symbolic_env(
+def symbolic_readings(
     env: FMUEnv, graph: Graph, variables: Mapping[str, np.dtype[Any]], judging: bool
-) -> FMUEnv:
-    """Copy an environment: symbols replace what hooks read.
-
-    Everything that tracing needs of the attributes of ``FMUEnv`` is in this function.
+) -> Readings:
+    """Make readings in which symbols stand for what programs load.
 
     Args:
-        env: The prototype, or the batch of an engine.
+        env: The prototype.
         graph: Records the operations.
         variables: The types of the episode variables.
         judging: Whether the FMU has stepped.
     """
-    count = len(env.out)
-    symbolic = light_copy(env)
-    symbolic.__dict__.update(copied_attributes(env))
-    _wrap_tables(symbolic, graph)
 
-    def rows(shape: tuple[int, ...], *head: Any, dtype: Any = np.float64) -> Symbols:
+    def rows(shape: tuple[int, ...], *head: Any, dtype: Any = np.float64) -> Any:
         return loaded(graph, "row", _names(shape, *head), dtype)
 
-    values: Any = rows((count,), "output")
-    symbolic._values = values
-    symbolic.state = values[: env._output_count]
-    symbolic.previous_state = (
-        rows((count,), "kept")[: env._output_count] if judging else symbolic.state
-    )
-    symbolic.out = NamedValues("output", list(env.out), lambda: values)
-    space: Any = env.action_space
-    for name in ("action", "previous_action"):
-        elements = np.arange(int(np.prod(space.shape or ()))).reshape(space.shape or ())
-        as_objects = np.empty(elements.shape, object)
-        for place in np.ndindex(elements.shape):
-            as_objects[place] = int(elements[place])
-        setattr(symbolic, name, loaded(graph, name, as_objects, space.dtype))
-    symbolic.inputs = rows((len(env._interface.inputs),), "input")
-    parameters = {name: rows((), "parameter", name) for name in env._interface.parameters}
-    symbolic.parameters = MappingProxyType(parameters)
-    symbolic.variables = EpisodeVariables(env.config.episode_variables)
+    values = rows((len(env.out),), "output")
+    state = values[: env._output_count]
+    names = EpisodeVariables(env.config.episode_variables)
     for name, dtype in variables.items():
-        shape = _shape_of_variable(env, name)
-        head = "before" if judging else "variable"
-        symbolic.variables[name] = rows(shape, head, name, dtype=dtype)
-    symbolic.step_count = rows((), "step_count", dtype=np.int64)
-    symbolic.after_end = lift(graph, np.zeros(LANES, np.bool_))
+        shape = np.shape(env.config.episode_variables[name])
+        names[name] = rows(shape, "before" if judging else "variable", name, dtype=dtype)
     missing = np.array("it reads self.done before there is one", object)
-    symbolic.done = loaded(graph, "missing", missing, np.bool_)
-    symbolic._in_hooks = True
-    return symbolic
+    return Readings(
+        values=values,
+        out=NamedValues("output", list(env.out), lambda: values),
+        state=state,
+        previous_state=rows((len(env.out),), "kept")[: env._output_count] if judging else state,
+        inputs=rows((len(env._interface.inputs),), "input"),
+        action=_symbolic_action(env, graph, "action"),
+        previous_action=_symbolic_action(env, graph, "previous_action"),
+        step_count=rows((), "step_count", dtype=np.int64),
+        done=loaded(graph, "missing", missing, np.bool_),
+        after_end=lift(graph, np.zeros(LANES, np.bool_)),
+        parameters=MappingProxyType(
+            {name: rows((), "parameter", name) for name in env._interface.parameters}
+        ),
+        variables=names,
+    )
 
 
-def _shape_of_variable(env: FMUEnv, name: str) -> tuple[int, ...]:
-    return np.shape(env.config.episode_variables[name])
+def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
+    space: Any = env.action_space
+    names = np.empty(space.shape or (), object)
+    for index, place in enumerate(np.ndindex(names.shape)):
+        names[place] = index
+    return loaded(graph, kind, names, space.dtype)
 
 
-def _wrap_tables(symbolic: FMUEnv, graph: Graph) -> None:
-    """Let hooks index arrays among the attributes with values."""
-    for name, value in vars(symbolic).items():
+def _tables(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """The arrays among the attributes that hooks may index with values."""
+    for name, value in vars(env).items():
         is_table = type(value) is np.ndarray and value.dtype.kind in "biuf"
         is_table = is_table and value.dtype.itemsize <= 8 and 0 < value.size <= _MOST_TABLE
-        if is_table and not name.startswith("_") and name not in _REPLACED:
-            vars(symbolic)[name] = lift(graph, value)
+        if is_table and not name.startswith("_") and name not in READINGS:
+            yield name, value

@@ -1,0 +1,251 @@
+"""The contents of the objects that an environment holds, to find and undo what hooks change."""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import PurePath
+from types import CellType, FunctionType, MappingProxyType, MethodType, ModuleType
+from typing import Any, Final, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.env import FMUEnv
+from fmugym.task.readings import READINGS
+
+__all__ = ["Contents", "borrowed", "differs"]
+
+_NOT_COMPARED: Final = frozenset(
+    {*READINGS, "_in_hooks", "_input_row", "_output_row", "_observation_row"}
+)
+"""Attributes that the caller of hooks and the pool change."""
+
+_OURS: Final = ("fmugym", "gymnasium", "logging")
+"""Packages whose objects hooks only read."""
+
+
+class _Kind(NamedTuple):
+    """A kind of object that can change in place.
+
+    Attributes:
+        copy: Copies the contents, but not the objects in them.
+        restore: Writes such a copy back to the object.
+        parts: The objects in the contents.
+    """
+
+    copy: Callable[[Any], Any]
+    restore: Callable[[Any, Any], Any]
+    parts: Callable[[Any], Iterable[Any]]
+
+
+class _Kept(NamedTuple):
+    attribute: str
+    value: Any
+    kind: _Kind
+    contents: Any
+
+
+class Contents:
+    """The contents of all objects that the attributes of an environment lead to.
+
+    Lists, dicts, arrays, random generators, instances of classes and variables of closures are
+    followed to any depth. What extension types hold is not seen.
+
+    Args:
+        env: The environment.
+    """
+
+    def __init__(self, env: FMUEnv) -> None:
+        self._attributes = vars(env)
+        self._before = dict(self._attributes)
+        self._kept: list[_Kept] = []
+        seen = {id(env)}
+        for name, value in self._before.items():
+            if name not in _NOT_COMPARED:
+                self._keep(name, value, seen)
+
+    def _keep(self, attribute: str, value: Any, seen: set[int]) -> None:
+        waiting = [value]
+        while waiting:
+            value = waiting.pop()
+            if id(value) in seen:
+                continue
+            seen.add(id(value))
+            with suppress(Exception):  # users' objects may fail in any way
+                kind = _kind_of(value)
+                if kind is None:
+                    continue
+                contents = kind.copy(value)
+                self._kept.append(_Kept(attribute, value, kind, contents))
+                waiting.extend(kind.parts(contents))
+
+    def changed(self) -> str | None:
+        """The name of an attribute that was set, or whose value has changed in place."""
+        before, in_place = self._before, self.changed_in_place()
+        for name, value in self._attributes.items():
+            if name in _NOT_COMPARED:
+                continue
+            if name in in_place or name not in before or differs(before[name], value):
+                return name
+        return None
+
+    def changed_in_place(self) -> set[str]:
+        """The names of the attributes whose values have changed in place."""
+        return {one.attribute for one in self._kept if _has_changed(one)}
+
+    def restore(self) -> None:
+        """Undo all changes."""
+        for one in filter(_has_changed, self._kept):
+            with suppress(Exception):  # as above
+                one.kind.restore(one.value, one.contents)
+        _restore_dict(self._attributes, self._before)
+
+
+@contextmanager
+def borrowed(env: FMUEnv) -> Iterator[Contents]:
+    """Use an environment for calls of its hooks; afterwards it and its objects are as before."""
+    before, env._in_hooks = env._in_hooks, True
+    contents = Contents(env)
+    try:
+        yield contents
+    finally:
+        contents.restore()
+        env._in_hooks = before
+
+
+def _has_changed(kept: _Kept) -> bool:
+    try:
+        return differs(kept.contents, kept.kind.copy(kept.value))
+    except Exception:  # users' objects may fail in any way
+        return False
+
+
+def _restore_dict(target: dict[str, Any], contents: Mapping[str, Any]) -> None:
+    dict.clear(target)
+    dict.update(target, contents)
+
+
+def _restore_list(target: Any, contents: Any) -> None:
+    target[:] = contents
+
+
+def _restore_by_methods(target: Any, contents: Any) -> None:
+    target.clear()
+    (target.extend if isinstance(target, deque) else target.update)(contents)
+
+
+def _restore_array(target: Any, contents: Any) -> None:
+    target[...] = contents
+
+
+def _parts_of_array(contents: Any) -> list[Any]:
+    return contents.ravel().tolist() if contents.dtype == object else []
+
+
+def _slots_of(value: Any) -> dict[str, Any]:
+    names = [n for cls in type(value).__mro__ for n in _names(getattr(cls, "__slots__", ()))]
+    return {n: getattr(value, n) for n in names if n != "__dict__" and hasattr(value, n)}
+
+
+def _names(slots: Any) -> list[str]:
+    return [slots] if isinstance(slots, str) else list(slots)
+
+
+def _attributes_of(value: Any) -> dict[str, Any]:
+    return _slots_of(value) | getattr(value, "__dict__", {})
+
+
+def _restore_attributes(target: Any, contents: Mapping[str, Any]) -> None:
+    for name in _attributes_of(target).keys() - contents.keys():
+        object.__delattr__(target, name)
+    for name, value in contents.items():
+        object.__setattr__(target, name, value)
+
+
+def _parts_of_function(function: Any) -> list[Any]:
+    return [*(function.__closure__ or ()), *(function.__defaults__ or ()), function.__kwdefaults__]
+
+
+def _nothing(*_: Any) -> tuple[()]:
+    return ()
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+_KINDS: Final[Mapping[type, _Kind]] = {
+    dict: _Kind(dict, _restore_dict, dict.values),
+    list: _Kind(list, _restore_list, _same),
+    bytearray: _Kind(bytes, _restore_list, _nothing),
+    set: _Kind(set, _restore_by_methods, _same),
+    deque: _Kind(list, _restore_by_methods, _same),
+    tuple: _Kind(_same, _nothing, _same),
+    frozenset: _Kind(_same, _nothing, _same),
+    MappingProxyType: _Kind(_same, _nothing, lambda proxy: proxy.values()),
+    np.ndarray: _Kind(np.copy, _restore_array, _parts_of_array),
+    np.random.Generator: _Kind(_same, _nothing, lambda generator: [generator.bit_generator]),
+    np.random.BitGenerator: _Kind(
+        lambda bits: bits.state, lambda bits, state: setattr(bits, "state", state), _nothing
+    ),
+    random.Random: _Kind(random.Random.getstate, random.Random.setstate, _nothing),
+    CellType: _Kind(
+        lambda cell: [cell.cell_contents],
+        lambda cell, contents: setattr(cell, "cell_contents", contents[0]),
+        _same,
+    ),
+    FunctionType: _Kind(_same, _nothing, _parts_of_function),
+    MethodType: _Kind(_same, _nothing, lambda method: [method.__self__]),
+    partial: _Kind(_same, _nothing, lambda made: [made.func, made.args, made.keywords]),
+}
+_INSTANCE: Final = _Kind(_attributes_of, _restore_attributes, dict.values)
+_PLAIN: Final = (
+    *(bool, int, float, complex, str, bytes, type(None), np.generic),
+    *(type, ModuleType, PurePath),
+)
+
+
+def _kind_of(value: Any) -> _Kind | None:
+    """How to keep the contents of an object; None if it has none that hooks could change."""
+    cls = type(value)
+    if issubclass(cls, _PLAIN):
+        return None
+    if cls.__module__.partition(".")[0] in _OURS or issubclass(cls, (gymnasium.Env, spaces.Space)):
+        return None
+    for base in cls.__mro__:
+        if base in _KINDS:
+            return _KINDS[base]
+    return _INSTANCE if hasattr(value, "__dict__") or hasattr(cls, "__slots__") else None
+
+
+def differs(before: Any, after: Any) -> bool:
+    """Whether a value has changed, if values of its type can be compared; NaNs are equal."""
+    if before is after:
+        return False
+    if type(before) is not type(after):
+        return True
+    try:
+        return _differ(before, after)
+    except Exception:  # users' values may raise anything when compared
+        return False
+
+
+def _differ(before: Any, after: Any) -> bool:
+    if isinstance(before, np.random.Generator):
+        return bool(before.bit_generator.state != after.bit_generator.state)
+    if isinstance(before, np.ndarray):
+        return not np.array_equal(before, after, equal_nan=before.dtype.kind in "fc")
+    if isinstance(before, list | tuple):
+        return len(before) != len(after) or any(map(differs, before, after))
+    if isinstance(before, dict):
+        return before.keys() != after.keys() or any(differs(before[k], after[k]) for k in before)
+    if isinstance(before, set | bytes):
+        return bool(before != after)
+    if isinstance(before, bool | int | float | complex | str | np.generic):
+        return bool(before != after) and not bool(before != before and after != after)
+    return _kind_of(before) is _INSTANCE and differs(_attributes_of(before), _attributes_of(after))

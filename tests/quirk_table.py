@@ -1,0 +1,143 @@
+"""Useful FMUs that break one promise each, and what fmugym does about it.
+
+The tests expect it, and docs/reliability.md tells it: ``python quirk_table.py`` prints its table.
+The FMUs are those of ``zoo/quirks.c``.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import fmu_tools
+import zoo_tools
+
+OUTPUTS = ("y", "clock", "calls")
+VARIABLES = (
+    ("u", "input", 'start="0" min="-1" max="1"'),
+    ("y", "output", ""),
+    ("gain", "parameter", 'start="1"'),
+    ("tau", "parameter", 'start="0.5"'),
+    ("clock", "output", ""),
+    ("calls", "output", ""),
+    ("returns", "output", ""),
+)
+"""As ``quirks.c`` has them, in the order of their value references."""
+
+STATES = (2, 3)
+"""The versions of FMI that have FMU states, and flags with which an FMU asks to stop."""
+
+NEEDS = {
+    "independent": "share the process",
+    "one thread": "are stepped by one thread",
+    "libraries": "get a copy of the library each",
+}
+
+
+@dataclass(frozen=True)
+class Quirk:
+    """One FMU.
+
+    Attributes:
+        token: As ``quirks.c`` knows it.
+        what: What the FMU does, for the document.
+        method: How episodes begin, of ``ResetMethod``; with FMI 1.0, which has no FMU states,
+            ``"restore"`` becomes ``"reset"``.
+        neighbours: What several instances need, of ``Neighbours``.
+        log: A part of the warning in the log; empty if there is none.
+        versions: Of FMI.
+        probe_timeout: In seconds.
+    """
+
+    token: str
+    what: str
+    method: str = "restore"
+    neighbours: str = "independent"
+    log: str = ""
+    versions: tuple[int, ...] = (1, 2, 3)
+    probe_timeout: float = 30.0
+
+    def __str__(self):
+        return self.token
+
+    def method_of(self, version):
+        """How episodes begin with a version of FMI."""
+        return "reset" if version == 1 and self.method == "restore" else self.method
+
+    @property
+    def row(self):
+        """The row of the document."""
+        method = f'`"{self.method}"`'
+        if self.method == "restore" and 1 in self.versions:
+            method += ' (FMI 1.0: `"reset"`)'
+        log = f"`{self.log}`" if self.log else ""
+        return f"| {self.what} | {method} | {NEEDS[self.neighbours]} | {log} |"
+
+
+def keeps(what, method="instance"):
+    """A reset that keeps something which an episode shows."""
+    log = "does not begin anew when it is reset" if method == "instance" else ""
+    return Quirk(f"reset keeps {what}", f"keeps {what} in a reset", method, log=log)
+
+
+BAD_RESET = "does not begin anew when it is reset"
+DISTURB = "disturb each other"
+
+QUIRKS = (
+    Quirk("well behaved", "nothing wrong"),
+    # Resets and restored states
+    Quirk("reset does nothing", "does nothing in a reset", "instance", log=BAD_RESET),
+    keeps("the state"),
+    keeps("inputs", "restore"),
+    keeps("outputs"),
+    keeps("parameters", "restore"),
+    keeps("the time"),
+    Quirk("stops, reset keeps that", "keeps its wish to stop in a reset", "instance",
+          log=BAD_RESET, versions=STATES),
+    Quirk("second reset fails", "returns Error in its second reset (a new instance replaces it)"),
+    Quirk("second episode hangs", "hangs in the first step after a reset if parameters are set",
+          "instance", log=BAD_RESET, probe_timeout=5.0),
+    Quirk("reset frees twice", "corrupts the heap in a reset", "instance", log=BAD_RESET),
+    Quirk("reset is not exact", "begins with a rounding error after a reset", "instance"),
+    Quirk("library keeps", "keeps a drift in a global variable of its library", "library",
+          "libraries", log=BAD_RESET),
+    Quirk("restore forgets", "leaves its state out of its FMU state (restores are given up)",
+          versions=STATES),
+    Quirk("restore keeps the time", "leaves the time out of its FMU state (likewise)",
+          versions=STATES),
+    # Several instances
+    Quirk("globals", "keeps its state in a global variable", "reset", "libraries", log=DISTURB),
+    Quirk("one in a process", "refuses a second instance", neighbours="libraries", log=DISTURB),
+    Quirk("overruns with two", "writes beyond its memory if there is a second instance",
+          neighbours="libraries", log=DISTURB),
+    Quirk("strtok", "initializes with `strtok`", neighbours="one thread", log=DISTURB),
+    # Memory, files and calls
+    Quirk("overruns", "writes a byte beyond its memory (it runs in worker processes)",
+          log="harms its process"),
+    Quirk("no early reading", "returns Error if it is read before its initialization"),
+    Quirk("reads a table", "has `\\` in the names of its archive"),
+)  # fmt: skip
+
+
+def quirk_fmu(folder, version, token):
+    """Write an FMU."""
+    files = {
+        "modelDescription.xml": zoo_tools.describe(version, token, VARIABLES),
+        fmu_tools.library_name(version, "Zoo"): zoo_tools.library(version, model="quirks"),
+        "resources/tables/offset.txt": "0.25",
+    }
+    if token == "reads a table":
+        files = {name.replace("/", "\\"): content for name, content in files.items()}
+    return fmu_tools.write_fmu(Path(folder) / "Quirks.fmu", files)
+
+
+def markdown():
+    """The table of the document."""
+    lines = [
+        "| the FMU | episodes begin by | several instances | in the log |",
+        "|---|---|---|---|",
+    ]
+    return "\n".join([*lines, *(quirk.row for quirk in QUIRKS)])
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown() + "\n")

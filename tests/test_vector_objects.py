@@ -1,0 +1,264 @@
+"""Functions and objects that environments hold in attributes, called and changed by their hooks."""
+
+import functools
+
+import numpy as np
+import pytest
+from vector_tools import Drawing, each_way, make_pair, require_pair_equal, sampled_actions
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.pool import has_native_pool
+from fmugym.vector import FMUVectorEnv
+from fmugym.vector.contents import Contents
+
+needs_native = pytest.mark.skipif(
+    not has_native_pool(), reason="the C extension was not built: no compiler at install"
+)
+
+
+class WithCost(Drawing):
+    """A function in an attribute, made in the constructor."""
+
+    def __init__(self):
+        super().__init__()
+        self.cost = lambda: self.state[0] * self.state[0]
+
+    def _reward_policy(self):
+        return -self.cost()
+
+
+class Judge:
+    """An object that refers to its environment."""
+
+    def __init__(self, env):
+        self.env = env
+
+    def __call__(self):
+        return -abs(self.env.state[0]) - abs(self.env.out["q_dot"])
+
+
+class Judged(Drawing):
+    def __init__(self):
+        super().__init__()
+        self.judge = Judge(self)
+        self.partial = functools.partial(abs, 1.0)
+
+    def _reward_policy(self):
+        return self.judge() + self.partial()
+
+
+class RewardInAttribute(Drawing):
+    """A hook itself in an attribute."""
+
+    def __init__(self):
+        super().__init__()
+        self._reward_policy = lambda: 2.0 * self.state[1]
+        self._is_truncated = lambda: self.state[1] > 0.3
+        self._get_info = lambda: {"speed": self.state[1]}
+
+
+@pytest.mark.parametrize("cls", [WithCost, Judged, RewardInAttribute])
+@each_way
+def test_functions_and_objects_that_refer_to_the_environment(cls, backend, hooks):
+    require_pair_equal(cls, steps=30, hooks=hooks, backend=backend)
+
+
+def test_a_hook_in_an_attribute_is_called():
+    env = RewardInAttribute()
+    env.reset(seed=1)
+    _, reward, _, truncated, info = env.step(np.zeros(1, np.float32))
+    assert (reward, truncated) == (2.0 * env.state[1], env.state[1] > 0.3)
+    assert info["speed"] == env.state[1]
+    env.close()
+
+
+class LowPass:
+    """A filter with a state."""
+
+    __slots__ = ("value",)
+
+    def __init__(self):
+        self.value = 0.0
+
+    def __call__(self, new):
+        self.value += 0.1 * (new - self.value)
+        return self.value
+
+
+class Filtering(Drawing):
+    def __init__(self):
+        super().__init__()
+        self.low_pass = LowPass()
+
+    def _reward_policy(self):
+        return self.low_pass(self.state[0])
+
+
+class CountingInClosure(Drawing):
+    """The state of a filter in a variable of a closure."""
+
+    def __init__(self):
+        super().__init__()
+        total = 0.0
+
+        def summed(value):
+            nonlocal total
+            total += value
+            return total
+
+        self.summed = summed
+
+    def _reward_policy(self):
+        return self.summed(self.state[0])
+
+
+class BufferInside(Drawing):
+    """An array deep inside of an object."""
+
+    def __init__(self):
+        super().__init__()
+        self.parts = {"history": [np.zeros(3)]}
+
+    def _get_info(self):
+        history = self.parts["history"][0]
+        history[:-1] = history[1:]
+        history[-1] = self.state[0]
+        return {"oldest": float(history[0])}
+
+
+STATEFUL = {Filtering: "low_pass", CountingInClosure: "summed", BufferInside: "parts"}
+
+
+@pytest.mark.parametrize("cls", STATEFUL)
+@pytest.mark.parametrize("hooks", ["auto", "per_env"])
+def test_objects_with_a_state_belong_to_one_environment_each(cls, hooks):
+    require_pair_equal(cls, steps=30, hooks=hooks)
+
+
+@pytest.mark.parametrize("cls", STATEFUL)
+def test_they_are_found_and_named(cls):
+    with pytest.raises(ConfigError, match=rf"changes self\.{STATEFUL[cls]}, which belongs in"):
+        FMUVectorEnv(cls, 2, hooks="array")
+
+
+class Remembering(fmugym.FMUEnv):
+    """A hook leaves what it has read in an object; all else can be compiled."""
+
+    def __init__(self, seen):
+        self.seen = seen
+        config = {
+            "model_input_names": ["tau"],
+            "model_output_names": ["q", "q_dot"],
+            "bounds": {"tau": (-0.01, 0.01)},
+            "time_step": 0.02,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum"), config)
+
+    def _get_action_space(self):
+        return fmugym.envs.CartPoleEnv._get_action_space(self)
+
+    def _get_inputs(self):
+        return 0.01 * self.action
+
+    def _is_done(self):
+        self.seen["last"] = self.state[0]
+        self.seen.setdefault("all", []).append(self.state[1])
+        return self.state[0] > 100.0
+
+
+@needs_native
+@pytest.mark.parametrize("hooks", ["auto", "array", "compiled"])
+def test_checks_and_traces_leave_nothing_in_the_users_objects(hooks):
+    seen = {}
+    try:
+        FMUVectorEnv(lambda: Remembering(seen), 2, hooks=hooks).close()
+    except ConfigError:
+        assert hooks != "auto"
+    assert seen == {}
+
+
+@needs_native
+def test_what_is_traced_reads_through_functions_in_attributes():
+    class Plain(fmugym.envs.CartPoleEnv):
+        def __init__(self):
+            super().__init__()
+            self.cost = lambda: self.state[0] * self.state[0]
+
+        def _reward_policy(self):
+            return -self.cost()
+
+    compiled, theirs = make_pair(Plain, hooks="compiled")
+    compiled.reset(seed=1), theirs.reset(seed=1)
+    for actions in sampled_actions(compiled, 40):
+        assert compiled.step(actions)[1].tolist() == theirs.step(actions)[1].tolist()
+    compiled.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("hooks", ["array", "per_env"])
+def test_methods_that_were_read_before_read_the_present_values(hooks):
+    vector = FMUVectorEnv(WithCost, 3, hooks=hooks)
+    vector.reset(seed=2)
+    methods = vector.get_attr("_reward_policy")
+    vector.step(np.zeros((3, 1), np.float32))
+    expected = [-state[0] * state[0] for state in vector.get_attr("state")]
+    assert [method() for method in methods] == expected
+    assert list(vector.call("cost")) == [-value for value in expected]
+    vector.close()
+
+
+class TestContents:
+    """What hooks change is found, and undone."""
+
+    def make(self, **attributes):
+        env = Drawing()
+        vars(env).update(attributes)
+        return env
+
+    @pytest.mark.parametrize(
+        ("value", "change"),
+        [
+            ([1, [2]], lambda value: value[1].append(3)),
+            ({"a": {1}}, lambda value: value["a"].add(2)),
+            (bytearray(b"x"), lambda value: value.extend(b"y")),
+            (np.zeros(2), lambda value: value.fill(1.0)),
+            (np.random.default_rng(1), lambda value: value.random()),
+            (LowPass(), lambda value: value(1.0)),
+            ((LowPass(),), lambda value: value[0](1.0)),
+            (LowPass().__call__, lambda value: value(1.0)),
+            (functools.partial(LowPass()), lambda value: value(1.0)),
+        ],
+    )
+    def test_of_all_kinds(self, value, change):
+        env = self.make(held=value)
+        contents = Contents(env)
+        assert contents.changed() is None
+        change(value)
+        assert contents.changed() == "held"
+        assert contents.changed_in_place() == {"held"}
+        contents.restore()
+        assert contents.changed() is None
+        assert env.held is value
+        env.close()
+
+    def test_new_attributes(self):
+        env = self.make()
+        contents = Contents(env)
+        env.new = 1
+        assert contents.changed() == "new"
+        contents.restore()
+        assert not hasattr(env, "new")
+        env.close()
+
+    def test_what_leads_back_to_itself(self):
+        loop = []
+        loop.append(loop)
+        env = self.make(loop=loop)
+        env.me = env
+        contents = Contents(env)
+        loop.append(1)
+        assert contents.changed() == "loop"
+        contents.restore()
+        assert len(loop) == 1
+        env.close()

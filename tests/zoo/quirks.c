@@ -1,0 +1,318 @@
+/* Useful FMUs that break one promise each: the instantiation token names it.
+
+   x' = gain u - x / tau and y = x, by explicit Euler with internal steps of 1 ms. "clock" is what
+   the FMU takes for the time since the start, "calls" counts the steps, and "returns" tells whether
+   states of earlier times may be restored, as the last step was told. */
+
+#define _GNU_SOURCE
+#include "zoo.h"
+
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+enum variable { U, Y, GAIN, TAU, CLOCK, CALLS, RETURNS, VARIABLES };
+
+enum { NUMBERS = 8, OVERRUN = 16 };
+
+struct Animal {
+    double values[VARIABLES];
+    double x;
+    int resets;
+    bool ready, hangs, stopped;
+    char token[40], folder[PATH_MAX];
+    double *numbers; /* a block of memory of its own */
+};
+
+/* What instances of one library share. */
+static double shared_x, shared_gain, shared_drift, buffer;
+static Animal saved;
+static int made, in_use;
+static bool read_beside_library;
+
+static bool is(const Animal *me, const char *token) {
+    return strcmp(me->token, token) == 0;
+}
+
+/* As libraries do that expect to be loaded from their own folder. */
+__attribute__((constructor)) static void read_data(void) {
+    read_beside_library = access("Zoo.txt", R_OK) == 0;
+}
+
+static void set_start(Animal *me) {
+    memset(me->values, 0, sizeof me->values);
+    me->values[GAIN] = shared_gain = 1.0;
+    me->values[TAU] = 0.5;
+    me->x = 0.0;
+    me->ready = me->hangs = me->stopped = false;
+}
+
+static void path_of(const Animal *me, const char *name, char *path, size_t size) {
+    snprintf(path, size, "%s/%s", me->folder, name);
+}
+
+static bool write_number(const char *path, double number) {
+    FILE *file = fopen(path, "w");
+
+    if (file != NULL) {
+        fprintf(file, "%a", number);
+        fclose(file);
+    }
+    return file != NULL;
+}
+
+static bool read_number(const char *path, double *number) {
+    FILE *file = fopen(path, "r");
+    const bool found = file != NULL && fscanf(file, "%la", number) == 1;
+
+    if (file != NULL) {
+        fclose(file);
+    }
+    return found;
+}
+
+/* Where the FMU writes what it reads again later; empty if it needs no such file. */
+static void find_scratch(const Animal *me, char *path, size_t size) {
+    path[0] = '\0';
+    if (is(me, "scratch file") || is(me, "reset keeps files")) {
+        path_of(me, "scratch.txt", path, size);
+    } else if (is(me, "scratch in directory")) {
+        snprintf(path, size, "scratch.txt");
+    }
+}
+
+static bool refuses(const Animal *me) {
+    return (is(me, "one in a process") && made > 0) ||
+           (is(me, "needs its directory") && !read_beside_library) ||
+           (is(me, "changes directory") && chdir(me->folder) != 0);
+}
+
+Animal *zoo_instantiate(const char *name, const char *token, const char *location, Logger logger,
+                        void *environment) {
+    Animal *me = calloc(1, sizeof *me);
+    const char *path = strncmp(location, "file://", 7) == 0 ? location + 7 : location;
+
+    snprintf(me->token, sizeof me->token, "%s", token);
+    snprintf(me->folder, sizeof me->folder, "%s%s", path, FMI_VERSION == 1 ? "/resources" : "");
+    if (refuses(me)) {
+        free(me);
+        return NULL;
+    }
+    set_start(me);
+    me->numbers = calloc(NUMBERS, sizeof *me->numbers);
+    made++;
+    in_use++;
+    return me;
+}
+
+void zoo_free(Animal *me) {
+    in_use--;
+    free(me->numbers);
+    free(me);
+}
+
+int zoo_call(Animal *me, enum call call) {
+    return OK;
+}
+
+int zoo_enter(Animal *me) {
+    return OK;
+}
+
+/* As old readers of tables do it: not safe in threads. */
+static bool parse_table(void) {
+    int rows = 0;
+    char table[400] = "";
+
+    for (int i = 0; i < 40; i++) {
+        strcat(table, "12 34;");
+    }
+    for (char *row = strtok(table, ";"); row != NULL; row = strtok(NULL, ";")) {
+        rows++;
+        usleep(20);
+    }
+    return rows == 40;
+}
+
+static bool prepare(Animal *me) {
+    char path[PATH_MAX + 20];
+
+    find_scratch(me, path, sizeof path);
+    if (is(me, "strtok")) {
+        return parse_table();
+    }
+    if (is(me, "reads a table")) {
+        path_of(me, "tables/offset.txt", path, sizeof path);
+        return read_number(path, &me->x);
+    }
+    if (is(me, "reset keeps files")) {
+        read_number(path, &me->x);
+    } else if (path[0] != '\0') {
+        return write_number(path, me->values[GAIN]);
+    }
+    return true;
+}
+
+int zoo_exit(Animal *me) {
+    const bool prepared = prepare(me);
+
+    shared_x = me->x;
+    me->ready = true;
+    if (!is(me, "reset keeps outputs")) {
+        me->values[Y] = me->x;
+    }
+    return prepared ? OK : ERROR;
+}
+
+int zoo_initialize(Animal *me) {
+    return zoo_exit(me);
+}
+
+/* The gain as it is found in each step. */
+static double find_gain(Animal *me) {
+    char path[PATH_MAX + 20];
+    double gain = is(me, "global parameters") ? shared_gain : me->values[GAIN];
+
+    find_scratch(me, path, sizeof path);
+    if (path[0] != '\0' && !is(me, "reset keeps files")) {
+        read_number(path, &gain);
+    }
+    return gain;
+}
+
+static void integrate(Animal *me, double step_size) {
+    double *x = is(me, "globals") ? &shared_x : &me->x;
+    const double gain = find_gain(me);
+    const int steps = (int)(step_size * 1000.0 + 0.5);
+
+    buffer = *x;
+    if (is(me, "static buffer")) {
+        usleep(20);
+        *x = buffer;
+    }
+    for (int i = 0; i < steps; i++) {
+        *x += 0.001 * (gain * me->values[U] - *x / me->values[TAU]);
+    }
+    if (is(me, "library keeps")) {
+        shared_drift += 0.001;
+        *x += shared_drift;
+    } else if (is(me, "noise")) {
+        *x += 1e-9 * (double)(rand() % 100);
+    }
+    me->values[Y] = *x;
+}
+
+static void corrupt(Animal *me) {
+    char path[PATH_MAX + 20];
+
+    if (is(me, "overruns")) {
+        ((char *)me->numbers)[NUMBERS * sizeof *me->numbers] = 1; /* padding: often harmless */
+    } else if (is(me, "overruns with two") && in_use > 1) {
+        memset(me->numbers + NUMBERS, 1, OVERRUN);
+    }
+    if (is(me, "reset keeps files")) {
+        find_scratch(me, path, sizeof path);
+        write_number(path, me->x);
+    }
+}
+
+bool zoo_stops(const Animal *me) {
+    return me->stopped;
+}
+
+int zoo_step(Animal *me, double step_size, bool no_set_state) {
+    while (me->hangs) {
+        sleep(1);
+    }
+    if (!me->stopped) {
+        integrate(me, step_size);
+        corrupt(me);
+        me->values[RETURNS] = !no_set_state;
+        me->values[CLOCK] += step_size;
+        me->values[CALLS] += 1.0;
+        me->stopped = strncmp(me->token, "stops", 5) == 0 && me->values[CLOCK] >= 0.35;
+    }
+    return me->stopped && FMI_VERSION == 2 ? DISCARD : OK;
+}
+
+int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
+    for (size_t i = 0; i < count; i++) {
+        values[i] = me->values[references[i]];
+    }
+    if (is(me, "no early reading") && !me->ready) {
+        return ERROR;
+    }
+    return is(me, "no reading before a step") && me->values[CALLS] == 0.0 ? ERROR : OK;
+}
+
+int zoo_set(Animal *me, const unsigned *references, size_t count, const double *values) {
+    for (size_t i = 0; i < count; i++) {
+        me->values[references[i]] = values[i];
+        if (references[i] == GAIN) {
+            shared_gain = values[i];
+            me->hangs = is(me, "second episode hangs") && me->resets > 0;
+        }
+    }
+    return OK;
+}
+
+int zoo_reset(Animal *me) {
+    const Animal before = *me;
+
+    me->resets++;
+    if (is(me, "reset does nothing")) {
+        return OK;
+    }
+    if (is(me, "second reset fails") && me->resets > 1) {
+        return ERROR;
+    }
+    set_start(me);
+    if (is(me, "reset keeps the state")) {
+        me->x = before.x;
+    } else if (is(me, "reset keeps inputs")) {
+        me->values[U] = before.values[U];
+    } else if (is(me, "reset keeps outputs")) {
+        me->values[Y] = before.values[Y];
+    } else if (is(me, "reset keeps parameters")) {
+        me->values[GAIN] = before.values[GAIN];
+    } else if (is(me, "reset keeps the time")) {
+        me->values[CLOCK] = before.values[CLOCK];
+    } else if (is(me, "stops, reset keeps that")) {
+        me->stopped = before.stopped;
+    } else if (is(me, "reset frees twice")) {
+        free(me->numbers);
+    } else if (is(me, "reset is not exact")) {
+        me->x = 1e-9 * before.values[CALLS];
+    }
+    return OK;
+}
+
+int zoo_get_state(Animal *me, void **state) {
+    if (*state == NULL) {
+        *state = malloc(sizeof *me);
+    }
+    memcpy(*state, me, sizeof *me);
+    saved = *me;
+    return OK;
+}
+
+int zoo_set_state(Animal *me, void *state) {
+    const Animal before = *me;
+
+    memcpy(me, is(me, "one saved state") ? &saved : state, sizeof *me);
+    me->numbers = before.numbers;
+    if (is(me, "restore forgets")) {
+        me->x = me->values[Y] = before.x;
+    } else if (is(me, "restore keeps the time")) {
+        me->values[CLOCK] += 1.0;
+    }
+    return OK;
+}
+
+int zoo_free_state(void **state) {
+    free(*state);
+    *state = NULL;
+    return OK;
+}
