@@ -118,7 +118,7 @@ class CompiledEngine(BatchEngine):
             "load_previous_action"
         )
         self._make_rows(task)
-        self._layout = _Layout(task, self.env, self._n)
+        self._layout = _Layout(task, self._n)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -214,10 +214,10 @@ class CompiledEngine(BatchEngine):
         flat = {name: row.reshape(-1, self._n) for name, row in self._rows.items()}
         before = {name: row.reshape(-1, self._n) for name, row in self._before.items()}
         constants = plan.constant_variables
-        keeps = not task.judgement.is_always_finite or not env._pool_observes
+        keeps = not task.judgement.is_always_finite or bool(task.seen)
         return {
             "kept": self._kept,
-            "keeps_always": keeps or task.judgement.loads("kept") or env._has_info,
+            "keeps_always": keeps or task.judgement.loads("kept"),
             "copies": tuple(
                 pair for name in flat for pair in zip(flat[name], before[name], strict=True)
             ),
@@ -358,13 +358,11 @@ class _Layout:
 
     Args:
         task: The programs.
-        env: The prototype.
         num_envs: N.
     """
 
-    def __init__(self, task: TracedTask, env: FMUEnv, num_envs: int) -> None:
-        self.has_own = not env._pool_observes or bool(task.seen)
-        self._observes = env._pool_observes
+    def __init__(self, task: TracedTask, num_envs: int) -> None:
+        self.has_own = bool(task.seen)
         self._shapes = [((num_envs, *array.shape), array.dtype) for array in task.seen]
         self._paths = [array.path for array in task.seen]
         self._is_plain = self._paths == [("observation",)]

@@ -269,11 +269,11 @@ class _Tracer:
         return int(self._call("_reward_policy", lambda value: self._nodes(value, (), np.float64)))
 
     def _trace_seen(self) -> tuple[list[SeenArray], list[Store]]:
-        """Trace the observation if it is not the default one, and the info if there is one."""
+        """Trace the observation unless the pool makes it, and the info if there is one."""
         seen: list[SeenArray] = []
         stores: list[Store] = []
         env = self._env
-        if not env._pool_observes:
+        if not env._pool_observes or env._has_info:
             space = env.observation_space
 
             def observe(value: Any) -> None:
