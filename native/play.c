@@ -47,58 +47,22 @@ bool play_has_bad_action(const Turn *turn) {
     }
 }
 
-static double *block_of(const Draws *d, size_t index) {
-    return d->block + index * d->episodes * d->draws;
-}
-
-/* How many episodes of its block an environment has used. The owner can write to this memory, so
- * an invalid number counts as all of them. */
-static size_t used_by(const Draws *d, size_t index) {
-    const uint64_t used = (uint64_t)d->used[index];
-    return used < d->episodes ? (size_t)used : d->episodes;
-}
-
 void play_foresee(const Play *play, size_t index) {
-    const Draws *d = &play->draws;
-    prefetch(block_of(d, index) + used_by(d, index) * d->draws);
+    prefetch(&play->streams[index]);
 }
 
-static void draw_ahead(const Draws *d, const Stream *stream, size_t index) {
-    double *fractions = block_of(d, index);
-
-    for (size_t i = 0; i < d->episodes * d->draws; i++) {
-        fractions[i] = stream->next_double(stream->state);
-    }
-}
-
-static double *place_of_draw(const Play *play, size_t row, size_t index) {
-    if (row < play->number_of_parameters) {
-        return play->start_values + row * play->count + index;
-    }
-    return (double *)(void *)play->variables[row - play->number_of_parameters].data + index;
-}
-
-/* Uses the same arithmetic as EpisodePlan.scaled, without fused operations. */
 void play_draw(const Turn *turn, size_t index) {
     const Play *play = turn->play;
-    const Draws *d = &play->draws;
+    const Draws *d = play->draws;
+    double *values = turn->drawn + index;
 
-    if (d->draws == 0) {
-        return;
+    draws_take(d, &play->streams[index], values, play->count);
+    for (size_t i = 0; i < d->count; i++) {
+        if (d->draws[i].row >= 0) {
+            play->start_values[(size_t)d->draws[i].row * play->count + index] =
+                values[i * play->count];
+        }
     }
-    size_t used = used_by(d, index);
-    if (used == d->episodes) {
-        draw_ahead(d, turn->streams[index], index);
-        used = 0;
-    }
-    const double *fractions = block_of(d, index) + used * d->draws;
-
-    for (size_t i = 0; i < d->draws; i++) {
-        const double scaled = d->width[i] * fractions[i], value = d->low[i] + scaled;
-        *place_of_draw(play, (size_t)d->rows[i], index) = value;
-        turn->drawn[i * play->count + index] = value;
-    }
-    d->used[index] = (int64_t)used + 1;
 }
 
 static Source source_of(const Turn *turn) {
@@ -161,7 +125,9 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 }
 
 /* Gives the hooks of an episode that has just started what they read after a reset. */
-static void start_episode(const Play *play, size_t index) {
+static void start_episode(const Turn *turn, size_t index) {
+    const Play *play = turn->play;
+
     for (size_t i = 0; i < play->number_of_inputs; i++) {
         const InputStart *start = &play->input_starts[i];
         play->input_rows[i * play->count + index] =
@@ -171,16 +137,21 @@ static void start_episode(const Play *play, size_t index) {
         const VariableStart *start = &play->variable_starts[i];
         memcpy(start->row.data + index * start->row.size, &start->bits, start->row.size);
     }
+    for (size_t i = 0; i < play->number_of_drawn_variables; i++) {
+        const DrawnVariable *variable = &play->drawn_variables[i];
+        const double *value = turn->drawn + variable->draw * play->count + index;
+        memcpy(variable->row.data + index * sizeof *value, value, sizeof *value);
+    }
     for (size_t i = 0; play->keeps_always && i < play->number_of_outputs; i++) {
         const size_t place = i * play->count + index;
         play->kept_rows[place] = play->output_rows[place];
     }
 }
 
-static void start_episodes(const Play *play, size_t begin, size_t count) {
+static void start_episodes(const Turn *turn, size_t begin, size_t count) {
     for (size_t index = begin; index < begin + count; index++) {
-        if (play->ended[index]) {
-            start_episode(play, index);
+        if (turn->play->ended[index]) {
+            start_episode(turn, index);
         }
     }
 }
@@ -233,7 +204,7 @@ void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scrat
     const Register *registers = scratch->judgement;
     Notes notes = {.outside = false};
 
-    start_episodes(play, begin, count);
+    start_episodes(turn, begin, count);
     copy_rows(play, begin, count);
     program_run(&play->judgement, &source, begin, count, scratch->judgement, &notes);
     for (size_t j = 0; j < count; j++) {

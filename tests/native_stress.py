@@ -25,7 +25,7 @@ import time
 
 import numpy as np
 
-from fmugym import FMU, SimulationError, bundled_fmu
+from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 from fmugym.vector.hooks.loops import loop_of
@@ -83,6 +83,16 @@ ACTIONS = {
     "highest": 1,
     "none": np.zeros(1, np.int64),
 }
+
+
+def draws(*rows):
+    """Uniform numbers from [0, 1), one for each row of the start values."""
+    kind = _native.distributions().index("uniform")
+    table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
+    return _native.Draws(table.tobytes(), np.array([0.0, 1.0]).tobytes(), 0)
+
+
+DRAWS = draws(0)
 
 
 class ReceiverError(Exception):
@@ -152,27 +162,30 @@ class Subject:
         self.pool.step_or_reset(None, self.start, self.values, self.mask(), observations)
 
     def prepare_play(self):
-        ends = np.zeros(1), np.ones(1), np.zeros(1, np.int64)
         variables, before = np.zeros((1, self.n)), np.zeros((1, self.n))
         self.pool.prepare_play(
             self.start,
             programs(self.pool, variables),
             ACTIONS | {"current": np.zeros(self.n, "i8"), "previous": np.zeros(self.n, "i8")},
             self.values.copy(),
-            (np.zeros((self.n, 4, 1)), np.full(self.n, 4), *ends),
+            (DRAWS, self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)),
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
             {
                 "kept": np.zeros_like(self.pool.outputs),
                 "keeps_always": True,
                 "copies": ((variables[0], before[0]),),
-                "variables": (variables[0],),
+                "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
             },
         )
 
-    def set_streams(self):
-        self.pool.set_streams([np.random.PCG64(i) for i in range(self.n)])
+    def draw(self):
+        """Seed streams and draw from them while other threads play."""
+        states = self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)
+        indices = np.arange(self.n)
+        _native.seed(states, indices, self.rng.bytes(4 * self.n))
+        DRAWS.take(states, indices, np.empty((1, self.n)))
 
     def play(self):
         flags = np.empty(self.n, np.bool_), np.empty(self.n, np.bool_)
@@ -215,7 +228,7 @@ class Subject:
 
 
 ACTIONS = (
-    *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "set_streams"),
+    *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "draw"),
     *("play", "play", "play", "save", "restore", "forget", "failure", "read", "health"),
     *("recycle", "costs", "close"),
 )

@@ -18,7 +18,7 @@ import math
 import os
 import shutil
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -31,6 +31,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -39,7 +40,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import CountedPool, HealthArray, no_counts
+from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
 
@@ -74,13 +75,12 @@ _SAID: Final = "\x1d"
 """Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 
 FloatArray32 = npt.NDArray[np.float32]
-IndexArray = npt.NDArray[np.int64]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(CountedPool):
+class NativePool(AttendedPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -175,6 +175,8 @@ class NativePool(CountedPool):
                     "restores": method == ResetMethod.RESTORE,
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
+                    "one_initialization": spec.one_initialization,
+                    "pace": (spec.initialization_interval, *spec.turn),
                 },
                 variables={
                     "inputs": self._access(spec.inputs),
@@ -214,17 +216,10 @@ class NativePool(CountedPool):
 
     @property
     def can_play(self) -> bool:
-        """See ``Pool.can_play``."""
-        return True
+        """See ``Pool.can_play``; nobody waits for licences within a step."""
+        return not self._spec.licence_wait
 
     # The contract of Pool.
-
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``."""
-        self.reset_into(variables, values, mask)
-        return self._result
 
     def step(
         self,
@@ -377,6 +372,8 @@ class NativePool(CountedPool):
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
 
+    _reset_some = reset_into
+
     def step_or_reset(
         self,
         inputs: FloatArray | None,
@@ -421,7 +418,7 @@ class NativePool(CountedPool):
         programs: tuple[tuple[Any, ...], tuple[Any, ...]],
         actions: Mapping[str, Any],
         start_values: FloatArray,
-        draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
+        draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
         surroundings: Mapping[str, Any],
     ) -> Callable[..., tuple[int, int]]:
@@ -439,27 +436,25 @@ class NativePool(CountedPool):
                 actions of this step and of the one before (or None), flat, environments first;
                 what counts as the action of a new episode.
             start_values: As the values of ``reset``; the pool writes the draws there.
-            draws: Uniform numbers drawn ahead, shape (N, episodes, draws); how many of their
-                episodes are used, shape (N,); the lower ends and widths of the distributions and
-                their rows, shape (draws,): rows in the start values, and after these the
-                variables of the surroundings.
+            draws: The draws of an episode, and the random streams, shape (N, 6); see
+                ``EpisodeStreams``.
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
             surroundings: ``kept``, for the outputs before the step; ``keeps_always``, whether
                 they are kept in each step, or only before outputs that no float32 can hold;
                 ``copies``, pairs of rows: episode variables and what they were before the step;
-                ``variables``, those of float64; ``variable_starts``, rows and the bytes of their
-                constants; ``input_starts``, for each input the number of a start value, or -1 and
-                a constant.
+                ``drawn_variables``, rows and the numbers of their draws; ``variable_starts``,
+                rows and the bytes of their constants; ``input_starts``, for each input the number
+                of a start value, or -1 and a constant.
 
         Returns:
             A function of actions, observations (float32, or a tuple of the arrays that the second
             program stores), rewards, terminated, truncated and drawn values (draws, N). It does a
             step and fills all but the actions; of the drawn values, only those of episodes that
             start. It returns how many instances have a status worse than a warning or numbers
-            that are not finite, and how many episodes have ended. Call ``set_streams`` before it.
+            that are not finite, and how many episodes have ended. Drawn values that the
+            distributions call ``given`` are read.
         """
-        block, used, low, width, rows = draws
         count, ended, limit = episodes
         self._pool.prepare_play(
             start=self._access(variables),
@@ -467,19 +462,12 @@ class NativePool(CountedPool):
             inputs=programs[0],
             judgement=programs[1],
             actions=dict(actions),
-            draws={"block": block, "used": used, "low": low, "width": width, "rows": rows},
+            draws=draws[0],
+            states=draws[1],
             episodes={"step_counts": count, "ended": ended, "limit": limit},
             **surroundings,
         )
         return self._pool.play
-
-    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
-        """Set the generators that ``prepare_play`` uses when the numbers drawn ahead are used up.
-
-        Args:
-            generators: N bit generators of numpy. The pool draws from them without their locks.
-        """
-        self._pool.set_streams(generators)
 
     @property
     def uses_states(self) -> bool:

@@ -8,11 +8,7 @@
 
 enum {
     STARTS,
-    BLOCK,
-    USED,
-    LOW,
-    WIDTH,
-    ROWS,
+    STATES,
     COUNTS,
     ENDED,
     CURRENT,
@@ -23,7 +19,6 @@ enum {
 };
 
 static const char *const PLAYING = "fmugym._native.playing";
-static const char *const STREAMS = "fmugym._native.streams";
 
 enum { MOST_DIMENSIONS = 8 };
 
@@ -36,19 +31,13 @@ typedef struct {
     size_t number_of_row_buffers;
     RowCopy *copies;
     VariableStart *variable_starts;
-    Row *variables;
+    DrawnVariable *drawn_variables;
     InputStart *input_starts;
     int action_letter, action_dimensions;
     Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
-    int64_t *rows;   /* a copy, because these values index memory */
+    PyObject *draws;
 } Playing;
-
-/* The result of set_streams. */
-typedef struct {
-    PyObject *generators, *capsules; /* these keep the targets of the streams alive */
-    const Stream *streams[];
-} Streams;
 
 static void playing_free(Playing *playing) {
     for (int i = 0; i < PLAY_BUFFERS; i++) {
@@ -60,25 +49,17 @@ static void playing_free(Playing *playing) {
     free(playing->row_buffers);
     free(playing->copies);
     free(playing->variable_starts);
-    free(playing->variables);
+    free(playing->drawn_variables);
     free(playing->input_starts);
     release_program(&playing->inputs);
     release_program(&playing->judgement);
     Py_XDECREF(playing->start);
-    free(playing->rows);
+    Py_XDECREF(playing->draws);
     free(playing);
 }
 
 static void playing_dealloc(PyObject *capsule) {
     playing_free(PyCapsule_GetPointer(capsule, PLAYING));
-}
-
-static void streams_dealloc(PyObject *capsule) {
-    Streams *streams = PyCapsule_GetPointer(capsule, STREAMS);
-
-    Py_XDECREF(streams->generators);
-    Py_XDECREF(streams->capsules);
-    free(streams);
 }
 
 static void replace_reference(PyObject **place, PyObject *object) {
@@ -101,28 +82,17 @@ static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObjec
                        (Py_ssize_t)self->pool.settings.count);
 }
 
-static bool take_draws(PyPool *self, Playing *playing, PyObject *group) {
-    static char *names[] = {"block", "used", "low", "width", "rows", NULL};
+static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject *states) {
     const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    const Py_ssize_t shape[] = {n, ANY_LENGTH, ANY_LENGTH};
-    Py_buffer *b = playing->buffers;
-    PyObject *block, *used, *low, *width, *rows;
 
-    if (!parse_group(group, "$OOOOO:draws", names, &block, &used, &low, &width, &rows) ||
-        !take_buffer(block, &b[BLOCK], WRITTEN, "block", ITEM_FLOAT64, 3, shape)) {
+    if (!PyObject_TypeCheck(draws, draws_type)) {
+        PyErr_SetString(PyExc_TypeError, "expected Draws");
         return false;
     }
-    const Py_ssize_t draws = b[BLOCK].shape[2];
-    playing->play.draws.episodes = (size_t)b[BLOCK].shape[1];
-    playing->play.draws.draws = (size_t)draws;
-    if (draws > 0 && b[BLOCK].shape[1] == 0) {
-        PyErr_SetString(PyExc_ValueError, "block must have room for an episode");
-        return false;
-    }
-    return take_vector(used, &b[USED], WRITTEN, "used", ITEM_INT64, n) &&
-           take_vector(low, &b[LOW], IN_PLACE, "low", ITEM_FLOAT64, draws) &&
-           take_vector(width, &b[WIDTH], IN_PLACE, "width", ITEM_FLOAT64, draws) &&
-           take_vector(rows, &b[ROWS], IN_PLACE, "rows", ITEM_INT64, draws);
+    playing->draws = Py_NewRef(draws);
+    playing->play.draws = &((PyDraws *)draws)->draws;
+    return take_matrix(states, &playing->buffers[STATES], WRITTEN, "states", ITEM_UINT64, n,
+                       STREAM_NUMBERS);
 }
 
 static bool take_episodes(PyPool *self, Playing *playing, PyObject *group) {
@@ -138,18 +108,6 @@ static bool take_episodes(PyPool *self, Playing *playing, PyObject *group) {
     playing->play.limit = limit;
     return take_vector(step_counts, &b[COUNTS], WRITTEN, "step_counts", ITEM_INT64, n) &&
            take_vector(ended, &b[ENDED], WRITTEN, "ended", ITEM_BOOLEAN, n);
-}
-
-static bool copy_rows(Playing *playing) {
-    const size_t size = playing->play.draws.draws * sizeof *playing->rows;
-
-    playing->rows = malloc(size + 1);
-    if (playing->rows == NULL) {
-        PyErr_NoMemory();
-        return false;
-    }
-    memcpy(playing->rows, playing->buffers[ROWS].buf, size);
-    return true;
 }
 
 /* Returns the number of elements of an action, or -1 with an exception. */
@@ -270,21 +228,27 @@ static bool take_variable_start(PyPool *self, Playing *playing, PyObject *pair,
     return true;
 }
 
-static bool take_drawn_variable(PyPool *self, Playing *playing, PyObject *object, Row *row) {
-    if (!take_row(self, playing, object, row)) {
+static bool take_drawn_variable(PyPool *self, Playing *playing, PyObject *pair,
+                                DrawnVariable *variable) {
+    PyObject *row;
+    Py_ssize_t draw;
+
+    if (!PyArg_ParseTuple(pair, "On;a variable and its draw", &row, &draw) ||
+        !take_row(self, playing, row, &variable->row)) {
         return false;
     }
-    if (row->size != sizeof(double)) {
-        PyErr_SetString(PyExc_ValueError, "a drawn variable is no float64");
+    variable->draw = (size_t)draw;
+    if (variable->row.size != sizeof(double) || variable->draw >= playing->play.draws->count) {
+        PyErr_SetString(PyExc_ValueError, "a drawn variable is no float64, or has no draw");
         return false;
     }
     return true;
 }
 
 static bool take_variables(PyPool *self, Playing *playing, PyObject *copies, PyObject *starts,
-                           PyObject *variables) {
+                           PyObject *drawn) {
     const size_t a = (size_t)PyTuple_Size(copies), b = (size_t)PyTuple_Size(starts),
-                 c = (size_t)PyTuple_Size(variables);
+                 c = (size_t)PyTuple_Size(drawn);
     Play *play = &playing->play;
     bool good = true;
 
@@ -292,15 +256,16 @@ static bool take_variables(PyPool *self, Playing *playing, PyObject *copies, PyO
     play->copies = playing->copies = calloc(a + 1, sizeof *playing->copies);
     play->variable_starts = playing->variable_starts =
         calloc(b + 1, sizeof *playing->variable_starts);
-    play->variables = playing->variables = calloc(c + 1, sizeof *playing->variables);
+    play->drawn_variables = playing->drawn_variables =
+        calloc(c + 1, sizeof *playing->drawn_variables);
     if (playing->row_buffers == NULL || playing->copies == NULL ||
-        playing->variable_starts == NULL || playing->variables == NULL) {
+        playing->variable_starts == NULL || playing->drawn_variables == NULL) {
         PyErr_NoMemory();
         return false;
     }
     play->number_of_copies = a;
     play->number_of_variable_starts = b;
-    play->number_of_variables = c;
+    play->number_of_drawn_variables = c;
     for (size_t i = 0; i < a && good; i++) {
         good = take_copy(self, playing, PyTuple_GetItem(copies, (Py_ssize_t)i),
                          &playing->copies[i]);
@@ -310,8 +275,8 @@ static bool take_variables(PyPool *self, Playing *playing, PyObject *copies, PyO
                                    &playing->variable_starts[i]);
     }
     for (size_t i = 0; i < c && good; i++) {
-        good = take_drawn_variable(self, playing, PyTuple_GetItem(variables, (Py_ssize_t)i),
-                                   &playing->variables[i]);
+        good = take_drawn_variable(self, playing, PyTuple_GetItem(drawn, (Py_ssize_t)i),
+                                   &playing->drawn_variables[i]);
     }
     return good;
 }
@@ -357,26 +322,18 @@ static void settle_play(PyPool *self, Playing *playing) {
     play->number_of_outputs = s->outputs->count;
     play->start_values = b[STARTS].buf;
     play->number_of_parameters = ((PyAccess *)playing->start)->access.count;
-    play->draws.block = b[BLOCK].buf;
-    play->draws.used = b[USED].buf;
-    play->draws.low = b[LOW].buf;
-    play->draws.width = b[WIDTH].buf;
-    play->draws.rows = playing->rows;
+    play->streams = b[STATES].buf;
     play->step_counts = b[COUNTS].buf;
     play->ended = b[ENDED].buf;
     play->source.statuses = s->status;
 }
 
 static bool is_sound(const PyPool *self, const Play *play) {
-    bool sound = play->inputs.number_of_seen == 0 &&
+    const bool sound = play->inputs.number_of_seen == 0 &&
                  play->judgement.number_of_results == PROGRAM_RESULTS &&
-                 play->number_of_inputs == self->pool.settings.inputs->count;
+                 play->number_of_inputs == self->pool.settings.inputs->count &&
+                 draws_fit(play->draws, play->number_of_parameters);
 
-    for (size_t i = 0; i < play->draws.draws; i++) {
-        const int64_t row = play->draws.rows[i];
-        sound = sound && row >= 0 &&
-                (size_t)row < play->number_of_parameters + play->number_of_variables;
-    }
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a program does not fit the pool");
     }
@@ -384,19 +341,19 @@ static bool is_sound(const PyPool *self, const Play *play) {
 }
 
 static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
-    static char *names[] = {"start", "start_values", "inputs", "judgement",    "actions", "draws",
-                            "episodes", "kept", "keeps_always", "copies", "variable_starts", "variables", "input_starts",
+    static char *names[] = {"start", "start_values", "inputs", "judgement",    "actions", "draws", "states",
+                            "episodes", "kept", "keeps_always", "copies", "variable_starts", "drawn_variables", "input_starts",
                             NULL};
     const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    PyObject *start, *values, *inputs, *judgement, *actions, *draws, *episodes, *kept, *copies;
-    PyObject *variable_starts, *variables, *starts;
+    PyObject *start, *values, *inputs, *judgement, *actions, *draws, *states, *episodes, *kept, *copies;
+    PyObject *variable_starts, *drawn, *starts;
     int keeps_always;
 
     if (!PyArg_ParseTupleAndKeywords(
-            args, kwargs, "$OOO!O!O!O!O!OpO!O!O!O!:prepare_play", names, &start, &values, &PyTuple_Type,
-            &inputs, &PyTuple_Type, &judgement, &PyDict_Type, &actions, &PyDict_Type, &draws,
-            &PyDict_Type, &episodes, &kept, &keeps_always, &PyTuple_Type, &copies, &PyTuple_Type,
-            &variable_starts, &PyTuple_Type, &variables, &PyTuple_Type, &starts)) {
+            args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &start, &values,
+            &PyTuple_Type, &inputs, &PyTuple_Type, &judgement, &PyDict_Type, &actions, &draws,
+            &states, &PyDict_Type, &episodes, &kept, &keeps_always, &PyTuple_Type, &copies,
+            &PyTuple_Type, &variable_starts, &PyTuple_Type, &drawn, &PyTuple_Type, &starts)) {
         return false;
     }
     playing->play.keeps_always = keeps_always != 0;
@@ -406,9 +363,8 @@ static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwarg
     const size_t elements = playing->play.actions.elements;
     if (!take_program(inputs, n, elements, &playing->inputs) ||
         !take_program(judgement, n, elements, &playing->judgement) ||
-        !take_draws(self, playing, draws) || !take_episodes(self, playing, episodes) ||
-        !take_kept(self, playing, kept) || !take_variables(self, playing, copies, variable_starts, variables) ||
-        !take_input_starts(self, playing, starts) || !copy_rows(playing)) {
+        !take_draws(self, playing, draws, states) || !take_episodes(self, playing, episodes) ||
+        !take_kept(self, playing, kept) || !take_variables(self, playing, copies, variable_starts, drawn) || !take_input_starts(self, playing, starts)) {
         return false;
     }
     settle_play(self, playing);
@@ -431,67 +387,6 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
         return NULL;
     }
     replace_reference(&self->playing, capsule);
-    Py_RETURN_NONE;
-}
-
-/* Streams */
-
-static Streams *streams_new(Py_ssize_t count) {
-    Streams *streams = calloc(1, sizeof *streams + (size_t)count * sizeof *streams->streams);
-
-    if (streams == NULL) {
-        PyErr_NoMemory();
-        return NULL;
-    }
-    streams->capsules = PyTuple_New(count);
-    return streams;
-}
-
-static bool take_stream(Streams *streams, Py_ssize_t index) {
-    PyObject *generator = PyTuple_GetItem(streams->generators, index);
-    PyObject *capsule = PyObject_GetAttrString(generator, "capsule");
-    const Stream *stream = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, "BitGenerator");
-
-    if (capsule != NULL) {
-        PyTuple_SetItem(streams->capsules, index, capsule);
-    }
-    streams->streams[index] = stream;
-    return stream != NULL;
-}
-
-static bool take_streams(Streams *streams, PyObject *generators, Py_ssize_t count) {
-    streams->generators = PySequence_Tuple(generators);
-    if (streams->generators == NULL || streams->capsules == NULL) {
-        return false;
-    }
-    if (PyTuple_Size(streams->generators) != count) {
-        PyErr_Format(PyExc_ValueError, "there must be %zd bit generators, not %zd", count,
-                     PyTuple_Size(streams->generators));
-        return false;
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (!take_stream(streams, i)) {
-            return false;
-        }
-    }
-    return true;
-}
-
-PyObject *py_set_streams(PyObject *object, PyObject *generators) {
-    PyPool *self = (PyPool *)object;
-    const Py_ssize_t count = (Py_ssize_t)self->pool.settings.count;
-    Streams *streams = streams_new(count);
-    PyObject *capsule = streams == NULL ? NULL : PyCapsule_New(streams, STREAMS, streams_dealloc);
-
-    if (capsule == NULL) {
-        free(streams);
-        return NULL;
-    }
-    if (!take_streams(streams, generators, count)) {
-        Py_DECREF(capsule);
-        return NULL;
-    }
-    replace_reference(&self->streams, capsule);
     Py_RETURN_NONE;
 }
 
@@ -564,16 +459,15 @@ static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *a
            take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
            take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
            take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)playing->play.draws.draws, n);
+                       (Py_ssize_t)playing->play.draws->count, n);
 }
 
-static void settle_turn(PyPool *self, const Playing *playing, const Streams *streams, PyTurn *t) {
+static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
     const Py_buffer *b = t->buffers;
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
 
     t->turn = (Turn){
         .play = &playing->play,
-        .streams = streams == NULL ? NULL : streams->streams,
         .actions = b[ACTIONS].buf,
         .rewards = b[REWARDS].buf,
         .terminated = b[TERMINATED].buf,
@@ -618,11 +512,8 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
                : NULL;
 }
 
-static PyObject *play_with(PyPool *self, PyObject *playing_capsule, PyObject *streams_capsule,
-                           PyObject *const *args) {
-    const Playing *playing = PyCapsule_GetPointer(playing_capsule, PLAYING);
-    const Streams *streams =
-        streams_capsule == NULL ? NULL : PyCapsule_GetPointer(streams_capsule, STREAMS);
+static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     const size_t seen = playing->judgement.program.number_of_seen;
     PyTurn t;
     PyObject *result = NULL;
@@ -632,7 +523,7 @@ static PyObject *play_with(PyPool *self, PyObject *playing_capsule, PyObject *st
     memset(t.seen_buffers, 0, seen * sizeof *t.seen_buffers);
 
     if (take_arrays(self, playing, args, &t)) {
-        settle_turn(self, playing, streams, &t);
+        settle_turn(self, playing, &t);
         result = play_turn(self, &t);
     }
     for (int i = 0; i < TURN_BUFFERS; i++) {
@@ -644,26 +535,18 @@ static PyObject *play_with(PyPool *self, PyObject *playing_capsule, PyObject *st
     return result;
 }
 
-static bool is_ready(const PyPool *self) {
-    const Playing *playing =
-        self->playing == NULL ? NULL : PyCapsule_GetPointer(self->playing, PLAYING);
-    const bool ready = playing != NULL && (self->streams != NULL || playing->play.draws.draws == 0);
-
-    if (!ready) {
-        PyErr_SetString(PyExc_ValueError, "play was not prepared, or has no streams");
-    }
-    return ready;
-}
-
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, TURN_BUFFERS) || !is_ready(self)) {
+    if (!has_arguments(nargs, TURN_BUFFERS)) {
         return NULL;
     }
-    PyObject *playing = Py_NewRef(self->playing), *streams = Py_XNewRef(self->streams);
-    PyObject *result = play_with(self, playing, streams, args);
+    if (self->playing == NULL) {
+        PyErr_SetString(PyExc_ValueError, "play was not prepared");
+        return NULL;
+    }
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = play_with(self, playing, args);
     Py_DECREF(playing);
-    Py_XDECREF(streams);
     return result;
 }

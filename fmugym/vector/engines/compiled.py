@@ -15,6 +15,7 @@ from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
 from fmugym.task import spaces as fmu_spaces
+from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
@@ -25,6 +26,7 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine", "find_programs"]
 
@@ -68,11 +70,6 @@ def _require_playable(env: FMUEnv) -> None:
     """Refuse environments that the native pool cannot play, whatever their hooks are."""
     if not env._open_pool("a vector environment").can_play:
         raise UntraceableError("the pool is not the native one")
-    if env._plan.num_uniform is None:
-        raise UntraceableError(
-            "its episodes have draws other than uniform ones of Real variables: "
-            + ", ".join(map(repr, env._plan.drawn_names))
-        )
 
 
 class CompiledEngine(BatchEngine):
@@ -94,7 +91,6 @@ class CompiledEngine(BatchEngine):
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
         self._shape = num_envs, env._output_count
-        self._stream_version = -1
         self._kept = np.zeros_like(self._pool.outputs)
         shape = (num_envs, *(env.action_space.shape or ()))
         dtype = env.action_space.dtype
@@ -108,12 +104,12 @@ class CompiledEngine(BatchEngine):
         plan, streams = self.env._plan, self._streams
         self._task = task
         self._prepared = False
-        if task is None or plan.num_uniform is None or plan.num_uniform != streams.num_draws:
-            return
-        if any(task.variables.get(name, np.float64) != np.float64 for name in plan.drawn_names):
+        if task is None or not _can_draw(task, plan):
             return
         self._names = plan.drawn_names
         self._drawn_shape = len(self._names), self._n
+        draws = streams.native_draws(plan)
+        self._draws_ahead = draws is None
         self._keeps_actions = task.judgement.loads("load_action") or task.loads(
             "load_previous_action"
         )
@@ -124,7 +120,7 @@ class CompiledEngine(BatchEngine):
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
             self._action_group(),
             self._start_values,
-            (streams.block, streams.used, *plan.limits, self._drawn_rows()),
+            (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
             self._surroundings(task),
         )
@@ -179,14 +175,6 @@ class CompiledEngine(BatchEngine):
         arrays = self._rows if kind == "variable" else self._before
         return arrays[name].reshape(-1, self._n)[index]
 
-    def _drawn_rows(self) -> npt.NDArray[np.int64]:
-        """Where the draws go: start values by their number, then the episode variables."""
-        plan = self.env._plan
-        places = {name: index for index, name in enumerate(plan.parameter_names)}
-        floats = [name for name, row in self._rows.items() if row.dtype == np.float64]
-        places |= {name: len(places) + index for index, name in enumerate(floats)}
-        return np.array([places[name] for name in plan.drawn_names], np.int64)
-
     def _action_group(self) -> dict[str, Any]:
         """How the pool checks and keeps actions."""
         env, dtype = self.env, self._actions[0].dtype
@@ -225,7 +213,11 @@ class CompiledEngine(BatchEngine):
                 (names.index(name), start) if name in names else (-1, start)
                 for name, start in env._start_inputs
             ),
-            "variables": tuple(row[0] for row in flat.values() if row.dtype == np.float64),
+            "drawn_variables": tuple(
+                (flat[name][0], number)
+                for number, name in enumerate(plan.drawn_names)
+                if name in flat
+            ),
             "variable_starts": tuple(
                 (row, np.array(value, row.dtype).tobytes())
                 for name, start in constants.items()
@@ -252,16 +244,6 @@ class CompiledEngine(BatchEngine):
             task = None
         self._prepare(task)
 
-    def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
-    ) -> tuple[Any, dict[str, Any]]:
-        """See ``Engine.reset``."""
-        result = super().reset(mask, seeds, options)
-        if self._stream_version != self._streams.version:
-            self._pool.set_streams(self._streams.bit_generators())
-            self._stream_version = self._streams.version
-        return result
-
     def call(
         self,
         name: str,
@@ -286,6 +268,10 @@ class CompiledEngine(BatchEngine):
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         judged = rewards, terminated, truncated
         drawn = np.empty(self._drawn_shape)
+        self.has_moved = False
+        if resetting is not None and self._draws_ahead:
+            actions = self._flat(actions)  # a refused step draws nothing
+            drawn[:, resetting] = self._streams.draw(self.env._plan, np.flatnonzero(resetting))
         play = self._play if resetting is None else self._play_with_resets
         self.has_moved = True
         try:
@@ -345,12 +331,18 @@ class CompiledEngine(BatchEngine):
     def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
         """Refuse inputs that are not finite, which they also are outside of their type's range."""
         inputs = self._pool.inputs
-        if not self.env._real_inputs and not np.isfinite(inputs).all():
+        if not self.env._input_writer.all_real and not np.isfinite(inputs).all():
             wanted = np.array(inputs)
             results.write_inputs(self.env._get_inputs(), wanted)
             for index in self._stepping(resetting):
                 fmu_spaces.to_input_types(self.env._interface.inputs, wanted[:, index])
         self._require_finite_inputs(resetting)
+
+
+def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
+    """Whether all variables that are drawn have kept the type of a draw."""
+    types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
+    return all(dtype == np.float64 for dtype in types)
 
 
 class _Layout:
