@@ -110,6 +110,8 @@ class Experiment(TypedDict):
     restores: bool
     rebuilds: bool
     reloads: bool
+    one_initialization: bool
+    pace: tuple[float, int, int]
 
 class Variables(TypedDict):
     """What is set and read in each step, and the Strings that are set before initialization."""

@@ -11,6 +11,7 @@ SLOW_MODULES = {
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
+    "test_fuzz_signals",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_native_build",
@@ -24,7 +25,10 @@ SLOW_MODULES = {
 
 EVERY = {
     "test_hostile_archive": 9,
+    "test_licences": 12,
+    "test_neighbours": 4,
     "test_pool": 8,
+    "test_slow_models": 3,
     "test_quirks": 31,
     "test_words": 17,
     "test_zoo": 29,

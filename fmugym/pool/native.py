@@ -31,6 +31,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -39,7 +40,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import CountedPool, HealthArray, no_counts
+from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
 
@@ -79,7 +80,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(CountedPool):
+class NativePool(AttendedPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -175,6 +176,8 @@ class NativePool(CountedPool):
                     "restores": method == ResetMethod.RESTORE,
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
+                    "one_initialization": spec.one_initialization,
+                    "pace": (spec.initialization_interval, *spec.turn),
                 },
                 variables={
                     "inputs": self._access(spec.inputs),
@@ -214,17 +217,10 @@ class NativePool(CountedPool):
 
     @property
     def can_play(self) -> bool:
-        """See ``Pool.can_play``."""
-        return True
+        """See ``Pool.can_play``; nobody waits for licences within a step."""
+        return not self._spec.licence_wait
 
     # The contract of Pool.
-
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``."""
-        self.reset_into(variables, values, mask)
-        return self._result
 
     def step(
         self,
@@ -376,6 +372,8 @@ class NativePool(CountedPool):
             self._open_pool()
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
+
+    _reset_some = reset_into
 
     def step_or_reset(
         self,

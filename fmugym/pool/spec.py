@@ -12,6 +12,7 @@ from fmugym.archive.description import Variable
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "DEFAULT_LEAK_LIMIT",
+    "INITIALIZATION_FACTOR",
     "ISOLATIONS",
     "PoolSpec",
     "ResetMethod",
@@ -23,6 +24,9 @@ ISOLATIONS: Final = ("none", "process")
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
 """How long a call to a worker process may take, in seconds of real time."""
+
+INITIALIZATION_FACTOR: Final = 10
+"""How many times as long as another call an instantiation or initialization may take."""
 
 DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
 """How many bytes resets may leak."""
@@ -64,6 +68,13 @@ class PoolSpec:
         leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
         reset_method: How instances start a new episode.
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
+        one_initialization: Whether only one instance in a process may be made, initialized, reset
+            or freed at a time. Steps run in parallel all the same.
+        initialization_interval: The least real time in seconds from one instantiation or
+            initialization to the next; see ``fmugym.pool.pacing``.
+        turn: Which turn this pool has in making and initializing instances, and how many turns
+            there are.
+        licence_wait: How long to wait for a refused licence, in seconds of real time.
     """
 
     inputs: tuple[Variable, ...]
@@ -80,6 +91,10 @@ class PoolSpec:
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET
     input_limits: tuple[tuple[float, float], ...] = ()
+    one_initialization: bool = False
+    initialization_interval: float = 0.0
+    turn: tuple[int, int] = (0, 1)
+    licence_wait: float = 0.0
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""

@@ -22,6 +22,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
@@ -33,10 +34,12 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMULoadError
+from fmugym.errors import FMULoadError, LicenceError
 from fmugym.fmi.words import as_messages, quoted
+from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.progress import INITIALIZATION
+from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 from fmugym.trial.cache import recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -57,6 +60,12 @@ _ALONE: Final = {"loading and instantiation", "initialization", "the first step"
 """The stages of a single instance. If a worker ends there only when memory is checked, the FMU
 writes to memory that it must not touch."""
 
+
+_LOOK: Final = 0.1
+"""Seconds between two looks at a worker."""
+
+_EVERY: Final = 10.0
+"""Seconds between two messages about a worker that takes long."""
 
 _MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
 """How glibc begins its messages about memory errors."""
@@ -98,6 +107,7 @@ class Stage(StrEnum):
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
     THREADS = "the comparison with an instance in another thread"
+    TURNS = "the comparison with an instance in another thread, initialized in turn"
 
     @classmethod
     def of(cls, method: ResetMethod) -> Stage:
@@ -164,6 +174,7 @@ def meet(fmu: FMU) -> None:
 
     Raises:
         FMULoadError: If the process did not survive. The text has the reason and the last lines.
+        LicenceError: If the FMU got no licence.
     """
     candidate = Candidate.of(fmu)
     if not candidate.exempt and known_verdict(fmu) is None:
@@ -200,8 +211,10 @@ def examine(
 
     Raises:
         FMULoadError: As ``meet``, if ``must_survive``.
+        LicenceError: If an instance got no licence.
     """
-    asked = _digest(repr((spec, starts, candidate.preload)).encode())
+    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0)  # the rest is tried
+    asked = _digest(repr((tried, starts, candidate.preload)).encode())
     key = f"{_content_key(candidate.path)}-{asked}"
     known = Verdict.from_text(recall(key))
     if known is not None and (known.neighbours is not None or not several):
@@ -221,6 +234,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
             logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
             return Verdict()
         notes.add(outcome)
+        notes.require_licence(name, outcome)
         if "finished" in outcome.answer:
             break
         if "complete" not in outcome.answer:
@@ -232,6 +246,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
     verdict = notes.verdict
+    logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
     return verdict
@@ -260,22 +275,41 @@ class _Notes:
             deterministic=bool(answer.get("deterministic", True)),
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             neighbours=None if neighbours is None else Neighbours(neighbours),
+            instances=int(answer.get("instances", 1)),
             isolate=any(death.stage in _ALONE for death in self._deaths),
             reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
+
+    def require_licence(self, name: str, outcome: _Outcome) -> None:
+        """Give up if an instance got no licence: this tells nothing about the FMU itself.
+
+        Raises:
+            LicenceError: With the FMU's words.
+        """
+        answer, said = outcome.answer, outcome.said
+        words = answer.get("refused", "")
+        if "finished" not in answer and "complete" in answer and speaks_of_licence(said):
+            words = f"it {outcome.end}{said}"
+        if words:
+            raise LicenceError(
+                f"{name} got no licence in its trial, which used {answer['instances']} "
+                f"instance(s) at once: {words}"
+            )
 
     def died_alone(self, name: str, must_survive: bool) -> Verdict:
         """Report that even a lone instance dies, or that it needs a separate process.
 
         Raises:
             FMULoadError: If ``must_survive``.
+            LicenceError: If it also speaks of a licence.
         """
         last = self._deaths[-1]
         if must_survive:
-            raise FMULoadError(
+            text = (
                 f"{name} cannot be used: in {last.stage} it {last.end}{last.said}. That was a "
                 "trial in a process of its own; probe_timeout=None turns it off"
             )
+            raise LicenceError(text) if speaks_of_licence(last.said) else FMULoadError(text)
         return replace(self.verdict, isolate=True, neighbours=Neighbours.PROCESSES)
 
 
@@ -318,12 +352,70 @@ def _watch(folder: Path, request: Request) -> tuple[str, list[str]]:
     )
     tail = OutputTail(cast(BinaryIO, process.stdout))
     try:
-        end = f"ended the process with {describe_exit(process.wait(timeout))}"
-    except subprocess.TimeoutExpired:
-        end = f"did not come back within {timeout:g} s (probe_timeout)"
+        end = _wait(process, _Watch(folder, request.candidate.path.name, timeout))
     finally:
         _end(process)
     return end, tail.lines()
+
+
+def patience(call: str, timeout: float) -> float:
+    """How many seconds a call may take in a trial: an initialization may take ten times as long."""
+    return timeout * INITIALIZATION_FACTOR if call == INITIALIZATION else timeout
+
+
+class _Watch:
+    """Looks at what a worker does, and for how long.
+
+    Args:
+        folder: Where it writes down its stage and the call it makes.
+        name: The FMU.
+        timeout: Seconds that a call may take.
+    """
+
+    def __init__(self, folder: Path, name: str, timeout: float) -> None:
+        self._file, self._folder = folder / "call", folder
+        self._name, self._timeout = name, timeout
+        self._change = 0
+        self._call = INITIALIZATION
+        self._begin = self._told = time.monotonic()
+
+    def look(self) -> str:
+        """Look at the worker, and log every ten seconds what takes so long.
+
+        Returns:
+            How it ended, if a call has taken too long; otherwise "".
+        """
+        self._notice_call()
+        seconds = time.monotonic() - self._begin
+        if time.monotonic() - self._told >= _EVERY:
+            self._told = time.monotonic()
+            stage = _stage(self._folder) or "its start"
+            doing = f"{stage}; {self._call}"
+            logger.info("%s: the trial is in %s has taken %.0f s", self._name, doing, seconds)
+        limit = patience(self._call, self._timeout)
+        if seconds < limit:
+            return ""
+        if limit == self._timeout:
+            return f"did not come back within {limit:g} s (probe_timeout)"
+        return f"did not come back from {self._call} within {limit:g} s (ten times probe_timeout)"
+
+    def _notice_call(self) -> None:
+        with contextlib.suppress(OSError):
+            change = self._file.stat().st_mtime_ns
+            if change != self._change:
+                self._change, self._begin = change, time.monotonic()
+                self._call = self._file.read_text() or self._call
+
+
+def _wait(process: subprocess.Popen[bytes], watch: _Watch) -> str:
+    """Wait for the end of a worker; return how it ended."""
+    while True:
+        try:
+            return f"ended the process with {describe_exit(process.wait(_LOOK))}"
+        except subprocess.TimeoutExpired:
+            late = watch.look()
+            if late:
+                return late
 
 
 def _environment(folder: Path, check_memory: bool) -> dict[str, str]:
