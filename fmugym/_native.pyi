@@ -245,15 +245,20 @@ class Pool:
         terminated: Array,
         truncated: Array,
         drawn: Array,
+        last_observations: Array | None,
+        started: Array | None,
         /,
-    ) -> tuple[int, int]:
-        """Do a step, with all that was taken over.
+    ) -> tuple[int, int, int]:
+        """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:
             TypeError: If the actions have another type or shape than was prepared.
             ValueError: If one of them is out of range or NaN.
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
+
+    def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
+        """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""

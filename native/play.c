@@ -85,19 +85,12 @@ void play_open(const Turn *turn, size_t count, PlayScratch *scratch) {
     program_prepare(&turn->play->judgement, has_short_runs, scratch->judgement);
 }
 
-/* An episode that starts has no action yet. */
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
     const Actions *a = &turn->play->actions;
     const size_t size = a->elements * a->size, offset = begin * size;
 
     memcpy(a->previous + offset, a->current + offset, count * size);
     memcpy(a->current + offset, turn->actions + offset, count * size);
-    for (size_t j = 0; j < count; j++) {
-        if (turn->play->ended[begin + j]) {
-            memcpy(a->previous + offset + j * size, a->none, size);
-            memcpy(a->current + offset + j * size, a->none, size);
-        }
-    }
 }
 
 void play_keep_outputs(const Play *play, size_t begin, size_t count) {
@@ -124,10 +117,20 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     }
 }
 
-/* Gives the hooks of an episode that has just started what they read after a reset. */
-static void start_episode(const Turn *turn, size_t index) {
+/* An episode that starts has no action yet. */
+static void forget_actions(const Actions *a, size_t index) {
+    const size_t size = a->elements * a->size;
+
+    if (a->current != NULL) {
+        memcpy(a->previous + index * size, a->none, size);
+        memcpy(a->current + index * size, a->none, size);
+    }
+}
+
+void play_start_episode(const Turn *turn, size_t index) {
     const Play *play = turn->play;
 
+    forget_actions(&play->actions, index);
     for (size_t i = 0; i < play->number_of_inputs; i++) {
         const InputStart *start = &play->input_starts[i];
         play->input_rows[i * play->count + index] =
@@ -151,7 +154,7 @@ static void start_episode(const Turn *turn, size_t index) {
 static void start_episodes(const Turn *turn, size_t begin, size_t count) {
     for (size_t index = begin; index < begin + count; index++) {
         if (turn->play->ended[index]) {
-            start_episode(turn, index);
+            play_start_episode(turn, index);
         }
     }
 }
@@ -220,4 +223,7 @@ void play_skip(const Turn *turn, size_t index) {
     turn->rewards[index] = 0.0;
     turn->terminated[index] = turn->truncated[index] = 0;
     program_clear_seen(&turn->play->judgement, turn->seen, index);
+    if (turn->started != NULL) {
+        turn->started[index] = 0;
+    }
 }

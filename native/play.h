@@ -81,8 +81,10 @@ typedef struct {
     double *rewards;
     uint8_t *terminated, *truncated;
     char *const *seen; /* the arrays of the observations and infos that the judgement stores */
-    double *drawn;     /* a row for each draw; only the values drawn in this step are written.
-                        * Values that were given are read from it */
+    float *last_observations; /* those of episodes that end, where the next ones start at once */
+    uint8_t *started;         /* where they have started; NULL if they start in the next step */
+    double *drawn; /* a row for each draw; only the values drawn in this step are written. Values
+                    * that were given are read from it */
 } Turn;
 
 /* Whether an action is out of range or NaN. */
@@ -110,6 +112,9 @@ void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scrat
 
 /* Keeps the outputs of a run, before the new ones replace them. */
 void play_keep_outputs(const Play *play, size_t begin, size_t count);
+
+/* Gives the hooks of an episode that has just started what they read after a reset. */
+void play_start_episode(const Turn *turn, size_t index);
 
 /* For an environment that is neither reset nor stepped because memory ran out. */
 void play_skip(const Turn *turn, size_t index);

@@ -192,9 +192,11 @@ def test_generated_expressions(prototype, reward, observed, variable):
     try:
         task = trace_hooks(env)
     except UntraceableError as error:
-        assert any(reason in str(error) for reason in NOT_TRACED), error
-        return
-    require_same_programs(env, batch, task)
+        task, reason = None, str(error)
+    if task is None:
+        assert any(known in reason for known in NOT_TRACED)
+    else:
+        require_same_programs(env, batch, task)
 
 
 def test_no_warnings_of_numpy_come_from_compiled_code():

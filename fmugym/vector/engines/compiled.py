@@ -26,6 +26,7 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.infos import final_infos, rows_as_objects
 from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -125,6 +126,7 @@ class CompiledEngine(BatchEngine):
             self._surroundings(task),
         )
         self._play_with_resets = self._pool.watched(self._play)
+        self._start = self._pool.start_of_play()
         self._prepared = True
 
     def _make_rows(self, task: TracedTask) -> None:
@@ -244,6 +246,31 @@ class CompiledEngine(BatchEngine):
             task = None
         self._prepare(task)
 
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Engine.reset``."""
+        if options or self._any_foreign or not self._prepared or self._layout.has_own:
+            return super().reset(mask, seeds, options)
+        self.has_moved = False
+        if seeds is not None:
+            self._streams.seed(seeds, np.flatnonzero(mask))
+        self._streams.require_seeds()
+        observations, drawn = np.empty(self._shape, _FLOAT32), self._draw_ahead(mask)
+        self.has_moved = True
+        if self._start(mask, observations, drawn):
+            self._require_started(np.flatnonzero(mask), self._pool.statuses)
+            self._require_finite_start(observations, mask)
+        self.any_ended = bool(np.count_nonzero(self.ended))
+        return observations, _start_infos(self._names, drawn, mask)
+
+    def _draw_ahead(self, mask: MaskArray | None) -> FloatArray:
+        """Make the array of drawn values; those of episodes that only Python can draw are in it."""
+        drawn = np.empty(self._drawn_shape)
+        if mask is not None and self._draws_ahead:
+            drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
+        return drawn
+
     def call(
         self,
         name: str,
@@ -267,32 +294,34 @@ class CompiledEngine(BatchEngine):
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         judged = rewards, terminated, truncated
-        drawn = np.empty(self._drawn_shape)
         self.has_moved = False
         if resetting is not None and self._draws_ahead:
             actions = self._flat(actions)  # a refused step draws nothing
-            drawn[:, resetting] = self._streams.draw(self.env._plan, np.flatnonzero(resetting))
-        play = self._play if resetting is None else self._play_with_resets
+        drawn, last, started = self._draw_ahead(resetting), None, None
+        if self.starts_at_ends and not self._draws_ahead and not layout.has_own:
+            last, started = np.empty(self._shape, _FLOAT32), np.empty(self._n, _BOOL)
+        play = self._play if resetting is started is None else self._play_with_resets
         self.has_moved = True
         try:
-            troubled, ended = play(actions, seen, *judged, drawn)
+            troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
         except (TypeError, ValueError, BufferError) as error:
             require_refusal(error)
             self.has_moved = False
             actions = self._flat(actions)
             self.has_moved = True
-            troubled, ended = play(actions, seen, *judged, drawn)
-        self.any_ended = ended > 0
+            troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
+        self.any_ended = ended > begun
         infos: dict[str, Any] = {}
         observations = seen
         if layout.has_own:
             observations, infos = layout.divided(seen, self._n)
         if resetting is not None:
-            told = LateDict.of(_told, self._names, drawn, resetting)  # rarely read
-            infos |= {"drawn": told, "_drawn": resetting}
+            infos |= _start_infos(self._names, drawn, resetting)
+        elif begun:
+            infos = LateDict.of(_infos_at_ends, self._names, drawn, last, started)
         result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
         if troubled:
-            self._mend(result, resetting)
+            self._mend(result, resetting if started is None else started)
         return result
 
     def _flat(self, actions: Any) -> npt.NDArray[Any]:
@@ -312,13 +341,18 @@ class CompiledEngine(BatchEngine):
             self._take_over()
         return result
 
-    def _mend(self, result: StepResult, resetting: MaskArray | None) -> None:
-        """Handle failures and numbers that are not finite: rare, so numpy is fast enough."""
+    def _mend(self, result: StepResult, starting: MaskArray | None) -> None:
+        """Handle failures and numbers that are not finite: rare, so numpy is fast enough.
+
+        Args:
+            result: Of the step; it is corrected.
+            starting: Which environments have started an episode in this step.
+        """
         env, statuses = self.env, self._pool.statuses
-        if resetting is not None:
-            self._require_started(np.flatnonzero(resetting), statuses)
-            self._require_finite_start(result.observations, resetting)
-        self._require_possible_inputs(resetting)
+        if starting is not None:
+            self._require_started(np.flatnonzero(starting), statuses)
+            self._require_finite_start(result.observations, starting)
+        self._require_possible_inputs(starting)
         env.done = result.terminated.copy()
         self._outputs_before, self._variables_before = self._kept, self._before
         env._in_hooks = True
@@ -327,6 +361,8 @@ class CompiledEngine(BatchEngine):
         finally:
             env._in_hooks = False
         self.note_ends(result.terminated, result.truncated)
+        if starting is not None:
+            self.note_starts(starting)
 
     def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
         """Refuse inputs that are not finite, which they also are outside of their type's range."""
@@ -384,6 +420,17 @@ def _masked(infos: Mapping[str, Any], count: int) -> dict[str, Any]:
         for name, value in infos.items()
     }
     return values | {f"_{name}": np.ones(count, np.bool_) for name in values}
+
+
+def _infos_at_ends(
+    names: list[str], drawn: FloatArray, last: npt.NDArray[Any], started: MaskArray
+) -> dict[str, Any]:
+    infos = _start_infos(names, drawn, started)
+    return infos | final_infos(rows_as_objects(last, started), {}, started)
+
+
+def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return {"drawn": LateDict.of(_told, names, drawn, mask), "_drawn": mask}  # rarely read
 
 
 def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
