@@ -27,6 +27,7 @@ from fmugym.task.step import conclude
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
+_INTEGERS: Final = frozenset({int, np.int64})
 _WARNING: Final = int(Status.WARNING)
 _TERMINATED: Final = int(Status.TERMINATED)
 _ARGUMENTS: Final = ("fmu_path", "config", "log_level", "render_mode", "backend", "isolation")
@@ -233,7 +234,7 @@ class FMUEnv(Constructed):
 
     def _take_action(self, action: Any) -> None:
         elements = self._elements
-        if elements is None or type(action) is not int or action not in elements:
+        if elements is None or type(action) not in _INTEGERS or action not in elements:
             self._require_usable(action)
         before = self.previous_action, self.previous_state
         self.previous_action, self.previous_state, self.action = self.action, self.state, action
