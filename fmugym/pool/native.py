@@ -31,7 +31,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
-from fmugym.pool.attendant import Attendant
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -40,7 +40,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import CountedPool, HealthArray, no_counts
+from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
 
@@ -80,7 +80,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(CountedPool):
+class NativePool(AttendedPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -140,10 +140,10 @@ class NativePool(CountedPool):
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self.step_own = self._pool.step_own
-        self._attendant = Attendant.of(spec, log)
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
+        self._reset_of_play = self.watched(self._pool.start)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
@@ -221,16 +221,6 @@ class NativePool(CountedPool):
         return not self._spec.licence_wait
 
     # The contract of Pool.
-
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``."""
-        if self._attendant is None:
-            self.reset_into(variables, values, mask)
-        else:
-            self._attendant.reset(self, self.reset_into, variables, values, mask)
-        return self._result
 
     def step(
         self,
@@ -383,6 +373,8 @@ class NativePool(CountedPool):
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
 
+    _reset_some = reset_into
+
     def step_or_reset(
         self,
         inputs: FloatArray | None,
@@ -429,7 +421,7 @@ class NativePool(CountedPool):
         start_values: FloatArray,
         draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-    ) -> Callable[..., tuple[int, int]]:
+    ) -> Callable[..., tuple[int, int, int]]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
 
         This replaces what was prepared before. Every step uses the given arrays in place.
@@ -445,10 +437,13 @@ class NativePool(CountedPool):
                 the next step, shape (N,); steps after which an episode is truncated.
 
         Returns:
-            A function of actions (int64), observations, rewards, terminated, truncated and drawn
-            values (draws, N). It does a step and fills all but the actions; of the drawn values,
-            only those of episodes that start; ``given`` ones are read. It returns how many
-            instances have a status worse than a warning, and how many episodes have ended.
+            A function of actions (int64), observations, rewards, terminated, truncated, drawn
+            values (draws, N), last observations and started (Booleans). It does a step and fills
+            all but the actions; of the drawn values, only those of episodes that start; ``given``
+            ones are read. If the last two are arrays, an episode that ends without a fault is
+            followed by the next in the same step; if they are None, in the next step. It returns
+            how many instances had trouble (a status worse than a warning, or a first observation
+            that is not finite), how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(
@@ -462,6 +457,16 @@ class NativePool(CountedPool):
             episodes={"step_counts": count, "ended": ended, "limit": limit},
         )
         return self._pool.play
+
+    def start_of_play(self) -> Callable[..., int]:
+        """The function that starts episodes after ``prepare_play``, outside of a step.
+
+        Returns:
+            A function of a mask, observations and drawn values (draws, N). It fills all of the
+            observations, and the drawn values in the mask; ``given`` ones are read. It returns how
+            many instances had trouble.
+        """
+        return self._reset_of_play
 
     @property
     def uses_states(self) -> bool:
