@@ -20,7 +20,7 @@ from measure import Effort, MissingError
 from tables import Table, duration, share
 
 from fmugym.envs import CartPoleEnv
-from fmugym.task.opening import request_pool
+from fmugym.vector.making import make_with_pool
 
 __all__ = ["tables"]
 
@@ -58,8 +58,7 @@ def _pools(stack: ExitStack, make_env: Callable[[], Any], count: int) -> list[An
     """Make a pool on a single thread here, and one in a single worker."""
     pools = []
     for options in ({"isolation": "none"}, {"isolation": "process", "workers": 1}):
-        with request_pool(count, threads=1, **options):
-            env = make_env()
+        env = make_with_pool(make_env, count, threads=1, **options)
         stack.callback(env.close)
         plan = env._plan
         pools.append(env._pool)
@@ -91,8 +90,7 @@ def _median_time(call: Callable[[], object], count: int) -> float:
 def _faults(stack: ExitStack, effort: Effort) -> Table:
     table = Table("Worker processes: faults of one cart-pole", ["what", "median", "longest"])
     count = 3 if effort.quick else 30
-    with request_pool(1, isolation="process"):
-        env = CartPoleEnv(log_level=logging.CRITICAL)
+    env = make_with_pool(_quiet_env, isolation="process")
     stack.callback(env.close)
     cases: dict[str, Callable[[], float]] = {
         "a worker is killed: until the step is truncated": lambda: _death(env),
@@ -103,6 +101,10 @@ def _faults(stack: ExitStack, effort: Effort) -> Table:
     hangs = [_hang(stack) for _ in range(1 if effort.quick else 10)]
     _add_times(table, f"a step hangs: after its time-out of {duration(TIMEOUT)}", hangs)
     return table
+
+
+def _quiet_env() -> CartPoleEnv:
+    return CartPoleEnv(log_level=logging.CRITICAL)
 
 
 def _after_death(env: Any, measure: Callable[[], float]) -> float:
@@ -127,8 +129,7 @@ def _restart(env: Any) -> float:
 
 def _hang(stack: ExitStack) -> float:
     """Stop a worker, so that it does not answer; return the time after its time-out."""
-    with request_pool(1, isolation="process", call_timeout=TIMEOUT):
-        env = CartPoleEnv(log_level=logging.CRITICAL)
+    env = make_with_pool(_quiet_env, isolation="process", call_timeout=TIMEOUT)
     stack.callback(env.close)
     env.reset()
     os.kill(env._pool.processes()[0], signal.SIGSTOP)

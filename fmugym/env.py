@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from math import floor, hypot, isfinite, nan
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Never
+from typing import Any, ClassVar, Final, Never, cast
 
 import numpy as np
 from gymnasium import logger as gymnasium_logger
@@ -28,6 +28,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.health import fault_rates
+from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import (
     elements_of,
@@ -40,7 +41,7 @@ from fmugym.task.actions import (
 from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.hooks import OwnHooks
 from fmugym.task.interface import checked, output_variable, resolve, start_variable
-from fmugym.task.opening import open_fmu, open_pool
+from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.results import (
     FLOAT32_LIMIT,
@@ -122,16 +123,22 @@ class FMUEnv(Pictured):
     """The keys that ``reset`` takes in its options."""
 
     _values: Any
+    _number: int
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
     _has_info: bool
     _pool_tells = False
     _pool: Pool | None = None
+    _is_closed = False
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUEnv:
-        """Keep the arguments, because an environment pickles as its class and arguments."""
+        """Keep the arguments, because an environment pickles as its class and arguments.
+
+        The number tells a vector environment which environments are new.
+        """
         env = super().__new__(cls)
         env._constructor_arguments = args, kwargs
+        env._number = next(env_numbers)
         return env
 
     def __init__(
@@ -160,14 +167,19 @@ class FMUEnv(Pictured):
         self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
-        self._pool = open_pool(
+        self._opening = PoolOpening(
             self.fmu, self._spec, self.config, self._plan, self.logger, backend, isolation
         )
-        self._step_pool = self._pool.step_own
-        self._input_row, self._output_row = self._pool.inputs[:, 0], self._pool.outputs[:, 0]
-        self._observation_row = self._pool.observations[0]
-        self._halt = self._pool.halt
-        self._pool_tells = bool(self._pool.info())
+        if not pools_are_deferred():
+            self._use(self._opening.open())
+
+    def _use(self, pool: Pool) -> None:
+        """Let a pool of one step this environment, or one of N if a vector environment does it."""
+        self._pool = pool
+        self._step_pool, self._halt = pool.step_own, pool.halt
+        self._input_row, self._output_row = pool.inputs[:, 0], pool.outputs[:, 0]
+        self._observation_row = pool.observations[0]
+        self._pool_tells = bool(pool.info())
         self._has_info = self._has_info or self._pool_tells
 
     @property
@@ -292,7 +304,7 @@ class FMUEnv(Pictured):
         try:
             pool.reset(plan.model_variables, episode.start_values)
             if pool.statuses.item(0) > Status.WARNING:
-                raise SimulationError(pool.failure(0))
+                raise failed_reset(pool.failure(0))
             self._begin_episode(episode)
             observation, info = self._observation_and_info()
         except BaseException:
@@ -413,8 +425,12 @@ class FMUEnv(Pictured):
 
     def _open_pool(self, method: str) -> Pool:
         if self._pool is None:
-            raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-        return self._pool
+            if self._is_closed:
+                raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
+            self._opening = self._opening.apart()
+            self.fmu = self._opening.fmu
+            self._use(self._opening.open())
+        return cast(Pool, self._pool)
 
     def _take_action(self, action: Any) -> None:
         elements = self._elements
@@ -602,13 +618,17 @@ class FMUEnv(Pictured):
 
     def close(self) -> None:
         """Free the FMU and its temporary folder; more than one call is fine."""
-        if self._pool is not None:
-            self._pool.close()
-            self._pool = None
+        self._is_closed = True
+        self._close_pool()
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
         super().close()
+
+    def _close_pool(self) -> None:
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
         return _rebuild, (type(self), *self._constructor_arguments)

@@ -44,7 +44,7 @@ typedef struct {
     const char *token;     /* GUID or instantiation token */
     const char *resources; /* a URI, in FMI 3.0 a path */
     uint64_t environment;  /* the same name as a number, for FMI 3.0 */
-    bool logging;
+    bool logging;          /* whether the FMU logs everything, not only what it thinks necessary */
 } Identity;
 
 typedef struct {
@@ -94,6 +94,10 @@ typedef struct Fmi {
     bool (*bind)(Library *library, char *error, size_t size);
 
     void *(*instantiate)(const Library *library, const Identity *identity);
+    /* Asks for messages of these categories; for none if count is 0. NULL in FMI 1.0, which has no
+     * categories. An FMU without the function returns OK. */
+    Status (*choose_messages)(const Library *library, void *component,
+                              const char *const *categories, size_t count);
     /* Sets doing to the name of the call that failed. */
     Status (*initialize)(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing);

@@ -19,6 +19,7 @@ typedef struct {
 typedef struct {
     void *(*instantiate)(const char *name, int type, const char *token, const char *resources,
                          const Callbacks *callbacks, int visible, int logging);
+    int (*set_debug_logging)(void *component, int on, size_t count, const char *const *categories);
     void (*free_instance)(void *component);
     int (*set_up)(void *component, int has_tolerance, double tolerance, double start_time,
                   int has_stop_time, double stop_time);
@@ -47,6 +48,7 @@ typedef struct {
 
 static const Binding bindings[] = {
     {"Instantiate", offsetof(Functions, instantiate), true},
+    {"SetDebugLogging", offsetof(Functions, set_debug_logging), false},
     {"FreeInstance", offsetof(Functions, free_instance), true},
     {"SetupExperiment", offsetof(Functions, set_up), true},
     {"EnterInitializationMode", offsetof(Functions, enter_initialization), true},
@@ -84,6 +86,14 @@ static void *instantiate(const Library *library, const Identity *identity) {
     return functions_of(library)->instantiate(identity->name, CO_SIMULATION, identity->token,
                                               identity->resources, &callbacks, 0,
                                               identity->logging);
+}
+
+static Status choose_messages(const Library *library, void *component,
+                              const char *const *categories, size_t count) {
+    const Functions *f = functions_of(library);
+    return f->set_debug_logging == NULL
+               ? STATUS_OK
+               : sane(f->set_debug_logging(component, count > 0, count, categories));
 }
 
 static Status initialize(const Library *library, void *component, const Experiment *e,
@@ -217,6 +227,7 @@ const Fmi fmi2 = {
     .boolean_size = sizeof(int),
     .bind = bind,
     .instantiate = instantiate,
+    .choose_messages = choose_messages,
     .initialize = initialize,
     .do_step = do_step,
     .exchange = exchange,

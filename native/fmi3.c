@@ -18,6 +18,7 @@ typedef struct {
                          void (*logger)(void *environment, int status, const char *category,
                                         const char *text),
                          void (*intermediate_update)(void));
+    int (*set_debug_logging)(void *instance, bool on, size_t count, const char *const *categories);
     void (*free_instance)(void *instance);
     int (*enter_initialization)(void *instance, bool has_tolerance, double tolerance,
                                 double start_time, bool has_stop_time, double stop_time);
@@ -43,6 +44,7 @@ typedef struct {
 
 static const Binding bindings[] = {
     {"InstantiateCoSimulation", offsetof(Functions, instantiate), true},
+    {"SetDebugLogging", offsetof(Functions, set_debug_logging), false},
     {"FreeInstance", offsetof(Functions, free_instance), true},
     {"EnterInitializationMode", offsetof(Functions, enter_initialization), true},
     {"ExitInitializationMode", offsetof(Functions, exit_initialization), true},
@@ -80,6 +82,14 @@ static void *instantiate(const Library *library, const Identity *identity) {
     return functions_of(library)->instantiate(
         identity->name, identity->token, identity->resources, false, identity->logging, false,
         false, NULL, 0, (void *)(uintptr_t)identity->environment, log_message_fmi3, NULL);
+}
+
+static Status choose_messages(const Library *library, void *instance,
+                              const char *const *categories, size_t count) {
+    const Functions *f = functions_of(library);
+    return f->set_debug_logging == NULL
+               ? STATUS_OK
+               : sane(f->set_debug_logging(instance, count > 0, count, categories));
 }
 
 static Status initialize(const Library *library, void *instance, const Experiment *e,
@@ -190,6 +200,7 @@ const Fmi fmi3 = {
     .boolean_size = sizeof(bool),
     .bind = bind,
     .instantiate = instantiate,
+    .choose_messages = choose_messages,
     .initialize = initialize,
     .do_step = do_step,
     .exchange = exchange,

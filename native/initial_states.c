@@ -60,7 +60,7 @@ static Status warm_up(Pool *pool, Instance *me) {
     return STATUS_OK;
 }
 
-static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
+static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
     const Settings *s = &pool->settings;
     StartContext context = {pool, me, start, scratch, UINT32_MAX};
     const char *doing = "initialization";
@@ -69,14 +69,27 @@ static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch 
     if (status > STATUS_WARNING) {
         return status;
     }
+    pace_wait(&pool->pace);
+    instance_begin_turn(pool);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
+    instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         return fail_initialization(pool, me, &context, doing, status);
     }
     me->phase = PHASE_STEPPING;
     return warm_up(pool, me);
+}
+
+/* An initialization that fails without a word is repeated, and the FMU is asked to log all. */
+static Status initialize(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
+    const Status status = initialize_once(pool, me, start, scratch);
+
+    if (status > STATUS_WARNING && instance_rebuild_to_hear(pool, me)) {
+        return initialize_once(pool, me, start, scratch);
+    }
+    return status;
 }
 
 /* Initial states. The pool saves one when the same start values occur a second time, after an
@@ -175,6 +188,16 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
     return got;
 }
 
+/* A failure must not be explained by the messages of earlier episodes. */
+static void forget_old_messages(Pool *pool, Instance *me) {
+    const size_t index = index_of(pool, me);
+
+    if (me->phase != PHASE_INSTANTIATED && !log_is_silent(&pool->log, index)) {
+        log_forget(&pool->log, index);
+        instance_hush(pool, me);
+    }
+}
+
 Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
     const Access *start = call->start;
     const Matrix *values = &call->start_values;
@@ -183,6 +206,7 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     health_count_steps(pool, me);
     health_of(pool, me)[RESETS]++;
     health_of(pool, me)[RETRIED] = 0;
+    forget_old_messages(pool, me);
     if (instance_renew_if_due(pool, me) > STATUS_WARNING) {
         return STATUS_FATAL;
     }

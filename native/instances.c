@@ -7,18 +7,100 @@ static const char *name_of(const Pool *pool, size_t index) {
     return pool->names + index * pool->name_size;
 }
 
-bool instance_build(Pool *pool, Instance *me) {
+void instance_begin_turn(Pool *pool) {
+    if (pool->settings.one_initialization) {
+        mutex_lock(pool->making);
+    }
+}
+
+void instance_end_turn(Pool *pool) {
+    if (pool->settings.one_initialization) {
+        mutex_unlock(pool->making);
+    }
+}
+
+static bool build(Pool *pool, Instance *me, bool logging) {
     const Settings *s = &pool->settings;
     const size_t index = index_of(pool, me);
     const Identity identity = {name_of(pool, index), s->token, s->resources,
-                               log_environment(&pool->log, index), s->logging};
+                               log_environment(&pool->log, index), logging};
 
-    mutex_lock(&pool->making);
+    pace_wait(&pool->pace);
+    mutex_lock(pool->making);
     me->component = s->fmi->instantiate(me->library, &identity);
-    mutex_unlock(&pool->making);
+    mutex_unlock(pool->making);
     floats_restore_if_seen(&pool->floats);
     me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
+    me->hearing = logging ? HEARING_ALL : HEARING_LITTLE;
     return me->component != NULL;
+}
+
+static Status choose_messages(const Pool *pool, Instance *me, size_t count) {
+    const Settings *s = &pool->settings;
+    const Status status =
+        s->fmi->choose_messages(me->library, me->component, s->categories, count);
+
+    floats_restore_if_seen(&pool->floats);
+    return instance_judge(me, status);
+}
+
+/* Asks the FMU to say why calls fail. If it cannot bear the question, it is made anew. */
+static bool ask_for_errors(Pool *pool, Instance *me) {
+    const Settings *s = &pool->settings;
+
+    if (s->logging || s->number_of_categories == 0 || s->fmi->choose_messages == NULL ||
+        atomic_get(&pool->deaf)) {
+        return true;
+    }
+    if (choose_messages(pool, me, s->number_of_categories) <= STATUS_WARNING) {
+        me->hearing = HEARING_ERRORS;
+        return true;
+    }
+    atomic_set(&pool->deaf, 1);
+    instance_discard(pool, me);
+    return build(pool, me, false);
+}
+
+/* An FMU that logs nothing may take long to be instantiated, and it may fail often. */
+static bool may_hear_all(Pool *pool) {
+    enum { MOST = 4 };
+    return !pool->settings.logging && atomic_add(&pool->heard, 1) < MOST;
+}
+
+bool instance_build(Pool *pool, Instance *me) {
+    if (build(pool, me, pool->settings.logging)) {
+        return ask_for_errors(pool, me);
+    }
+    return log_is_silent(&pool->log, index_of(pool, me)) && may_hear_all(pool) &&
+           build(pool, me, true);
+}
+
+/* Whether a call of the FMU failed, and the FMU did not say why. */
+static bool is_unexplained(const Instance *me) {
+    const Failure *failure = me->failure;
+    return failure != NULL && failure->status >= 0 && failure->said == NULL;
+}
+
+bool instance_rebuild_to_hear(Pool *pool, Instance *me) {
+    if (!is_unexplained(me) || me->phase == PHASE_DEAD || me->hearing == HEARING_ALL ||
+        pool->snapshots != NULL || !may_hear_all(pool)) {
+        return false;
+    }
+    instance_discard(pool, me);
+    if (!build(pool, me, true)) {
+        return false;
+    }
+    failure_drop(me);
+    return true;
+}
+
+void instance_hush(Pool *pool, Instance *me) {
+    if (me->hearing == HEARING_ERRORS && me->phase == PHASE_STEPPING &&
+        atomic_get(&pool->log.idle) > LOG_IDLE_LIMIT) {
+        me->hearing = HEARING_LITTLE;
+        atomic_set(&pool->deaf, 1);
+        choose_messages(pool, me, 0);
+    }
 }
 
 Status instance_free_state(const Pool *pool, Instance *me, void **state) {
@@ -54,9 +136,9 @@ void instance_discard(Pool *pool, Instance *me) {
         instance_judge(me, fmi->terminate(me->library, me->component));
     }
     if (me->phase != PHASE_DEAD) {
-        mutex_lock(&pool->making);
+        mutex_lock(pool->making);
         fmi->free_instance(me->library, me->component);
-        mutex_unlock(&pool->making);
+        mutex_unlock(pool->making);
     }
     floats_restore_if_seen(&pool->floats);
     me->component = NULL;
@@ -119,7 +201,11 @@ Status instance_renew_if_due(Pool *pool, Instance *me) {
         health_of(pool, me)[RECYCLINGS]++;
         return replace(pool, me);
     }
-    return pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
+    if (me->phase != PHASE_STEPPING && instance_rebuild_to_hear(pool, me)) {
+        return STATUS_OK;
+    }
+    const bool loud = me->hearing == HEARING_ALL && !pool->settings.logging;
+    return loud || pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
 }
 
 /* Returns an instance to the state just after instantiation. Replaces the instance if it refuses
@@ -129,7 +215,9 @@ Status instance_return_to_start(Pool *pool, Instance *me) {
         return STATUS_OK;
     }
     if (me->phase != PHASE_DEAD) {
+        instance_begin_turn(pool);
         const Status status = pool->settings.fmi->reset(me->library, me->component);
+        instance_end_turn(pool);
         floats_restore_if_seen(&pool->floats);
         if (status <= STATUS_WARNING) {
             me->phase = PHASE_INSTANTIATED;

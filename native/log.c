@@ -22,13 +22,14 @@ static struct {
     size_t length;
 } echo;
 
-bool log_open(Log *log, size_t count) {
+bool log_open(Log *log, size_t count, bool terse) {
     memset(log, 0, sizeof *log);
     log->recent = calloc(count, sizeof *log->recent);
     if (log->recent == NULL) {
         return false;
     }
     log->count = count;
+    log->terse = terse;
     mutex_lock(&lock);
     log->id = next_id++;
     log->next = logs;
@@ -37,14 +38,18 @@ bool log_open(Log *log, size_t count) {
     return true;
 }
 
+static Recent *recent_of(const Log *log, size_t index) {
+    return (Recent *)(uintptr_t)atomic_get(&log->recent[index]);
+}
+
 static void forget(Log *log, size_t index) {
-    Recent *recent = log->recent[index];
+    Recent *recent = recent_of(log, index);
 
     for (size_t i = 0; recent != NULL && i < LOG_RECENT; i++) {
         free(recent->texts[i]);
     }
     free(recent);
-    log->recent[index] = NULL;
+    atomic_set(&log->recent[index], 0);
 }
 
 static void unlink_log(const Log *log) {
@@ -65,7 +70,7 @@ void log_close(Log *log) {
     for (size_t i = 0; i < log->count; i++) {
         forget(log, i);
     }
-    free(log->recent);
+    free((void *)log->recent);
     log->recent = NULL;
     log->count = 0;
     messages_free(log_take(log, &dropped));
@@ -155,15 +160,17 @@ static void queue_message(Log *log, size_t index, int status, const char *catego
     enqueue(log, message);
 }
 
-static void remember(Log *log, size_t index, const char *text) {
-    Recent *recent = log->recent[index];
+static void remember(Log *log, size_t index, int status, const char *text) {
+    Recent *recent = recent_of(log, index);
 
     if (recent == NULL) {
-        recent = log->recent[index] = calloc(1, sizeof *recent);
+        recent = calloc(1, sizeof *recent);
+        atomic_set(&log->recent[index], (uintptr_t)recent);
     }
     if (recent != NULL) {
         free(recent->texts[recent->next]);
         recent->texts[recent->next] = duplicate(text);
+        recent->statuses[recent->next] = status;
         recent->next = (recent->next + 1) % LOG_RECENT;
     }
 }
@@ -224,8 +231,12 @@ static void deliver(uint64_t environment, int status, const char *category, char
     append_to_echo(category, text);
     Log *log = find_log((uint32_t)(environment >> INDEX_BITS));
     if (log != NULL && index < log->count) {
-        remember(log, index, text);
-        queue_message(log, index, status, category, text);
+        remember(log, index, status, text);
+        if (log->terse && status == 0) {
+            atomic_add(&log->idle, 1);
+        } else {
+            queue_message(log, index, status, category, text);
+        }
     }
     mutex_unlock(&lock);
 }
@@ -235,14 +246,16 @@ static void deliver(uint64_t environment, int status, const char *category, char
 static char *join(const Recent *recent) {
     size_t size = 1;
     for (size_t i = 0; i < LOG_RECENT; i++) {
-        size += recent->texts[i] == NULL ? 0 : strlen(recent->texts[i]) + 3;
+        size += recent->texts[i] == NULL ? 0 : strlen(recent->texts[i]) + 2;
     }
     char *joined = calloc(1, size);
+    char *end = joined;
     for (size_t i = 0; joined != NULL && i < LOG_RECENT; i++) {
-        const char *text = recent->texts[(recent->next + i) % LOG_RECENT];
-        if (text != NULL) {
-            strcat(joined, joined[0] == '\0' ? "" : " | ");
-            strcat(joined, text);
+        const size_t place = (recent->next + i) % LOG_RECENT;
+        const int status = recent->statuses[place];
+        if (recent->texts[place] != NULL) {
+            *end++ = (char)('0' + (status < 0 || status > 9 ? 9 : status));
+            end += sprintf(end, "%s" LOG_END, recent->texts[place]);
         }
     }
     return joined;
@@ -250,10 +263,14 @@ static char *join(const Recent *recent) {
 
 char *log_said(Log *log, size_t index) {
     mutex_lock(&lock);
-    const Recent *recent = log->recent[index];
+    const Recent *recent = recent_of(log, index);
     char *said = recent == NULL ? NULL : join(recent);
     mutex_unlock(&lock);
     return said;
+}
+
+bool log_is_silent(const Log *log, size_t index) {
+    return atomic_get(&log->recent[index]) == 0;
 }
 
 void log_forget(Log *log, size_t index) {

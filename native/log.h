@@ -10,7 +10,11 @@
 
 #include "platform.h"
 
-enum { LOG_RECENT = 10, LOG_QUEUE_LIMIT = 1000 };
+enum {
+    LOG_RECENT = 10,
+    LOG_QUEUE_LIMIT = 1000,
+    LOG_IDLE_LIMIT = 1000 /* messages that nobody wants, until the FMU is asked to log less */
+};
 
 typedef struct Message {
     struct Message *next;
@@ -23,6 +27,7 @@ typedef struct Message {
 /* The last messages of one instance. The texts of failures include them. */
 typedef struct {
     char *texts[LOG_RECENT]; /* a ring; unused places are NULL */
+    int statuses[LOG_RECENT];
     size_t next;
 } Recent;
 
@@ -32,14 +37,16 @@ typedef struct Log {
     struct Log *next;
     uint32_t id;
     size_t count;
-    Recent **recent; /* one entry per instance, NULL until it logs something */
+    Atomic *recent; /* one Recent * per instance, 0 until it logs something */
     Message *first, *last;
     size_t queued;
     size_t dropped;
+    bool terse;     /* whether messages with the status OK are not queued */
     Atomic pending; /* whether messages are queued */
+    Atomic idle;    /* how many messages were not queued because the log is terse */
 } Log;
 
-bool log_open(Log *log, size_t count);
+bool log_open(Log *log, size_t count, bool terse);
 void log_close(Log *log);
 
 /* The number that identifies an instance to FMUs: it combines log and instance. */
@@ -53,9 +60,14 @@ void messages_free(Message *first);
  * ones. */
 void log_give_back(Log *log, Message *first, size_t dropped);
 
-/* The recent messages of an instance joined by " | ", or NULL if there are none. The caller
- * frees them. */
+/* The recent messages of an instance, or NULL if there are none. Each begins with its status as a
+ * digit, 9 for an unknown one, and ends with LOG_END. The caller frees them. */
+#define LOG_END "\x1e"
+/* Stands before such messages at the end of an error. */
+#define LOG_SAID "\x1d"
 char *log_said(Log *log, size_t index);
+/* Whether an instance has logged nothing since it was made or its messages were forgotten. */
+bool log_is_silent(const Log *log, size_t index);
 void log_forget(Log *log, size_t index);
 
 /* Also writes the end of every later message to this memory, one line each. The text stays

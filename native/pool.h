@@ -12,6 +12,7 @@
 #include "floats.h"
 #include "fmi.h"
 #include "log.h"
+#include "pace.h"
 #include "platform.h"
 #include "play.h"
 
@@ -29,12 +30,18 @@ typedef struct {
     const char *resources;
     const char *const *paths; /* path of the library, or of one private copy per instance */
     bool private_libraries;   /* whether each instance has its own library */
-    bool logging;
+    bool logging;             /* whether FMUs are asked to log everything */
+    const char *const *categories; /* the log categories of errors and warnings */
+    size_t number_of_categories;
     bool can_save;
     bool restores; /* whether episodes begin by a restored state where the start values are the same
                     */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
+    bool one_initialization; /* whether only one instance in the process may be made, initialized,
+                              * reset or freed at a time */
+    double pace_interval;    /* see pace.h; in seconds */
+    int64_t turn, turns;
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -87,6 +94,12 @@ typedef struct {
     size_t number_of_values;
 } Failure;
 
+typedef enum {
+    HEARING_LITTLE, /* only what the FMU logs without being asked */
+    HEARING_ERRORS, /* also the categories of errors and warnings */
+    HEARING_ALL     /* everything, since the FMU failed without a message */
+} Hearing;
+
 typedef struct {
     Library *library;
     void *component;
@@ -99,6 +112,7 @@ typedef struct {
     uint8_t phase;
     bool unsavable; /* the FMU once refused to save its state */
     bool due;       /* whether the next reset replaces it */
+    uint8_t hearing;
 } Instance;
 
 /* Threads that work on neighbouring instances must not write to the same cache line. */
@@ -133,7 +147,9 @@ typedef struct Pool {
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
     Floats floats; /* environment of the thread inside, which FMUs must find */
-    Mutex making;  /* held while an instance is made or freed: FMUs may keep lists of them */
+    Mutex own_making;
+    Pace pace;
+    Mutex *making; /* held while an instance is made or freed: FMUs may keep lists of them */
     bool open;
     Log log;
     Library *libraries;
@@ -149,6 +165,8 @@ typedef struct Pool {
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Atomic states_too_large;
+    Atomic deaf;     /* whether the FMU has refused the categories of its own */
+    Atomic heard;    /* how often an instance was asked to log everything */
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

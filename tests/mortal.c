@@ -48,7 +48,7 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
     instances++;
     if (strcmp(token, "licence") == 0) {
         callbacks->logger(NULL, name, 3, "licence", "no licence for %d seats", 5);
-        printf("so much for that\n"); /* not flushed */
+        printf("so much for the licence\n"); /* not flushed */
         abort();
     }
     if (strcmp(token, "refuse") == 0) {

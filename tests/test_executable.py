@@ -146,10 +146,10 @@ import pathlib, sys
 sys.path.insert(0, {str(HERE)!r})
 import fmugym
 from fmu_tools import PlainEnv, probe_config
-from fmugym.task.opening import request_pool
+from fmugym.vector.making import make_with_pool
 try:
-    with request_pool(1, backend={backend!r}):
-        env = PlainEnv({str(fmu_path)!r}, probe_config(**{config!r}))
+    config = probe_config(**{config!r})
+    env = make_with_pool(lambda: PlainEnv({str(fmu_path)!r}, config), backend={backend!r})
     env.reset()
     print(env.step([1.0])[0].tolist())
     env.close()

@@ -15,8 +15,8 @@ from fmu_tools import PlainEnv, edited_fmu, probe_config, probe_fmu, probe_xml, 
 
 from fmugym import FMU, FMULoadError, SimulationError
 from fmugym.errors import printable
-from fmugym.task.opening import request_pool
 from fmugym.tools.cli import main
+from fmugym.vector.making import make_with_pool
 
 XML = "modelDescription.xml"
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
@@ -189,8 +189,11 @@ class TestControlCharacters:
     def test_messages_in_log_error_and_info(self, probe, caplog, backend, version):
         label = "\x1b[31m\x07red\x9b\nforged line"
         parameters = {"label": label, "log_status": 1, "fault": 3, "fault_step": 2}
-        with request_pool(1, backend=backend), caplog.at_level(logging.INFO):
-            env = PlainEnv(probe(version), probe_config(model_parameters=parameters), logging.INFO)
+        config = probe_config(model_parameters=parameters)
+        with caplog.at_level(logging.INFO):
+            env = make_with_pool(
+                lambda: PlainEnv(probe(version), config, logging.INFO), backend=backend
+            )
         env.reset()
         infos = [env.step(0.0)[4] for _ in range(2)]
         env.close()

@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import Choice, ConfigError, EnvConfig, LogUniform, Normal, Uniform
-from fmugym.task.opening import request_pool
+from fmugym.vector.making import make_with_pool
 
 TYPES = [
     int,
@@ -105,8 +105,7 @@ def test_vector_environments(number, hooks):
 
 @types
 def test_native_and_python(number):
-    with request_pool(1, backend="python"):
-        env = Cart(number)
+    env = make_with_pool(lambda: Cart(number), backend="python")
     assert alone(env) == alone(Cart(number))
 
 

@@ -434,8 +434,9 @@ class TestFaults:
 
     @all_versions
     def test_an_fmu_that_refuses_to_be_replaced_for_a_while(self, pool, version):
+        """Each refusal without a message is repeated once, to hear a reason."""
         pool = pool(version)
-        set_up(pool, fault=4, fault_step=1, refusals=2)
+        set_up(pool, fault=4, fault_step=1, refusals=4)
         step(pool)
         for _ in range(2):
             assert set_up(pool)[1].tolist() == [Status.FATAL]

@@ -583,7 +583,7 @@ class TestPool:
     def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
         monkeypatch.setattr(
             "fmugym.pool.process.supervisor.launch",
-            lambda end, memory, _: _SpawnedProcess(end, memory),
+            lambda end, memory, *_: _SpawnedProcess(end, memory),
         )
         pool = make_pool()
         set_up(pool, faulty, ["crash"], at=2)
@@ -612,7 +612,7 @@ class WorkerThread:
 
     pid, sentinel = 0, None
 
-    def __init__(self, end, memory, folder):
+    def __init__(self, end, memory, folder, pipes):
         self._end, self._memory = end.dup(), Memory(memory.size, os.dup(memory.descriptor))
         worker = BlockWorker(Channel(self._end), self._memory)
         self._thread = threading.Thread(target=worker.serve, daemon=True)

@@ -13,7 +13,7 @@ from test_foreign_fmu import TankEnv
 import fmugym
 from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.envs import CartPoleEnv, PendulumEnv
-from fmugym.task.opening import request_pool
+from fmugym.vector.making import make_with_pool
 
 NUM_ENVS = 3
 STEPS = 60
@@ -73,8 +73,7 @@ def actions_in(space, index):
 
 def alone(make, index=0, episodes=1, **options):
     """Make rollouts of an environment of its own; one in bytes for each seeded reset."""
-    with request_pool(1, **options):
-        env = make()
+    env = make_with_pool(make, **options)
     try:
         actions = actions_in(env.action_space, index)
         return [_rollout(env, 7 + index, actions) for _ in range(episodes)]

@@ -97,7 +97,7 @@ class TestDeath:
         text = str(caught.value)
         assert "Mortal.fmu cannot be used: in loading and instantiation it ended" in text
         assert "signal SIGABRT" in text
-        assert "[licence] no licence for 5 seats | so much for that. " in text
+        assert "[licence] no licence for 5 seats | so much for the licence. " in text
         assert "probe_timeout=None turns it off" in text
 
     @pytest.mark.parametrize(

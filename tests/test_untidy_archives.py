@@ -18,8 +18,8 @@ from fmu_tools import (
 )
 
 from fmugym import FMU, FMULoadError
-from fmugym.task.opening import request_pool
 from fmugym.tools.cli import main
+from fmugym.vector.making import make_with_pool
 
 XML = "modelDescription.xml"
 SUFFIX = fmpy.sharedLibraryExtension
@@ -60,8 +60,7 @@ def make(probe, tmp_path):
 def runs(path, expected=0.3, **config):
     """Play an episode with both pools, from the same config."""
     for backend in ("native", "python"):
-        with request_pool(1, backend=backend):
-            env = PlainEnv(path, probe_config(**config))
+        env = make_with_pool(lambda: PlainEnv(path, probe_config(**config)), backend=backend)
         env.reset(seed=0)
         for _ in range(3):
             observation, *_ = env.step([1.0])

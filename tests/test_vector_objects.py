@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from vector_tools import WAYS, Drawing, make_pair, require_pair_equal, sampled_actions
+from vector_tools import Drawing, each_way, make_pair, require_pair_equal, sampled_actions
 
 import fmugym
 from fmugym import ConfigError
@@ -59,7 +59,7 @@ class RewardInAttribute(Drawing):
 
 
 @pytest.mark.parametrize("cls", [WithCost, Judged, RewardInAttribute])
-@pytest.mark.parametrize(("backend", "hooks"), [way for way in WAYS if way[1] != "per_env"])
+@each_way
 def test_functions_and_objects_that_refer_to_the_environment(cls, backend, hooks):
     require_pair_equal(cls, steps=30, hooks=hooks, backend=backend)
 
@@ -131,6 +131,12 @@ STATEFUL = {Filtering: "low_pass", CountingInClosure: "summed", BufferInside: "p
 
 
 @pytest.mark.parametrize("cls", STATEFUL)
+@pytest.mark.parametrize("hooks", ["auto", "per_env"])
+def test_objects_with_a_state_belong_to_one_environment_each(cls, hooks):
+    require_pair_equal(cls, steps=30, hooks=hooks)
+
+
+@pytest.mark.parametrize("cls", STATEFUL)
 def test_they_are_found_and_named(cls):
     with pytest.raises(ConfigError, match=rf"changes self\.{STATEFUL[cls]}, which belongs in"):
         FMUVectorEnv(cls, 2, hooks="array")
@@ -190,7 +196,7 @@ def test_what_is_traced_reads_through_functions_in_attributes():
     theirs.close()
 
 
-@pytest.mark.parametrize("hooks", ["array"])
+@pytest.mark.parametrize("hooks", ["array", "per_env"])
 def test_methods_that_were_read_before_read_the_present_values(hooks):
     vector = FMUVectorEnv(WithCost, 3, hooks=hooks)
     vector.reset(seed=2)

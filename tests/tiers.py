@@ -24,8 +24,11 @@ SLOW_MODULES = {
 
 EVERY = {
     "test_hostile_archive": 9,
+    "test_licences": 12,
+    "test_neighbours": 4,
     "test_pool": 8,
     "test_quirks": 31,
+    "test_words": 17,
     "test_zoo": 29,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""

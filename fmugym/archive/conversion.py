@@ -17,6 +17,8 @@ __all__ = ["convert"]
 _EXPERIMENT: Final = ("startTime", "stopTime", "tolerance", "stepSize")
 _POSITIVE: Final = {"tolerance", "stepSize", "fixedInternalStepSize"}
 _IDENTIFIER: Final = re.compile(r"[^/\\:]{1,200}")
+_OF_ERRORS: Final = re.compile("error|fatal|discard|warning", re.IGNORECASE)
+_MOST_CATEGORIES: Final = 32
 _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
@@ -58,7 +60,19 @@ def convert(source: Any, root: Any) -> ModelDescription:
         variables=variables,
         state_derivatives=_state_derivatives(source),
         findings=_findings(source),
+        error_categories=_error_categories(root),
     )
+
+
+def _error_categories(root: Any) -> tuple[str, ...]:
+    """Read the log categories whose names or descriptions tell of errors; FMI 1.0 has none."""
+    categories = root.findall("LogCategories/Category")
+    chosen = [
+        category.get("name", "")
+        for category in categories
+        if _OF_ERRORS.search(f"{category.get('name')} {category.get('description')}")
+    ]
+    return tuple(name for name in chosen if name)[:_MOST_CATEGORIES]
 
 
 def _state_derivatives(source: Any) -> dict[str, str]:

@@ -134,6 +134,7 @@ class ModelDescription:
         state_derivatives: For each scalar continuous state that the FMU declares, the name of its
             derivative.
         findings: Rules of the standard that the file breaks, as texts.
+        error_categories: The declared log categories of errors and warnings.
     """
 
     fmi_version: str
@@ -152,6 +153,7 @@ class ModelDescription:
     variables: Mapping[str, Variable]
     state_derivatives: Mapping[str, str]
     findings: tuple[str, ...]
+    error_categories: tuple[str, ...] = ()
 
     @cached_property
     def fmi_major_version(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -11,6 +11,7 @@ from fmpy.fmi1 import FMU1Slave
 
 from fmugym.fmi.instance import Initialize, Instance, Span
 from fmugym.fmi.log import MessageLog, fmi1_callbacks
+from fmugym.fmi.status import Status
 
 _TRUE: Final = b"\x01"
 _FALSE: Final = b"\x00"
@@ -52,8 +53,12 @@ class FMI1Instance(Instance):
         for name in cls._STATUS_FUNCTIONS:
             slave._functions[name].restype = ctypes.c_int
 
-    def _instantiate(self, log: MessageLog) -> None:
-        self._slave.instantiate(functions=fmi1_callbacks, loggingOn=log.wants_debug)
+    def _instantiate(self, log: MessageLog, logging: bool) -> None:
+        self._slave.instantiate(functions=fmi1_callbacks, loggingOn=logging)
+
+    def _choose_messages(self, _: Sequence[str]) -> int:
+        """Do nothing: FMI 1.0 has no log categories."""
+        return Status.OK
 
     def _function_name(self, name: str) -> str:
         name = self._SLAVE_FUNCTIONS.get(name, name)

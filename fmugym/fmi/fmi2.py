@@ -29,8 +29,8 @@ class FMI2Instance(Instance):
     _TERMINATED: ClassVar = 3
     """``fmi2Terminated`` of ``fmi2StatusKind``."""
 
-    def _instantiate(self, log: MessageLog) -> None:
-        self._slave.instantiate(callbacks=fmi2_callbacks, loggingOn=log.wants_debug)
+    def _instantiate(self, log: MessageLog, logging: bool) -> None:
+        self._slave.instantiate(callbacks=fmi2_callbacks, loggingOn=logging)
 
     def _function_name(self, name: str) -> str:
         return f"fmi2{name}"

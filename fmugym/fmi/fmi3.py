@@ -36,14 +36,14 @@ class FMI3Instance(Instance):
     }
     enumeration_type = "Int64"
 
-    def _instantiate(self, log: MessageLog) -> None:
+    def _instantiate(self, log: MessageLog, logging: bool) -> None:
         resources = os.path.join(self._slave.unzipDirectory, "resources", "")
         self._slave.component = self._slave.fmi3InstantiateCoSimulation(
             self._slave.instanceName.encode(),
             self._slave.guid.encode(),
             resources.encode(),
             False,  # visible
-            log.wants_debug,
+            logging,
             False,  # event mode used
             False,  # early return allowed
             None,

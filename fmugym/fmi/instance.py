@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.fmi.log import MessageLog
+from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.status import Phase, Status, sane
 
 __all__ = ["Initialize", "Instance", "SavedState", "Span"]
@@ -64,14 +64,22 @@ class Instance(ABC):
     enumeration_type: ClassVar = "Integer"
     """The C type of enumerations in this FMI version."""
 
-    def __init__(self, description: ModelDescription, slave: Any, target: logging.Logger) -> None:
+    def __init__(
+        self,
+        description: ModelDescription,
+        slave: Any,
+        target: logging.Logger,
+        hearing: Hearing,
+        hear_all: bool = False,
+    ) -> None:
         self.phase = Phase.DEAD
         self._description = description
         self._slave = copy.copy(slave)  # shares the library and its functions
         self._log = MessageLog(description.model_identifier, target)
         self._slave.instanceName = self._log.instance_name
+        self._hearing, self.hears_all = hearing, hear_all or self._log.wants_debug
         self._instantiate_checked()
-        self._component = ctypes.c_void_p(self._slave.component)
+        self._ask_for_errors()
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
         self._may_return = False  # to an earlier state; FMI tells the FMU whether this may happen
         self.step = self._prepare_step()
@@ -79,18 +87,63 @@ class Instance(ABC):
         self._reset_function = self._function("Reset")
 
     def _instantiate_checked(self) -> None:
-        failure = ""
-        try:
-            self._instantiate(self._log)
-        except Exception as error:
-            failure = f" ({error})"
+        failure = self._try_to_instantiate()
+        if not self._slave.component and self.can_say_more:
+            self.hears_all = True
+            failure = self._try_to_instantiate()
         if not self._slave.component:
             said = self._log.said()
             self._log.close()
             raise FMULoadError(
                 f"{self._description.model_name} refused to be instantiated{failure}{said}"
             )
+        self._component = ctypes.c_void_p(self._slave.component)
         self.phase = Phase.INSTANTIATED
+
+    def _try_to_instantiate(self) -> str:
+        try:
+            self._instantiate(self._log, self.hears_all)
+        except Exception as error:
+            return f" ({error})"
+        return ""
+
+    # What the FMU is asked to log.
+
+    @property
+    def can_say_more(self) -> bool:
+        """Whether a new instance may log everything, because a call failed without a message."""
+        return not self.hears_all and not self._log.recent and self._hearing.may_hear_all()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the FMU has logged nothing in this episode."""
+        return not self._log.recent
+
+    @property
+    def hears_more_than_wanted(self) -> bool:
+        """Whether the FMU logs everything although the logger drops most of it."""
+        return self.hears_all and not self._log.wants_debug
+
+    def _ask_for_errors(self) -> None:
+        """Ask the FMU to say why calls fail. If it cannot bear the question, make it anew."""
+        categories = self._description.error_categories
+        if self.hears_all or not categories or self._hearing.deaf:
+            return
+        status = self._choose_messages(categories)
+        if status > Status.WARNING:
+            self._hearing.deaf = True
+            if status != Status.FATAL:
+                self._free_component()
+            self._instantiate_checked()
+
+    def begin_episode(self) -> None:
+        """Forget the messages of the episode before; they would not explain a failure."""
+        if self.phase is Phase.INSTANTIATED or not self._log.recent:
+            return
+        self._log.recent.clear()
+        if self._log.is_too_long and not self._hearing.deaf and self.phase is Phase.STEPPING:
+            self._hearing.deaf = True
+            self.judge(self._choose_messages(()))
 
     # The parts that differ between the versions.
 
@@ -100,7 +153,16 @@ class Instance(ABC):
         return
 
     @abstractmethod
-    def _instantiate(self, log: MessageLog) -> None: ...
+    def _instantiate(self, log: MessageLog, logging: bool) -> None: ...
+
+    def _choose_messages(self, categories: Sequence[str]) -> int:
+        """Ask for messages of these categories, for none if there are none; return the status."""
+        texts = (ctypes.c_char_p * len(categories))(*(c.encode() for c in categories))
+        set_logging = self._function("SetDebugLogging")
+        status: int = set_logging(
+            self._component, bool(categories), ctypes.c_size_t(len(categories)), texts
+        )
+        return sane(status)
 
     @abstractmethod
     def _function_name(self, name: str) -> str: ...
@@ -218,9 +280,12 @@ class Instance(ABC):
             self.judge(self._function("Terminate")(self._component))
         fatal, self.phase = self.phase is Phase.DEAD, Phase.DEAD
         if not fatal:  # after Fatal, the standard forbids even this, so memory leaks
-            self._function("FreeInstance", restype=None)(self._component)
+            self._free_component()
         self._slave.component = None
         self._log.close()
+
+    def _free_component(self) -> None:
+        self._function("FreeInstance", restype=None)(self._component)
 
     def check(self, doing: str, status: int) -> None:
         """Raise for a status worse than a warning.
@@ -335,6 +400,11 @@ class Instance(ABC):
         saved = SavedState(self, state)
         self._saved_states.add(saved)
         return saved
+
+    @property
+    def number_of_states(self) -> int:
+        """How many saved states are in use."""
+        return len(self._saved_states)
 
     def restore_state(self, state: SavedState) -> None:
         """Return to a state saved by this instance.

@@ -16,6 +16,7 @@ from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Instance
+from fmugym.fmi.log import Hearing
 
 __all__ = ["Library"]
 
@@ -42,6 +43,7 @@ class Library:
         self._instance_class = _INSTANCE_CLASSES[fmu.description.fmi_major_version]
         self._fmu = fmu
         self._target = target
+        self._hearing = Hearing()
         self._native = _Native(fmu)
         try:
             self._native.load(self._instance_class)
@@ -51,8 +53,11 @@ class Library:
         self.can_save_state = fmu.description.capabilities.can_get_and_set_fmu_state
         self.close = weakref.finalize(self, self._native.close)
 
-    def instantiate(self) -> Instance:
+    def instantiate(self, *, hear_all: bool = False) -> Instance:
         """Make a new instance.
+
+        Args:
+            hear_all: Whether it logs everything, even if the logger drops most of it.
 
         Raises:
             FMULoadError: If the FMU refuses.
@@ -60,7 +65,9 @@ class Library:
         """
         if not self.close.alive:
             raise SimulationError(f"{self._fmu.path.name} is closed")
-        instance = self._instance_class(self._fmu.description, self._native.slave, self._target)
+        instance = self._instance_class(
+            self._fmu.description, self._native.slave, self._target, self._hearing, hear_all
+        )
         self._native.instances.append(instance)
         return instance
 

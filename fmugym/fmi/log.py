@@ -14,7 +14,7 @@ import itertools
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any, ParamSpec
+from typing import Any, Final, ParamSpec
 
 import fmpy
 from fmpy.fmi1 import fmi1CallbackFunctions
@@ -23,8 +23,17 @@ from fmpy.fmi3 import fmi3LogMessageCallback
 from fmpy.logging import addLoggerProxy
 
 from fmugym.errors import printable
+from fmugym.fmi.status import Status
+from fmugym.fmi.words import Message, quoted
 
-__all__ = ["MessageLog", "fmi1_callbacks", "fmi2_callbacks", "fmi3_log_message", "raise_caught"]
+__all__ = [
+    "Hearing",
+    "MessageLog",
+    "fmi1_callbacks",
+    "fmi2_callbacks",
+    "fmi3_log_message",
+    "raise_caught",
+]
 
 P = ParamSpec("P")
 
@@ -34,6 +43,30 @@ _LEVELS = (logging.INFO, logging.WARNING, logging.WARNING, logging.ERROR, loggin
 _receivers: dict[int, MessageLog] = {}
 _ids = itertools.count(1)
 _caught: list[BaseException] = []
+
+
+_IDLE_LIMIT: Final = 1000
+"""Messages that nobody wants, until the FMU is asked to log less."""
+
+_MOST_HEARD: Final = 4
+"""How many instances of a library may log all; it may take long to make them, and fail often."""
+
+
+class Hearing:
+    """What the instances of a library are asked to log if the log has no room for everything.
+
+    Attributes:
+        deaf: Whether they are not asked for errors: one has refused, or has logged too much.
+    """
+
+    def __init__(self) -> None:
+        self.deaf = False
+        self._heard = 0
+
+    def may_hear_all(self) -> bool:
+        """Whether one more instance may log everything."""
+        self._heard += 1
+        return self._heard <= _MOST_HEARD
 
 
 class MessageLog:
@@ -47,6 +80,8 @@ class MessageLog:
         environment: A number that is unique in the process.
         instance_name: A name that is unique in the process.
         recent: The last messages, for errors.
+        idle: How many messages nobody wanted: those with the status OK, if only errors were asked
+            for.
         muted: Whether messages are dropped.
     """
 
@@ -55,7 +90,8 @@ class MessageLog:
     def __init__(self, model: str, target: logging.Logger) -> None:
         self.environment = next(_ids)
         self.instance_name = f"{model}_{self.environment}"
-        self.recent: deque[str] = deque(maxlen=10)
+        self.recent: deque[Message] = deque(maxlen=10)
+        self.idle = 0
         self._target = target
         _receivers[self.environment] = self
 
@@ -68,13 +104,21 @@ class MessageLog:
         """Pass a message on, at the level of its status."""
         if self.muted:
             return
-        self.recent.append(message)
+        self.recent.append((status, message))
+        if status == Status.OK and not self.wants_debug:
+            self.idle += 1
+            return
         level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
         self._target.log(level, "%s: [%s] %s", self.instance_name, category, message)
 
+    @property
+    def is_too_long(self) -> bool:
+        """Whether the FMU has logged too much that nobody wants."""
+        return self.idle > _IDLE_LIMIT
+
     def said(self) -> str:
         """The recent messages, to end an error's text."""
-        return f"; the FMU said: {' | '.join(self.recent)}" if self.recent else ""
+        return quoted(tuple(self.recent))
 
     def close(self) -> None:
         """Stop receiving; later messages go to this module's logger."""

@@ -14,6 +14,7 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.health import Column, HealthArray
+from fmugym.pool.pacing import Pacer
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Slot", "Snapshot"]
@@ -58,7 +59,7 @@ class Slot:
         input_row: The inputs of the instance, shape (k_in,).
         output_row: Its outputs, shape (k,).
         counts: Its counts, shape (HEALTH_COUNTS,).
-        states: What the pool's instances know about FMU states.
+        pacer: Waits before an instance is made or initialized.
 
     Attributes:
         failure: Why the last status was worse than a warning.
@@ -72,10 +73,12 @@ class Slot:
         input_row: FloatArray,
         output_row: FloatArray,
         counts: HealthArray,
+        pacer: Pacer,
     ) -> None:
         self.failure = ""
         self.is_due = False
-        self._counts = counts
+        self._unexplained = False
+        self._counts, self._pacer = counts, pacer
         self._count = self._counted = 0
         self._library = library
         self._spec = spec
@@ -85,8 +88,9 @@ class Slot:
         self._first_outputs = b""
         self._build()
 
-    def _build(self) -> None:
-        self._instance = self._library.instantiate()
+    def _build(self, *, hear_all: bool = False) -> None:
+        self._pacer.wait()
+        self._instance = self._library.instantiate(hear_all=hear_all)
         self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
         self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
         self._start_variables: tuple[Variable, ...] = ()
@@ -109,6 +113,7 @@ class Slot:
         self._counts[Column.RETRIED] = 0
         try:
             self._make_anew_if_due()
+            self._instance.begin_episode()
             if not self._restored(key):
                 self._initialize(variables, values)
                 self._keep_state(key, stepped)
@@ -130,13 +135,20 @@ class Slot:
     def _make_anew_if_due(self) -> None:
         """Replace an instance that has leaked memory, or that no reset can make like new."""
         is_due, self.is_due = self.is_due, False
+        unexplained, self._unexplained = self._unexplained, False
         if self._instance.phase in (Phase.DEAD, Phase.INSTANTIATED):
             return
         if is_due:
             self._counts[Column.RECYCLINGS] += 1
             self._replace()
-        elif self._spec.reset_method not in _REUSING:
+        elif unexplained and not self._has_snapshots and self._instance.can_say_more:
+            self._rebuild(hear_all=True)
+        elif self._spec.reset_method not in _REUSING or self._instance.hears_more_than_wanted:
             self._rebuild()
+
+    @property
+    def _has_snapshots(self) -> bool:
+        return self._instance.number_of_states > (self._saved is not None)
 
     def _restored(self, key: tuple[tuple[Variable, ...], bytes]) -> bool:
         if self._saved is None or key != self._start_key or self._instance.phase is Phase.DEAD:
@@ -158,12 +170,24 @@ class Slot:
             self._saved = self._instance.save_state()
 
     def _initialize(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """Initialize; if that fails without a word, repeat it and let the FMU log everything."""
+        try:
+            self._initialize_once(variables, values)
+        except SimulationError:
+            dead = self._instance.phase is Phase.DEAD
+            if dead or self._has_snapshots or not self._instance.can_say_more:
+                raise
+            self._rebuild(hear_all=True)
+            self._initialize_once(variables, values)
+
+    def _initialize_once(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         self._return_to_instantiated()
         if variables is not self._start_variables:
             self._start = Access(self._instance, variables)
             self._start_variables = variables
         self._start.values[:] = values
         spec = self._spec
+        self._pacer.wait()
         self._instance.initialize(
             spec.start_time, spec.stop_time, spec.tolerance, self._set_start_values
         )
@@ -182,9 +206,9 @@ class Slot:
         self._counts[Column.REPLACEMENTS] += 1
         self._rebuild()
 
-    def _rebuild(self) -> None:
+    def _rebuild(self, *, hear_all: bool = False) -> None:
         self._library.discard(self._instance)
-        self._build()
+        self._build(hear_all=hear_all)
 
     def _set_start_values(self) -> None:
         self._instance.check("setting the start values", self._start.set())
@@ -227,8 +251,7 @@ class Slot:
             status = do_step(time, self._step_size)
             self._count += 1
             if status and not _is_fine(status):
-                doing = f"the step at t = {time:g} s"
-                self.failure = self._instance.describe_failure(doing, status)
+                self._note_failure(f"the step at t = {time:g} s", status)
                 break
         return status
 
@@ -282,9 +305,13 @@ class Slot:
 
     def _failed_call(self, doing: str, status: int) -> int:
         status = self._instance.judge(status)
-        self.failure = self._instance.describe_failure(doing, status)
+        self._note_failure(doing, status)
         self._output_row[:] = self._good_outputs
         return status
+
+    def _note_failure(self, doing: str, status: int) -> None:
+        self.failure = self._instance.describe_failure(doing, status)
+        self._unexplained = status != Status.TERMINATED and self._instance.is_silent
 
     def _failed(self, reason: str) -> int:
         self.failure = reason

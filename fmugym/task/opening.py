@@ -8,36 +8,48 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from itertools import takewhile
+from dataclasses import dataclass, replace
+from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_option, check_path
 from fmugym.config import EnvConfig
+from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.task.episode import EpisodePlan
 from fmugym.trial.opening import make_pool
 
-__all__ = ["open_fmu", "open_pool", "request_pool"]
+__all__ = ["PoolOpening", "deferred_pools", "env_numbers", "open_fmu", "pools_are_deferred"]
 
-_request: ContextVar[tuple[int, dict[str, Any]]] = ContextVar("request", default=(1, {}))
+env_numbers: Final = count()
+"""Numbers of environments in the order in which they are made."""
+
+_fmus: ContextVar[dict[Any, FMU] | None] = ContextVar("fmus", default=None)
 
 
 @contextmanager
-def request_pool(num_instances: int, **options: Any) -> Iterator[None]:
-    """Give each environment made in this context a pool of this size.
+def deferred_pools(fmus: dict[Any, FMU]) -> Iterator[None]:
+    """Let environments that are made in this context open no pool before they need one.
+
+    A vector environment gives columns of its own pool to the environments that it makes here.
+    Others, such as one that a constructor makes for itself, open a pool when they are first used.
 
     Args:
-        num_instances: Number of FMU instances; the prototype of a vector environment has them all.
-        options: Passed to ``fmugym.trial.opening.make_pool``.
+        fmus: The FMUs that these environments share; new ones are added.
     """
-    token = _request.set((num_instances, options))
+    token = _fmus.set(fmus)
     try:
         yield
     finally:
-        _request.reset(token)
+        _fmus.reset(token)
+
+
+def pools_are_deferred() -> bool:
+    """Whether this is the context of ``deferred_pools``."""
+    return _fmus.get() is not None
 
 
 def open_fmu(cls: type, path: str | os.PathLike[str], config: EnvConfig) -> FMU:
@@ -47,42 +59,82 @@ def open_fmu(cls: type, path: str | os.PathLike[str], config: EnvConfig) -> FMU:
         ConfigError: If an argument is invalid.
         FMULoadError: If the file is missing or not a valid FMU.
     """
-    return FMU(
-        _find_file(cls, check_path("fmu_path", path)),
-        limits=config.archive_limits,
-        preload=[_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload],
-        probe_timeout=config.probe_timeout,
-    )
+    file = _find_file(cls, check_path("fmu_path", path))
+    preload = [_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload]
+    limits, timeout = config.archive_limits, config.probe_timeout
+    known = _fmus.get()
+    if known is None:
+        return FMU(file, limits=limits, preload=preload, probe_timeout=timeout)
+    key = file, limits, tuple(map(str, preload)), timeout
+    if key not in known:
+        known[key] = FMU(file, limits=limits, preload=preload, probe_timeout=timeout)
+    return known[key]
 
 
-def open_pool(
-    fmu: FMU,
-    spec: PoolSpec,
-    config: EnvConfig,
-    plan: EpisodePlan,
-    log: logging.Logger,
-    backend: Any,
-    isolation: str | None,
-) -> Pool:
-    """Make the pool that the config, the arguments and the context ask for.
+@dataclass(frozen=True)
+class PoolOpening:
+    """What it takes to open the pool of an environment.
+
+    Args:
+        fmu: The FMU; closed with the pool.
+        spec: What to do at each reset and step.
+        config: The environment's config.
+        plan: The draws of its episodes, for the trial of resets.
+        log: The logger that gets the FMU's messages.
+        backend: See ``FMUEnv``.
+        isolation: See ``FMUEnv``.
 
     Raises:
-        ConfigError: If an argument is invalid.
-        FMULoadError: If the FMU cannot be used on this machine.
+        ConfigError: If there is no isolation of this name.
     """
-    if isolation is not None:
-        isolation = check_option("isolation", isolation, ISOLATIONS)
-    num_instances, requested = _request.get()
-    options: dict[str, Any] = {
-        "isolation": isolation or config.isolation,
-        "call_timeout": config.call_timeout,
-        "reset_method": config.reset_method,
-        "starts": plan.starts(),
-        **requested,
-    }
-    if backend is not None:
-        options["backend"] = backend
-    return make_pool(fmu, spec, num_instances, log, **options)
+
+    fmu: FMU
+    spec: PoolSpec
+    config: EnvConfig
+    plan: EpisodePlan
+    log: logging.Logger
+    backend: Any
+    isolation: str | None
+
+    def __post_init__(self) -> None:
+        if self.isolation is not None:
+            check_option("isolation", self.isolation, ISOLATIONS)
+
+    def open(self, num_instances: int = 1, **options: Any) -> Pool:
+        """Open a pool.
+
+        Args:
+            num_instances: N.
+            options: Passed to ``fmugym.trial.opening.make_pool``, before the config's own.
+
+        Raises:
+            ConfigError: If an argument is invalid.
+            FMULoadError: If the FMU cannot be used on this machine.
+        """
+        self._check_max_instances(num_instances)
+        own: dict[str, Any] = {
+            "isolation": self.isolation or self.config.isolation,
+            "call_timeout": self.config.call_timeout,
+            "reset_method": self.config.reset_method,
+            "starts": self.plan.starts(),
+        }
+        options = own | options
+        if self.backend is not None:
+            options["backend"] = self.backend
+        return make_pool(self.fmu, self.spec, num_instances, self.log, **options)
+
+    def _check_max_instances(self, wanted: int) -> None:
+        most = self.config.max_instances
+        if most is not None and wanted > most:
+            self.fmu.close()
+            raise ConfigError(
+                f"{self.fmu.path.name}: {wanted} environments need {wanted} instances, but config "
+                f"key 'max_instances' allows {most}"
+            )
+
+    def apart(self) -> PoolOpening:
+        """Return the same with an FMU that is not shared."""
+        return replace(self, fmu=FMU.of(self.fmu))
 
 
 def _find_file(cls: type, path: Path) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import logging
 import pickle
@@ -18,7 +17,6 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.task.interface import checked_value
-from fmugym.task.opening import request_pool
 from fmugym.vector.arguments import (
     UnknownAttributeError,
     autoreset_mode_of,
@@ -37,6 +35,7 @@ from fmugym.vector.engines.compiled import CompiledEngine, find_programs
 from fmugym.vector.engines.per_env import PerEnvEngine
 from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import merged, observations_of, restricted
+from fmugym.vector.making import EnvMaker
 
 __all__ = ["FMUVectorEnv"]
 
@@ -52,8 +51,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     A copy, or what is loaded from a pickle, is a new vector environment of the same arguments.
 
     Args:
-        make_env: A function without arguments, or a class, that returns one environment, the
-            prototype; wrappers are refused. Pickles carry it with them.
+        make_env: A function without arguments, or a class, that returns a new environment in each
+            call; wrappers are refused. It is called once, or once for each environment if hooks are
+            called one environment at a time. Pickles carry it with them.
         num_envs: N.
         max_episode_steps: Truncates episodes; ``gymnasium.make_vec`` passes the spec's.
         autoreset_mode: What follows the end of an episode: ``NEXT_STEP`` (the next step starts an
@@ -105,17 +105,26 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         way, limit = checked_hooks(hooks), checked_step_limit(max_episode_steps)
         options = checked_pool_options(pool_options, self.num_envs)
         try:
-            with request_pool(self.num_envs, **options):
-                self._prototype = _checked_prototype(make_env())
-            self._set_up_or_close(way, limit)
+            self._maker = EnvMaker(make_env)
+            self._prototype = self._maker.make()
+            self._set_up_or_close(way, limit, options)
         except MemoryError:
             raise ConfigError(f"there is not enough memory for num_envs = {num_envs}") from None
 
-    def _set_up_or_close(self, hooks: str, max_episode_steps: int | None) -> None:
+    def _set_up_or_close(
+        self, hooks: str, max_episode_steps: int | None, pool_options: Mapping[str, Any]
+    ) -> None:
+        env = self._prototype
         try:
-            self._set_up(hooks, max_episode_steps)
+            self._pool = env._opening.open(self.num_envs, **pool_options)
+            try:
+                env._use(self._pool)
+                self._set_up(hooks, max_episode_steps)
+            except BaseException:
+                self._pool.close()
+                raise
         except BaseException:
-            self._prototype.close()
+            env.close()
             raise
 
     def _set_up(self, hooks: str, max_episode_steps: int | None) -> None:
@@ -127,19 +136,32 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_observation_space = env.observation_space
         self.action_space = batch_space(env.action_space, count)
         self.observation_space = batch_space(env.observation_space, count)
-        self._started = False
+        self._started = self._is_ready = False
         self._engine = self._make_engine(hooks, max_episode_steps)
-        env._open_pool("a vector environment").forget_health()  # that of the hook check
+        self._pool.forget_health()  # that of the hook check
 
     def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:
         env, count = self._prototype, self.num_envs
         if not self._use_arrays(hooks):
-            return PerEnvEngine(env, count, max_episode_steps, self.action_space, self._add_info)
+            envs = self._make_all()
+            spaces = self.action_space
+            return PerEnvEngine(envs, self._pool, max_episode_steps, spaces, self._add_info)
         if hooks != "array":
             programs = find_programs(env, required=hooks == "compiled")
             if programs is not None:
                 return CompiledEngine(env, count, max_episode_steps, programs)
         return BatchEngine(env, count, max_episode_steps)
+
+    def _make_all(self) -> list[FMUEnv]:
+        """Make the other environments; all but the prototype are closed if one cannot be made."""
+        envs = [self._prototype]
+        try:
+            envs.extend(self._maker.make_like(envs[0], i) for i in range(1, self.num_envs))
+        except BaseException:
+            for env in envs[1:]:
+                env.close()
+            raise
+        return envs
 
     def _use_arrays(self, hooks: str) -> bool:
         if hooks == "per_env":
@@ -179,15 +201,16 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._open_pool("reset")
         remaining = checked_options(options)
         mask = checked_mask(remaining.pop("reset_mask", None), self.num_envs)
-        if not self._started and not mask.all():
-            raise ConfigError("the first reset must be of all environments")
+        if not self._is_ready and not mask.all():
+            when = "reset after an exception" if self._started else "first reset"
+            raise ConfigError(f"the {when} must be of all environments")
         seeds = checked_seeds(seed, self.num_envs)
         try:
             observations, infos = self._engine.reset(mask, seeds, remaining)
         except BaseException:
-            self._prototype._halt()
+            self._interrupt()
             raise
-        self._started = True
+        self._started = self._is_ready = True
         return observations, infos
 
     def step(self, actions: Any) -> StepResult:
@@ -204,10 +227,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             ConfigError: If the actions do not fit, or a hook returns what cannot be used.
             SimulationError: Before the first reset, after ``close``, in mode ``DISABLED`` after an
-                end, and, with ``on_fault="raise"``, after a fault.
+                end, and, with ``on_fault="raise"``, after a fault. Also after an exception that
+                came when the FMUs had stepped, until all environments are reset.
         """
         engine = self._engine
-        if not self._started or self.closed:
+        if not self._is_ready or self.closed:
             self._refuse_step()
         if engine.any_ended and self.autoreset_mode is AutoresetMode.DISABLED:
             index = int(np.flatnonzero(engine.ended)[0])
@@ -217,18 +241,27 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             if engine.any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment
-            self._prototype._halt()
+            self._interrupt()
             raise
         return result
 
+    def _interrupt(self) -> None:
+        """After an exception, end the episodes whose FMUs have stepped without a result."""
+        self._pool.halt()
+        self._is_ready = self._is_ready and not self._engine.has_moved
+
     def _refuse_step(self) -> None:
         self._open_pool("step")
+        if self._started:
+            raise SimulationError(
+                "step was called after an exception that has ended all episodes; call reset first"
+            )
         raise SimulationError("step was called before the first reset")
 
     def _open_pool(self, method: str) -> Pool:
         if self.closed:
             raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-        return self._prototype._open_pool(method)
+        return self._pool
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Reset in the step that ended the episodes, as the mode ``SAME_STEP`` wants it."""
@@ -385,8 +418,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool."""
-        if hasattr(self, "_prototype"):  # the constructor may have failed before
-            self._prototype.close()
+        if hasattr(self, "_engine"):  # otherwise the constructor has failed, and closed everything
+            try:
+                self._engine.close()
+            finally:
+                self._pool.close()
 
     # Copies.
 
@@ -422,13 +458,3 @@ def _rebuilt(
 
 def _unpickled(construction: bytes) -> FMUVectorEnv:
     return _rebuilt(*pickle.loads(construction).fn)
-
-
-def _checked_prototype(env: Any) -> FMUEnv:
-    if isinstance(env, FMUEnv):
-        return env
-    with contextlib.suppress(Exception):  # it is the user's
-        env.close()
-    raise ConfigError(
-        f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
-    )

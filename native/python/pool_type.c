@@ -140,9 +140,9 @@ static void pool_dealloc(PyObject *object) {
         release_buffer(&self->buffers[i]);
     }
     free(self->paths);
+    free(self->categories);
     free(self->strings);
     Py_XDECREF(self->playing);
-    Py_XDECREF(self->streams);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -151,11 +151,11 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
-    int restores, rebuilds, reloads;
+    int restores, rebuilds, reloads, one_initialization;
     long long substeps, warm_up_steps, retries;
 } Arguments;
 
@@ -172,22 +172,24 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 }
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
-    static char *names[] = {"version", "model",   "token",  "resources", "paths",
-                            "private", "logging", "states", NULL};
+    static char *names[] = {"version", "model",   "token",  "resources",  "paths",
+                            "private", "logging", "states", "categories", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iyyyO!ppp:library", names, &a->version, &s->model, &s->token,
+    return parse_group(group, "$iyyyO!pppO!:library", names, &a->version, &s->model, &s->token,
                        &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save);
+                       &a->can_save, &PyTuple_Type, &a->categories);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
-                            "rebuilds",   "reloads",       NULL};
+                            "rebuilds",   "reloads",       "one_initialization",
+                            "pace",       NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLppp:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLpppp(dLL):experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
-                       &a->retries, &a->restores, &a->rebuilds, &a->reloads);
+                       &a->retries, &a->restores, &a->rebuilds, &a->reloads,
+                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -246,19 +248,35 @@ static bool take_optional(PyObject *object, bool *given, double *value) {
     return !PyErr_Occurred();
 }
 
+/* Returns the texts of a tuple of bytes. Returns NULL with an exception if it holds others. */
+static const char **take_texts(PyObject *tuple) {
+    const Py_ssize_t count = PyTuple_Size(tuple);
+    const char **texts = calloc((size_t)count + 1, sizeof *texts);
+
+    if (texts == NULL) {
+        PyErr_NoMemory();
+    }
+    for (Py_ssize_t i = 0; i < count && texts != NULL; i++) {
+        texts[i] = PyBytes_AsString(PyTuple_GetItem(tuple, i));
+        if (texts[i] == NULL) {
+            free(texts);
+            return NULL;
+        }
+    }
+    return texts;
+}
+
+static bool take_categories(PyPool *self, PyObject *categories) {
+    self->categories = take_texts(categories);
+    return self->categories != NULL;
+}
+
 static bool take_paths(PyPool *self, PyObject *paths, Py_ssize_t wanted) {
     const Py_ssize_t count = PyTuple_Size(paths);
 
-    self->paths = calloc((size_t)count + 1, sizeof *self->paths);
+    self->paths = take_texts(paths);
     if (self->paths == NULL) {
-        PyErr_NoMemory();
         return false;
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        self->paths[i] = PyBytes_AsString(PyTuple_GetItem(paths, i));
-        if (self->paths[i] == NULL) {
-            return false;
-        }
     }
     if (count != wanted) {
         PyErr_Format(PyExc_ValueError, "%zd libraries are wanted, not %zd", wanted, count);
@@ -320,12 +338,15 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->restores = s->can_save && a->restores;
     s->rebuilds = a->rebuilds;
     s->reloads = a->reloads;
+    s->one_initialization = a->one_initialization;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
     s->num_observed = (size_t)a->num_observed;
     s->count = (size_t)a->count;
     s->threads = (size_t)a->threads;
     s->paths = self->paths;
+    s->categories = self->categories;
+    s->number_of_categories = (size_t)PyTuple_Size(a->categories);
     s->strings = self->strings;
     s->number_of_strings = (size_t)PyTuple_Size(a->strings);
     s->output_values = self->buffers[OUTPUTS].buf;
@@ -337,7 +358,7 @@ static bool settle(PyPool *self, const Arguments *a) {
 
 static bool open_pool(PyPool *self) {
     const Settings settings = self->pool.settings;
-    char error[2048];
+    char error[8192];
     bool opened;
 
     self->opened = true;
@@ -379,7 +400,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     self->arguments = copy_of_groups(kwargs);
     if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
         check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
-        take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
+        take_categories(self, a.categories) && take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
         open_pool(self)) {
         return (PyObject *)self;
     }
@@ -395,7 +416,6 @@ static PyMethodDef methods[] = {
     FAST("step_or_reset", py_step_or_reset),
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
-    {"set_streams", py_set_streams, METH_O, NULL},
     FAST("play", py_play),
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),

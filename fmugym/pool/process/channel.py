@@ -7,6 +7,7 @@ run the same program of the same user.
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import select
@@ -16,6 +17,8 @@ import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
+
+from fmugym.pool.process.output import Output
 
 __all__ = ["Channel", "Code"]
 
@@ -67,18 +70,23 @@ class Channel:
         end: The socket, in blocking mode.
         sentinel: A file descriptor that becomes readable when the other process has ended; None
             where there is none.
+        output: What the other process prints; passed on while this one waits.
 
     Attributes:
         end: The socket.
     """
 
-    def __init__(self, end: socket.socket, sentinel: int | None = None) -> None:
+    def __init__(
+        self, end: socket.socket, sentinel: int | None = None, output: Output | None = None
+    ) -> None:
         self.end = end
         self._send, self._receive = end.send, end.recv
         self._descriptor, self._sentinel = end.fileno(), sentinel
         self._lock = threading.Lock()
         self._look = _poller(end.fileno())
         self._poll = _poller(end.fileno(), sentinel)
+        if output is not None:
+            self._poll = _listener(output, end.fileno(), sentinel)
 
     def send_code(self, code: bytes) -> None:
         """Send a bare code."""
@@ -189,6 +197,23 @@ def _poller(*descriptors: int | None) -> Callable[[float | None], Any]:
     for descriptor in known:
         poll.register(descriptor, select.POLLIN)
     return poll.poll
+
+
+def _listener(output: Output, *descriptors: int | None) -> Callable[[float | None], Any]:
+    """Make a function as ``_poller`` does, which passes on output while it waits."""
+
+    def wait(ms: float | None) -> bool:
+        deadline = math.inf if ms is None else time.monotonic() + 1e-3 * ms
+        while True:
+            look = _poller(*descriptors, *output.descriptors)
+            left = None if ms is None else max(0.0, 1e3 * (deadline - time.monotonic()))
+            ready = {descriptor for descriptor, _ in look(left)}
+            if ready.intersection(output.descriptors):
+                output.pump()
+            if ready.intersection(descriptors) or time.monotonic() >= deadline:
+                return bool(ready.intersection(descriptors))
+
+    return wait
 
 
 def _wait_to_send(descriptor: int, sentinel: int | None) -> None:

@@ -23,8 +23,10 @@ import signal
 import socket
 import struct
 import sys
+from collections.abc import Sequence
 from typing import Final, NamedTuple, NoReturn
 
+from fmugym.pool.process.output import redirect
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
@@ -37,8 +39,9 @@ ANSWER: Final = struct.Struct("<q")
 """First the process number or minus an error number, then the exit status, negative for signals."""
 
 _PR_SET_PDEATHSIG: Final = 1
-_DESCRIPTORS: Final = 3
-"""The descriptors of a request: the lifeline, the channel and the memory."""
+_DESCRIPTORS: Final = 5
+"""The descriptors of a request: the lifeline, the channel, the memory, and two pipes for what the
+worker prints."""
 
 
 def main(descriptor: int, parent: int) -> NoReturn:
@@ -117,7 +120,9 @@ class _Server:
                 os.close(descriptor)
         return True
 
-    def _start(self, folder: str, size: int, lifeline: int, channel: int, memory: int) -> None:
+    def _start(
+        self, folder: str, size: int, lifeline: int, channel: int, memory: int, *pipes: int
+    ) -> None:
         """Fork a worker and send its process number."""
         answers = socket.socket(fileno=lifeline)
         server = os.getpid()
@@ -127,9 +132,9 @@ class _Server:
             pid = -(error.errno or 1)
         if pid == 0:
             answers.close()
-            self._become_worker(server, channel, Memory(size, memory))
-        os.close(channel)
-        os.close(memory)
+            self._become_worker(server, channel, Memory(size, memory), pipes)
+        for descriptor in (channel, memory, *pipes):
+            os.close(descriptor)
         _send(answers, pid)
         if pid < 0:
             answers.close()
@@ -138,11 +143,14 @@ class _Server:
         self._folders = {folder, *filter(os.path.isdir, self._folders)}
         self._poll.register(lifeline, select.POLLIN)
 
-    def _become_worker(self, server: int, channel: int, memory: Memory) -> NoReturn:
+    def _become_worker(
+        self, server: int, channel: int, memory: Memory, pipes: Sequence[int]
+    ) -> NoReturn:
         status = 1
         try:
             self._let_go()
             memory.close()
+            redirect(*pipes)
             os.setpgid(0, 0)  # not a session: Linux schedules each by itself
             if _end_with_parent(server):
                 status = run_worker(socket.socket(fileno=channel), memory)

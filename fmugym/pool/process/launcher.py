@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from collections.abc import Sequence
 from multiprocessing.reduction import DupFd
 from pathlib import Path
 from typing import Any, Protocol
@@ -51,20 +52,21 @@ class Process(Protocol):
         ...
 
 
-def launch(end: socket.socket, memory: Memory, folder: Path) -> Process:
+def launch(end: socket.socket, memory: Memory, folder: Path, pipes: Sequence[int] = ()) -> Process:
     """Start a worker.
 
     Args:
         end: The worker's end of the channel. The caller may close it afterwards.
         memory: Shared with the worker.
         folder: Where its FMU was extracted to. It is removed if this process is killed.
+        pipes: For its standard output and standard error; not used on Windows.
 
     Raises:
         OSError: If the system refuses.
     """
     if sys.platform == "win32":
         return _SpawnedProcess(end, memory)
-    return _start(folder, memory.size, (end.fileno(), memory.descriptor))
+    return _start(folder, memory.size, (end.fileno(), memory.descriptor, *pipes))
 
 
 class _ForkServer:
@@ -80,7 +82,7 @@ class _ForkServer:
         self._stop = weakref.finalize(self, _stop, self._requests, self.pid)
         self._stop.atexit = False  # pools may still have to close their workers then
 
-    def start(self, folder: Path, size: int, descriptors: tuple[int, int]) -> _ForkedProcess:
+    def start(self, folder: Path, size: int, descriptors: Sequence[int]) -> _ForkedProcess:
         """Start a worker with a lifeline of its own, so that threads do not mix.
 
         Raises:
@@ -138,7 +140,7 @@ def _fork_server() -> _ForkServer:
         return _cached_fork_server()
 
 
-def _start(folder: Path, size: int, descriptors: tuple[int, int]) -> _ForkedProcess:
+def _start(folder: Path, size: int, descriptors: Sequence[int]) -> _ForkedProcess:
     """Start a worker with the fork server, or with a new one if the old one has ended."""
     try:
         return _fork_server().start(folder, size, descriptors)

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.errors import printable
+from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.last_words import describe_exit
 from fmugym.pool.process.launcher import Process, launch
+from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo
 from fmugym.pool.process.worker import Setup
 
@@ -68,6 +70,7 @@ class Supervisor:
         self.released: deque[tuple[int, int]] = deque()
         self._setup, self._memory, self._log = setup, memory, log
         self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
+        self._output = Output()
         self._deaths = 0
         self._process: Process | None = None
         self._opening = self._busy = False
@@ -98,13 +101,18 @@ class Supervisor:
 
     def _launch(self) -> tuple[Process, Channel]:
         end, other_end = socket.socketpair()
+        output = Output()
         try:
             with other_end:
-                process = launch(other_end, self._memory, self._setup.folder)
+                output.open()
+                process = launch(other_end, self._memory, self._setup.folder, output.writing_ends)
         except BaseException:
             end.close()
+            output.close()
             raise
-        return process, Channel(end, process.sentinel)
+        output.release_writing_ends()
+        self._output = output
+        return process, Channel(end, process.sentinel, output)
 
     def revive(self) -> None:
         """Start a process if there is none, with longer and longer pauses between deaths.
@@ -136,6 +144,7 @@ class Supervisor:
             return
         self._process.kill()
         self._process.exit_status(_LONGEST_KILL)
+        self._output.drain()
         self._forget_process(reason)
 
     def _forget_process(self, reason: str) -> None:
@@ -165,6 +174,7 @@ class Supervisor:
             self._channel.close()
             self._process.forget()
             self._process = None
+            self._output.close()
 
     def begin_closing(self) -> None:
         """Ask the worker to free its instances; end it at once if it has not made them yet."""
@@ -203,10 +213,22 @@ class Supervisor:
     def tell(self, name: str, *arguments: Any) -> None:
         """Ask for a call of one of the worker's methods; failures show in the reply."""
         self._busy = True
+        self._output.pump()
         with contextlib.suppress(OSError):
             if self.released:
                 self._release()
             self._channel.send_object(Code.REQUEST, (name, arguments))
+
+    def forget_output(self) -> None:
+        """Forget what was printed, because it would not explain a later failure."""
+        self._output.drain()
+        self._output.clear()
+
+    @property
+    def printed(self) -> str:
+        """The telling ones of the last lines since ``forget_output``, to end an error's text."""
+        self._output.drain()
+        return quoted(as_messages(self._output.lines()), "it printed")
 
     def _release(self) -> None:
         generation, numbers = self.generation, []
@@ -244,7 +266,7 @@ class Supervisor:
         result = self._receive(deadline, "the instantiation")
         self._opening = False
         if isinstance(result, Exception):
-            self.bury(str(result))
+            self.bury(f"{result}{self.printed}")
             raise LostError(self.reason) from result
 
     def _receive(self, deadline: float, doing: str) -> Any:
@@ -275,6 +297,7 @@ class Supervisor:
         if status is None:
             self._process.kill()
             self._process.exit_status(_LONGEST_KILL)
+        self._output.drain()
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
         raise LostError(self.reason)
@@ -282,14 +305,15 @@ class Supervisor:
     def _end_hang(self, doing: str) -> None:
         """End a worker that is late; messages that it has not sent yet are lost."""
         what = f"worker process {self.pid} took longer than call_timeout for {doing} and was ended"
+        self._output.drain()
         self.bury(self._cause(what))
         raise LostError(self.reason)
 
     def _cause(self, text: str) -> str:
         echo = self._echo.tobytes().partition(b"\0")[0].decode(errors="replace")
         lines = echo.splitlines()[-_TAIL:] or list(self._tail)
-        said = f"; the FMU said: {' | '.join(lines)}" if lines else ""
-        return printable(f"{self._setup.path.name}: {text}{said}")
+        said = quoted(as_messages(lines))
+        return printable(f"{self._setup.path.name}: {text}{said}{self.printed}")
 
 
 def _is_debugged(pid: int) -> bool:

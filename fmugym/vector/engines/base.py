@@ -31,11 +31,13 @@ class Engine(ABC):
     Attributes:
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
+        has_moved: Whether the last step or reset got as far as the FMUs.
     """
 
     def __init__(self, num_envs: int) -> None:
         self.ended = np.zeros(num_envs, np.bool_)
         self.any_ended = False
+        self.has_moved = False
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""
@@ -60,6 +62,10 @@ class Engine(ABC):
     @abstractmethod
     def seed_of(self, index: int) -> int | None:
         """Return the seed of an environment's generator."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the environments, but not the pool."""
 
     @abstractmethod
     def single(self, index: int) -> AbstractContextManager[FMUEnv]:

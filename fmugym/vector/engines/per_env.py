@@ -14,11 +14,9 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
-from fmugym.task.values import EpisodeVariables
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.copies import copied_attributes, light_copy
 from fmugym.vector.engines.base import Engine, StepResult
 
 __all__ = ["PerEnvEngine"]
@@ -27,13 +25,13 @@ AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
 
 
 class PerEnvEngine(Engine):
-    """Calls the hooks of light copies of a prototype, which share its pool.
+    """Calls the hooks of N environments, each on a column of one pool.
 
     The FMUs still step together on all threads, unless the class has its own ``step``.
 
     Args:
-        env: The prototype, made with a pool of N instances.
-        num_envs: N.
+        envs: The environments.
+        pool: Their pool of N instances.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
         action_space: The space of the actions of all environments.
         add_info: Merges the info of one environment into that of all.
@@ -41,21 +39,28 @@ class PerEnvEngine(Engine):
 
     def __init__(
         self,
-        env: FMUEnv,
-        num_envs: int,
+        envs: Sequence[FMUEnv],
+        pool: Pool,
         max_episode_steps: int | None,
         action_space: Any,
         add_info: AddInfo,
     ) -> None:
-        super().__init__(num_envs)
-        self._pool = pool = env._open_pool("a vector environment")
-        self._envs = [_independent_copy(env, pool, index) for index in range(num_envs)]
-        self._together = type(env).step is FMUEnv.step
+        super().__init__(len(envs))
+        self._envs, self._pool = envs, pool
+        for index, env in enumerate(envs):
+            env._use(PoolColumn(pool, index))
+            env._prepare_hooks()  # its constructor may have set some as attributes
+        self._together = not any(env._own.step for env in envs)
         self._limit = max_episode_steps
         self._action_space = action_space
         self._add_info = add_info
-        self._space = env.observation_space
-        self._observations: list[Any] = [None] * num_envs
+        self._space = envs[0].observation_space
+        self._observations: list[Any] = [None] * len(envs)
+
+    def close(self) -> None:
+        """See ``Engine.close``."""
+        for env in self._envs:
+            env.close()
 
     def seed_of(self, index: int) -> int | None:
         """See ``Engine.seed_of``."""
@@ -98,6 +103,7 @@ class PerEnvEngine(Engine):
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
         infos: dict[str, Any] = {}
+        self.has_moved = False
         for index in np.flatnonzero(mask).tolist():
             self._observations[index], info = self._reset(index, seeds[index], options)
             infos = self._with_info(infos, info, index)
@@ -106,13 +112,23 @@ class PerEnvEngine(Engine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
+        self.has_moved = False
+        items = self._actions(actions)
+        if self._together:
+            self._step_pool(items, resetting)
+        self.has_moved = True
+        try:
+            return self._results(items, resetting)
+        except BaseException:
+            for env in self._envs:  # their FMUs have stepped, and some without a result
+                env._ended = True
+            raise
+
+    def _results(self, items: Sequence[Any], resetting: MaskArray | None) -> StepResult:
         count = len(self._envs)
         rewards = np.zeros(count)
         terminated, truncated = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         infos: dict[str, Any] = {}
-        items = self._actions(actions)
-        if self._together:
-            self._step_pool(items, resetting)
         for index, action in enumerate(items):
             if resetting is not None and resetting[index]:
                 self._observations[index], info = self._reset(index, None, {})
@@ -129,7 +145,9 @@ class PerEnvEngine(Engine):
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         try:
-            return self._envs[index].reset(seed=seed, options=dict(options))
+            result = self._envs[index].reset(seed=seed, options=dict(options))
+            self.has_moved = True
+            return result
         except FMUGymError as error:
             raise _located(error, index) from error
 
@@ -192,20 +210,6 @@ class PerEnvEngine(Engine):
                 f"_get_observation returned {shown(self._observations[0])}, which is no element of "
                 f"{self._space}"
             ) from None
-
-
-def _independent_copy(env: FMUEnv, pool: Pool, index: int) -> FMUEnv:
-    """Copy an environment: share what is costly to make, and copy all other attributes."""
-    single = light_copy(env)
-    single.__dict__.update(copied_attributes(env))
-    single.variables = EpisodeVariables(env.config.episode_variables)
-    single._pool = PoolColumn(pool, index)
-    single._input_row = single._pool.inputs[:, 0]
-    single._output_row = single._pool.outputs[:, 0]
-    single._observation_row = single._pool.observations[0]
-    single._step_pool = single._pool.step_own
-    single._np_random = single._np_random_seed = None
-    return single
 
 
 def _located(error: FMUGymError, index: int) -> FMUGymError:

@@ -1,0 +1,147 @@
+"""What a worker prints: it goes to the parent's streams, and its last lines explain failures.
+
+The worker's standard output and error are pipes to the parent. The parent empties them while it
+waits for the worker, and before each request, so a step costs nothing. A worker that prints more
+than a pipe holds waits for its parent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import select
+import sys
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Final
+
+__all__ = ["Output", "print_line_by_line", "redirect"]
+
+_LINES: Final = 10
+_LINE_LENGTH: Final = 300
+_CHUNK: Final = 65536
+_LAST_CHUNKS: Final = 16
+"""The most chunks that a pipe holds, on any system."""
+
+_STREAMS: Final = (1, 2)
+_LINE_BUFFERED: Final = 1
+"""``_IOLBF`` of glibc, musl and macOS."""
+
+
+class Output:
+    """The parent's ends of the pipes of one worker.
+
+    Attributes:
+        writing_ends: For the worker: standard output and standard error.
+    """
+
+    def __init__(self) -> None:
+        self._streams: dict[int, int] = {}  # the descriptor of this process by the reading end
+        self._lines: deque[bytes] = deque(maxlen=_LINES)
+        self._unfinished = dict.fromkeys(_STREAMS, b"")
+        self._poll: Any = None
+        self.writing_ends: list[int] = []
+
+    def open(self) -> None:
+        """Make the pipes, but not on Windows.
+
+        Raises:
+            OSError: If the system has no descriptor left.
+        """
+        if sys.platform == "win32":
+            return
+        self._poll = select.poll()
+        for stream in _STREAMS:
+            reading, writing = os.pipe()
+            os.set_blocking(reading, False)
+            self._poll.register(reading, select.POLLIN)
+            self._streams[reading] = stream
+            self.writing_ends.append(writing)
+
+    @property
+    def descriptors(self) -> Sequence[int]:
+        """The reading ends that are open."""
+        return tuple(self._streams)
+
+    def release_writing_ends(self) -> None:
+        """Close the worker's ends in this process, once the worker has them."""
+        for end in self.writing_ends:
+            os.close(end)
+        self.writing_ends = []
+
+    def pump(self) -> bool:
+        """Pass on what has come, but at most one chunk of each stream.
+
+        Returns:
+            Whether anything has come.
+        """
+        ready = self._poll.poll(0) if self._streams else ()
+        for reading, _ in ready:
+            self._pass_on(reading)
+        return bool(ready)
+
+    def drain(self) -> None:
+        """Pass on everything that a worker has left."""
+        for _ in range(_LAST_CHUNKS):
+            if not self.pump():
+                break
+
+    def _pass_on(self, reading: int) -> None:
+        stream = self._streams[reading]
+        try:
+            data = os.read(reading, _CHUNK)
+        except BlockingIOError:
+            return
+        if not data:  # the worker has closed its end
+            self._poll.unregister(reading)
+            os.close(reading)
+            del self._streams[reading]
+            return
+        self._note(stream, data)
+        _write(stream, data)
+
+    def _note(self, stream: int, data: bytes) -> None:
+        *lines, rest = (self._unfinished[stream] + data).split(b"\n")
+        self._unfinished[stream] = rest[-_LINE_LENGTH:]
+        self._lines.extend(line[:_LINE_LENGTH] for line in lines[-_LINES:] if line.strip())
+
+    def lines(self) -> list[str]:
+        """The last lines since ``clear``."""
+        unfinished = [rest for rest in self._unfinished.values() if rest.strip()]
+        return [line.decode(errors="replace") for line in (*self._lines, *unfinished)]
+
+    def clear(self) -> None:
+        """Forget what has been printed so far."""
+        if self._lines or any(self._unfinished.values()):
+            self._lines.clear()
+            self._unfinished = dict.fromkeys(_STREAMS, b"")
+
+    def close(self) -> None:
+        """Close the pipes; the lines stay."""
+        for end in (*self._streams, *self.writing_ends):
+            os.close(end)
+        self._streams, self.writing_ends = {}, []
+
+
+def _write(stream: int, data: bytes) -> None:
+    view = memoryview(data)
+    with contextlib.suppress(OSError):  # this process may have closed it
+        while view:
+            view = view[os.write(stream, view) :]
+
+
+def redirect(output: int, error: int) -> None:
+    """Let a worker print to its parent's pipes, line by line, since the next may be its last."""
+    for descriptor, stream in zip((output, error), _STREAMS, strict=True):
+        os.dup2(descriptor, stream)
+        os.close(descriptor)
+    print_line_by_line()
+
+
+def print_line_by_line() -> None:
+    """Flush C's output to a pipe after each line; a crash would lose what is buffered."""
+    library = ctypes.CDLL(None)
+    name = "__stdoutp" if sys.platform == "darwin" else "stdout"
+    stream = ctypes.c_void_p.in_dll(library, name)
+    library.setvbuf(stream, None, _LINE_BUFFERED, ctypes.c_size_t(0))
