@@ -225,7 +225,7 @@ class TestSkeleton:
         assert f"class PendulumEnv(fmugym.FMI{fmi_version[0]}CSEnv):" in text
         assert '"tau",  # [N.m] Torque' in text
         assert '"g": 9.81,  # [m/s2]' in text
-        assert '"body": "rod",' in text
+        assert '"body": "point_mass",' in text
         assert '"bounds"' not in text  # the FMU has limits for its input
 
     def test_output_is_a_new_file_only(self, tmp_path, capsys):
