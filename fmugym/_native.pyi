@@ -211,14 +211,19 @@ class Pool:
         terminated: Array,
         truncated: Array,
         drawn: Array,
+        last_observations: Array | None,
+        started: Array | None,
         /,
-    ) -> tuple[int, int]:
-        """Do a step, with all that was taken over.
+    ) -> tuple[int, int, int]:
+        """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:
             TypeError: If the actions are no int64.
             ValueError: If there is a wrong number of them, or one is out of range.
         """
+
+    def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
+        """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""

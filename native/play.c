@@ -110,4 +110,7 @@ size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 void play_skip(const Turn *turn, size_t index) {
     turn->rewards[index] = 0.0;
     turn->terminated[index] = turn->truncated[index] = 0;
+    if (turn->started != NULL) {
+        turn->started[index] = 0;
+    }
 }

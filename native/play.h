@@ -32,6 +32,8 @@ typedef struct {
     const int64_t *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
+    float *last_observations; /* those of episodes that end, where the next ones start at once */
+    uint8_t *started;         /* where they have started; NULL if they start in the next step */
     double *drawn; /* a row for each draw; only the values drawn in this step are written. Values
                     * that were given are read from it */
 } Turn;

@@ -4,6 +4,7 @@
 
 #include "initial_states.h"
 #include "instances.h"
+#include "starts.h"
 
 void write_observation(const Pool *pool, size_t index, float *observations) {
     const Settings *s = &pool->settings;
@@ -27,7 +28,7 @@ static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
     return instance_read_outputs(task->pool, me, scratch);
 }
 
-static size_t note_status(Task *task, size_t index, Status status) {
+size_t note_status(Task *task, size_t index, Status status) {
     task->pool->settings.status[index] = (int8_t)status;
     if (status <= STATUS_WARNING) {
         return 0;
@@ -44,6 +45,10 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
 
     for (size_t i = begin; i < end; i++) {
         const size_t index = pool->chosen[i];
+        if (call->turn != NULL) {
+            troubled += starts_one(task, index, scratch);
+            continue;
+        }
         Instance *me = &pool->instances[index];
         const Status status = task->operation == RESTORE ? restore_instance(task, me, scratch)
                                                          : instance_reset(pool, me, call, scratch);
@@ -321,7 +326,7 @@ size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch) {
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
     const Turn *turn = task->call->turn;
     PlayScratch registers;
-    size_t troubled = 0, ended = 0;
+    size_t troubled = 0, ended = 0, started = 0;
 
     play_open(turn, &registers);
     for (size_t first = begin; first < end; first += RUN) {
@@ -329,7 +334,11 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
         play_prepare(turn, first, count, &registers);
         troubled += do_run(task, first, count, scratch);
         ended += play_judge(turn, first, count, &registers);
+        if (turn->started != NULL) {
+            troubled += starts_after_ends(task, first, count, scratch, &started);
+        }
     }
     atomic_add(&task->ended, ended);
+    atomic_add(&task->started, started);
     return troubled;
 }

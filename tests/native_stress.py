@@ -161,11 +161,19 @@ class Subject:
         flags = np.empty(self.n, np.bool_), np.empty(self.n, np.bool_)
         observations = np.empty((self.n, len(self.outputs)), np.float32)
         actions = self.rng.integers(0, 2, self.n)
+        ends = [None, None]
+        if self.rng.random() < 0.5:  # episodes start in the step that ends others
+            ends = np.empty_like(observations), np.empty(self.n, np.bool_)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
             self.pool._pool.play(
-                actions, observations, np.empty(self.n), *flags, np.empty((1, self.n))
+                actions, observations, np.empty(self.n), *flags, np.empty((1, self.n)), *ends
             )
             counts["played"] += 1
+
+    def start(self):
+        observations = np.empty((self.n, len(self.outputs)), np.float32)
+        with contextlib.suppress(ValueError):  # there may be nothing prepared
+            self.pool._pool.start(self.mask(), observations, np.empty((1, self.n)))
 
     def save(self):
         self.snapshot = self.pool.save()
@@ -199,7 +207,7 @@ class Subject:
 
 ACTIONS = (
     *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "draw"),
-    *("play", "play", "play", "save", "restore", "forget", "failure", "read", "health"),
+    *("play", "play", "play", "start", "save", "restore", "forget", "failure", "read", "health"),
     *("recycle", "costs", "close"),
 )
 

@@ -143,6 +143,7 @@ class NativePool(AttendedPool):
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
+        self._reset_of_play = self.watched(self._pool.start)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
@@ -420,7 +421,7 @@ class NativePool(AttendedPool):
         start_values: FloatArray,
         draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-    ) -> Callable[..., tuple[int, int]]:
+    ) -> Callable[..., tuple[int, int, int]]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
 
         This replaces what was prepared before. Every step uses the given arrays in place.
@@ -436,10 +437,13 @@ class NativePool(AttendedPool):
                 the next step, shape (N,); steps after which an episode is truncated.
 
         Returns:
-            A function of actions (int64), observations, rewards, terminated, truncated and drawn
-            values (draws, N). It does a step and fills all but the actions; of the drawn values,
-            only those of episodes that start; ``given`` ones are read. It returns how many
-            instances have a status worse than a warning, and how many episodes have ended.
+            A function of actions (int64), observations, rewards, terminated, truncated, drawn
+            values (draws, N), last observations and started (Booleans). It does a step and fills
+            all but the actions; of the drawn values, only those of episodes that start; ``given``
+            ones are read. If the last two are arrays, an episode that ends without a fault is
+            followed by the next in the same step; if they are None, in the next step. It returns
+            how many instances had trouble (a status worse than a warning, or a first observation
+            that is not finite), how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(
@@ -453,6 +457,16 @@ class NativePool(AttendedPool):
             episodes={"step_counts": count, "ended": ended, "limit": limit},
         )
         return self._pool.play
+
+    def start_of_play(self) -> Callable[..., int]:
+        """The function that starts episodes after ``prepare_play``, outside of a step.
+
+        Returns:
+            A function of a mask, observations and drawn values (draws, N). It fills all of the
+            observations, and the drawn values in the mask; ``given`` ones are read. It returns how
+            many instances had trouble.
+        """
+        return self._reset_of_play
 
     @property
     def uses_states(self) -> bool:

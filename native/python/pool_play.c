@@ -194,15 +194,39 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
 
 /* Playing */
 
-enum { ACTIONS, SEEN, REWARDS, TERMINATED, TRUNCATED, DRAWN, TURN_BUFFERS };
+enum {
+    ACTIONS,
+    SEEN,
+    REWARDS,
+    TERMINATED,
+    TRUNCATED,
+    DRAWN,
+    LAST,
+    STARTED,
+    PLAY_ARGUMENTS,
+    MASK = PLAY_ARGUMENTS,
+    TURN_BUFFERS
+};
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];
     Turn turn;
     Call call;
     bool bad_action;
-    size_t troubled, ended;
+    size_t troubled;
+    Ends ends;
 } PyTurn;
+
+/* None stands for episodes that start in the step after the end of the previous one. */
+static bool take_starts_at_ends(PyPool *self, PyObject *last, PyObject *started, PyTurn *t) {
+    const Settings *s = &self->pool.settings;
+    const Py_ssize_t n = (Py_ssize_t)s->count;
+
+    return last == Py_None ||
+           (take_matrix(last, &t->buffers[LAST], WRITTEN, "the last observations", ITEM_FLOAT32, n,
+                        (Py_ssize_t)s->num_observed) &&
+            take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n));
+}
 
 static bool take_arrays(PyPool *self, const Play *play, PyObject *const *args, PyTurn *t) {
     const Settings *s = &self->pool.settings;
@@ -216,7 +240,8 @@ static bool take_arrays(PyPool *self, const Play *play, PyObject *const *args, P
            take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
            take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
            take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)play->draws->count, n);
+                       (Py_ssize_t)play->draws->count, n) &&
+           take_starts_at_ends(self, args[LAST], args[STARTED], t);
 }
 
 static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
@@ -230,6 +255,8 @@ static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .terminated = b[TERMINATED].buf,
         .truncated = b[TRUNCATED].buf,
         .drawn = b[DRAWN].buf,
+        .last_observations = b[LAST].buf,
+        .started = b[STARTED].buf,
     };
     t->call = (Call){
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
@@ -247,7 +274,7 @@ static void do_play(PyPool *self, bool alone, void *context) {
     t->call.alone = alone;
     t->bad_action = play_has_bad_action(&t->turn);
     if (!t->bad_action) {
-        t->troubled = pool_play(&self->pool, &t->call, &t->ended);
+        t->troubled = pool_play(&self->pool, &t->call, &t->ends);
     }
 }
 
@@ -260,7 +287,8 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
         return NULL;
     }
     return report_messages(self)
-               ? Py_BuildValue("(nn)", (Py_ssize_t)t->troubled, (Py_ssize_t)t->ended)
+               ? Py_BuildValue("(nnn)", (Py_ssize_t)t->troubled, (Py_ssize_t)t->ends.ended,
+                               (Py_ssize_t)t->ends.started)
                : NULL;
 }
 
@@ -279,18 +307,70 @@ static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *arg
     return result;
 }
 
+static bool is_prepared(const PyPool *self) {
+    if (self->playing == NULL) {
+        PyErr_SetString(PyExc_ValueError, "play was not prepared");
+    }
+    return self->playing != NULL;
+}
+
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, TURN_BUFFERS)) {
-        return NULL;
-    }
-    if (self->playing == NULL) {
-        PyErr_SetString(PyExc_ValueError, "play was not prepared");
+    if (!has_arguments(nargs, PLAY_ARGUMENTS) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
     PyObject *result = play_with(self, playing, args);
+    Py_DECREF(playing);
+    return result;
+}
+
+/* Starting episodes outside of a step */
+
+static void do_start(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+
+    t->call.alone = alone;
+    t->troubled = pool_start(&self->pool, &t->call);
+}
+
+static bool take_start_arrays(PyPool *self, const Play *play, PyObject *const *args, PyTurn *t) {
+    const Settings *s = &self->pool.settings;
+    const Py_ssize_t n = (Py_ssize_t)s->count;
+    Py_buffer *b = t->buffers;
+
+    return take_vector(args[0], &b[MASK], COPIED, "the mask", ITEM_BOOLEAN, n) &&
+           take_matrix(args[1], &b[SEEN], WRITTEN, "observations", ITEM_FLOAT32, n,
+                       (Py_ssize_t)s->num_observed) &&
+           take_matrix(args[2], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
+                       (Py_ssize_t)play->draws->count, n);
+}
+
+static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
+    PyTurn t = {.bad_action = false};
+    bool done = false;
+
+    if (take_start_arrays(self, &playing->play, args, &t)) {
+        settle_turn(self, playing, &t);
+        t.call.mask = (Mask){t.buffers[MASK].buf, t.buffers[MASK].strides[0]};
+        done = perform(self, RESET, do_start, &t) && report_messages(self);
+    }
+    for (int i = 0; i < TURN_BUFFERS; i++) {
+        release_buffer(&t.buffers[i]);
+    }
+    return done ? PyLong_FromSize_t(t.troubled) : NULL;
+}
+
+PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+
+    if (!has_arguments(nargs, 3) || !is_prepared(self)) {
+        return NULL;
+    }
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = start_with(self, playing, args);
     Py_DECREF(playing);
     return result;
 }

@@ -181,7 +181,7 @@ class BatchEngine(Engine):
     # Episodes.
 
     def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
         self.has_moved = False

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -21,7 +22,7 @@ from fmugym.vector.hooks import results
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
 from fmugym.vector.hooks.trace import trace_hooks
-from fmugym.vector.infos import not_finite
+from fmugym.vector.infos import final_infos, not_finite, rows_as_objects
 from fmugym.vector.streams import given_draws
 from fmugym.vector.views import copied
 
@@ -136,6 +137,7 @@ class CompiledEngine(BatchEngine):
             (self.env.step_count, self.ended, self._limit),
         )
         self._play_with_resets = self._pool.watched(self._play)
+        self._start = self._pool.start_of_play()
         self._prepared = True
 
     def set_parameter(self, name: str, values: FloatArray) -> None:
@@ -156,6 +158,31 @@ class CompiledEngine(BatchEngine):
             programs = None
         self._prepare(programs)
 
+    def reset(
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Engine.reset``."""
+        if options or self._any_foreign or not self._prepared:
+            return super().reset(mask, seeds, options)
+        self.has_moved = False
+        if seeds is not None:
+            self._streams.seed(seeds, np.flatnonzero(mask))
+        self._streams.require_seeds()
+        observations, drawn = np.empty(self._shape, _FLOAT32), self._draw_ahead(mask)
+        self.has_moved = True
+        if self._start(mask, observations, drawn):
+            self._require_started(np.flatnonzero(mask), self._pool.statuses)
+            self._require_finite_start(observations, mask)
+        self.any_ended = bool(np.count_nonzero(self.ended))
+        return observations, _start_infos(self._names, drawn, mask)
+
+    def _draw_ahead(self, mask: MaskArray | None) -> FloatArray:
+        """Make the array of drawn values; those of episodes that only Python can draw are in it."""
+        drawn = np.empty(self._drawn_shape)
+        if mask is not None and self._draws_ahead:
+            drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
+        return drawn
+
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         if self._any_foreign or not self._prepared:
@@ -167,35 +194,45 @@ class CompiledEngine(BatchEngine):
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         arrays = observations, rewards, terminated, truncated
-        drawn = np.empty(self._drawn_shape)
         self.has_moved = False
         if resetting is not None and self._draws_ahead:
             actions = self._checked(actions)  # a refused step draws nothing
-            drawn[:, resetting] = self._streams.draw(self.env._plan, np.flatnonzero(resetting))
-        play = self._play if resetting is None else self._play_with_resets
+        drawn, last, started = self._draw_ahead(resetting), None, None
+        if self.starts_at_ends and not self._draws_ahead:
+            last, started = np.empty(self._shape, _FLOAT32), np.empty(self._n, _BOOL)
+        play = self._play if resetting is started is None else self._play_with_resets
         try:
-            troubled, ended = play(actions, *arrays, drawn)
+            troubled, ended, begun = play(actions, *arrays, drawn, last, started)
         except (TypeError, ValueError, BufferError) as error:
             require_refusal(error)
             actions = np.require(self._checked(actions), np.int64, ["C", "A"])
-            troubled, ended = play(actions, *arrays, drawn)
+            troubled, ended, begun = play(actions, *arrays, drawn, last, started)
         self.has_moved = True
-        self.any_ended = ended > 0
+        self.any_ended = ended > begun
         infos: dict[str, Any] = {}
         if resetting is not None:
-            told = LateDict.of(_told, self._names, drawn, resetting)  # rarely read
-            infos = {"drawn": told, "_drawn": resetting}
+            infos = _start_infos(self._names, drawn, resetting)
+        elif begun:
+            infos = LateDict.of(_infos_at_ends, self._names, drawn, last, started)
         result: StepResult = _make_tuple(StepResult, (*arrays, infos))
         if troubled or (self._may_overflow and not_finite(rewards) is not None):
-            self._mend(actions, result, resetting)
+            self._mend(actions, result, resetting if started is None else started)
         return result
 
-    def _mend(self, actions: Any, result: StepResult, resetting: MaskArray | None) -> None:
-        """Handle FMUs that failed or asked to stop: they are rare, so numpy is fast enough."""
+    def _mend(self, actions: Any, result: StepResult, starting: MaskArray | None) -> None:
+        """Handle FMUs that failed or asked to stop: they are rare, so numpy is fast enough.
+
+        Args:
+            actions: Those of the step.
+            result: Of the step; it is corrected.
+            starting: Which environments have started an episode in this step.
+        """
         statuses = self._pool.statuses
-        if resetting is not None:
-            self._require_started(np.flatnonzero(resetting), statuses)
-        self._require_finite_inputs(resetting)
+        if starting is not None:
+            self._require_started(np.flatnonzero(starting), statuses)
+        if starting is not None and self.starts_at_ends:
+            self._require_finite_start(result.observations, starting)
+        self._require_finite_inputs(starting)
         stopped = self._stopped(statuses)
         if stopped.any():
             result.terminated[stopped] = True
@@ -204,6 +241,19 @@ class CompiledEngine(BatchEngine):
             result.rewards[stopped] = rewards[stopped]
         self._handle_faults(result, statuses, True)
         self.note_ends(result.terminated, result.truncated)
+        if starting is not None:
+            self.note_starts(starting)
+
+
+def _infos_at_ends(
+    names: list[str], drawn: FloatArray, last: npt.NDArray[Any], started: MaskArray
+) -> dict[str, Any]:
+    infos = _start_infos(names, drawn, started)
+    return infos | final_infos(rows_as_objects(last, started), {}, started)
+
+
+def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return {"drawn": LateDict.of(_told, names, drawn, mask), "_drawn": mask}  # rarely read
 
 
 def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

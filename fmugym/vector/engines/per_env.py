@@ -99,13 +99,14 @@ class PerEnvEngine(Engine):
             env._plan = env._plan_episode({})
 
     def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
         infos: dict[str, Any] = {}
         self.has_moved = False
         for index in np.flatnonzero(mask).tolist():
-            self._observations[index], info = self._reset(index, seeds[index], options)
+            seed = None if seeds is None else seeds[index]
+            self._observations[index], info = self._reset(index, seed, options)
             infos = self._with_info(infos, info, index)
         self.note_starts(mask)
         return self._stacked(), infos
