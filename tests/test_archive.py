@@ -309,3 +309,16 @@ def test_a_file_that_is_replaced_after_it_was_opened(tmp_path):
     with pytest.raises(FMULoadError, match=r"Replaced.fmu was changed after it was opened"):
         fmu.extract()
     assert FMU(path).extract().is_dir()
+
+
+def test_errors_quote_a_little_of_a_damaged_file(probe, tmp_path):
+    """zipfile quotes what it finds in the place of a name."""
+    path = tmp_path / "Probe.fmu"
+    content = bytearray(probe(2).read_bytes())
+    content[26:28] = (5000).to_bytes(2, "little")  # the length of the first name
+    path.write_bytes(content)
+    with pytest.raises(
+        FMULoadError, match=r"Probe.fmu is damaged: File name in directory"
+    ) as caught:
+        FMU(path)
+    assert len(str(caught.value)) < 1000

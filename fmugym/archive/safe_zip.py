@@ -25,7 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final, cast
 
 from fmugym.checks import check_count
-from fmugym.errors import FMULoadError
+from fmugym.errors import FMULoadError, reason
 
 __all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
 
@@ -115,7 +115,9 @@ class SafeZip:
             self._version = _version_of(path)
             entries = _read_directory(path, limits)
         except _ZIP_ERRORS as error:
-            raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
+            raise FMULoadError(
+                f"{path.name} is not an FMU (a zip archive): {reason(error)}"
+            ) from None
         _check_sizes(path, entries, limits)
         self._links: dict[str, zipfile.ZipInfo] = {}
         for entry in entries:
@@ -291,10 +293,10 @@ class SafeZip:
             with zipfile.ZipFile(self.path) as archive:
                 yield archive
         except OSError as error:
-            raise FMULoadError(f"{self.path.name} cannot be unpacked: {error}") from None
+            raise FMULoadError(f"{self.path.name} cannot be unpacked: {reason(error)}") from None
         except _ZIP_ERRORS as error:
             raise FMULoadError(
-                f"{self.path.name} is damaged: {error}; copy or export the FMU again"
+                f"{self.path.name} is damaged: {reason(error)}; copy or export the FMU again"
             ) from None
 
 
