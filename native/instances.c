@@ -75,10 +75,11 @@ bool instance_build(Pool *pool, Instance *me) {
            build(pool, me, true);
 }
 
-/* Whether a call of the FMU failed, and the FMU did not say why. */
+/* Whether a call of the FMU failed, and the FMU did not say why. A wish to stop is no failure. */
 static bool is_unexplained(const Instance *me) {
     const Failure *failure = me->failure;
-    return failure != NULL && failure->status >= 0 && failure->said == NULL;
+    return failure != NULL && failure->status >= 0 && failure->status != STATUS_TERMINATED &&
+           failure->said == NULL;
 }
 
 bool instance_rebuild_to_hear(Pool *pool, Instance *me) {

@@ -232,6 +232,13 @@ void pool_count_steps(Pool *pool);
 /* Marks each instance for replacement by a new one at its next reset. */
 void pool_recycle(Pool *pool);
 
+/* What became of the episodes in a step that plays. */
+typedef struct {
+    size_t ended;   /* how many have ended */
+    size_t started; /* how many of these were followed by another one in the same step */
+    bool outside;   /* whether a hook looked up an index outside of a table */
+} Ends;
+
 /* The following functions return how many instances now have a status worse than a warning. */
 
 /* Steps all instances except those in the mask. Writes all observations. */
@@ -241,8 +248,11 @@ size_t pool_reset(Pool *pool, const Call *call);
 /* Resets the instances in the mask and steps the others. Writes all observations. */
 size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
- * turn before and after. Writes all observations and how many episodes have just ended. */
-size_t pool_play(Pool *pool, const Call *call, size_t *ended);
+ * turn before and after. Writes all observations. */
+size_t pool_play(Pool *pool, const Call *call, Ends *ends);
+/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all
+ * observations. */
+size_t pool_start(Pool *pool, const Call *call);
 
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);

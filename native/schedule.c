@@ -28,7 +28,7 @@ size_t task_give_up(Task *task, size_t begin, size_t end) {
         if (call->observations != NULL) {
             write_observation(task->pool, index, call->observations);
         }
-        if (call->turn != NULL) {
+        if (task->operation == PLAY) {
             play_skip(call->turn, index);
         }
     }

@@ -28,6 +28,7 @@ EVERY = {
     "test_licences": 12,
     "test_neighbours": 4,
     "test_pool": 8,
+    "test_slow_models": 3,
     "test_quirks": 31,
     "test_words": 17,
     "test_zoo": 29,

@@ -34,7 +34,7 @@ __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
 logger = logging.getLogger(__name__)
 
 DEFAULT_PROBE_TIMEOUT: Final = 60.0
-"""Seconds that the trial of an unknown FMU may take, including the start of its process."""
+"""Seconds that a call may take in the trial of an unknown FMU; for an initialization, ten times."""
 
 _NEVER_NEEDED: Final = {"documentation", "sources"}
 _MOST_FINDINGS: Final = 20
@@ -133,8 +133,8 @@ class FMU(LoadableFMU):
         limits: What is too large to be opened; by default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's, which may need them: paths, or names
             that the system's loader finds.
-        probe_timeout: Seconds that the first load and step of an unknown FMU may take in a process
-            of its own; None to do without. See ``fmugym.trial``.
+        probe_timeout: Seconds that a call of an unknown FMU may take in a trial in a process of its
+            own; None to do without. See ``fmugym.trial``.
 
     Attributes:
         path: The file's absolute path.

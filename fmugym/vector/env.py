@@ -21,12 +21,11 @@ from fmugym.vector.arguments import (
     UnknownAttributeError,
     autoreset_mode_of,
     checked_hooks,
-    checked_mask,
     checked_num_envs,
-    checked_options,
     checked_pool_options,
     checked_seeds,
     checked_step_limit,
+    split_options,
 )
 from fmugym.vector.calls import TOGETHER, checked_name, require_settable
 from fmugym.vector.engines.base import Engine, StepResult
@@ -34,7 +33,7 @@ from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.compiled import CompiledEngine, find_programs
 from fmugym.vector.engines.per_env import PerEnvEngine
 from fmugym.vector.hooks.check import CURE, find_difference
-from fmugym.vector.infos import merged, observations_of, restricted
+from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
 
 __all__ = ["FMUVectorEnv"]
@@ -61,7 +60,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ``infos["final_obs"]`` and ``["final_info"]``) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
         hooks: The way of calling hooks. ``"auto"`` takes the fastest mode that gives correct
-            results. ``"compiled"`` has hooks that are plain arithmetic run by the native pool,
+            results. ``"compiled"`` has the native pool run hooks that can be traced,
             ``"array"`` calls them once for all environments, ``"per_env"`` one environment at a
             time; each is an error where it is not possible.
         pool_options: Passed to ``fmugym.trial.opening.make_pool``: ``backend``, ``threads``,
@@ -138,6 +137,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(env.observation_space, count)
         self._started = self._is_ready = False
         self._engine = self._make_engine(hooks, max_episode_steps)
+        self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._pool.forget_health()  # that of the hook check
 
     def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:
@@ -199,12 +199,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
         self._open_pool("reset")
-        remaining = checked_options(options)
-        mask = checked_mask(remaining.pop("reset_mask", None), self.num_envs)
+        remaining, mask = split_options(options, self.num_envs)
         if not self._is_ready and not mask.all():
             when = "reset after an exception" if self._started else "first reset"
             raise ConfigError(f"the {when} must be of all environments")
-        seeds = checked_seeds(seed, self.num_envs)
+        seeds = None if seed is None else checked_seeds(seed, self.num_envs)
         try:
             observations, infos = self._engine.reset(mask, seeds, remaining)
         except BaseException:
@@ -264,13 +263,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return self._pool
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
-        """Reset in the step that ended the episodes, as the mode ``SAME_STEP`` wants it."""
+        """Start the next episodes in the step that ended some, where the engine has not."""
         last = observations_of(result.observations, ended)
-        observations, infos = self._engine.reset(ended, [None] * self.num_envs, {})
-        final_info = restricted(result.infos, ended)
+        observations, infos = self._engine.reset(ended, None, {})
+        infos |= final_infos(last, restricted(result.infos, ended), ended)
         infos = merged(restricted(result.infos, ~ended), infos)
-        infos |= {"final_obs": last, "_final_obs": ended.copy()}
-        infos |= {"final_info": final_info, "_final_info": ended.copy()}
         return result._replace(observations=observations, infos=infos)
 
     def render(self) -> tuple[Any, ...] | None:

@@ -17,11 +17,13 @@ from fmugym.pool.base import FloatArray, MaskArray
 __all__ = [
     "copy_rows",
     "drawn_info",
+    "final_infos",
     "merged",
     "not_finite",
     "observation_of",
     "observations_of",
     "restricted",
+    "rows_as_objects",
     "within",
 ]
 
@@ -39,6 +41,18 @@ def drawn_info(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, An
     for name, row in drawn.items():
         values[name], values[f"_{name}"] = within(mask, row), mask.copy()
     return {"drawn": values, "_drawn": mask.copy()}
+
+
+def final_infos(
+    observations: npt.NDArray[Any], infos: Mapping[str, Any], ended: MaskArray
+) -> dict[str, Any]:
+    """The infos of the mode ``SAME_STEP`` on the episodes that have ended."""
+    return {
+        "final_obs": observations,
+        "_final_obs": ended.copy(),
+        "final_info": infos,
+        "_final_info": ended.copy(),
+    }
 
 
 def restricted(infos: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
@@ -101,6 +115,15 @@ def observation_of(observations: Any, index: int) -> Any:
     if isinstance(observations, tuple):
         return tuple(observation_of(value, index) for value in observations)
     return observations[index].copy()
+
+
+def rows_as_objects(rows: npt.NDArray[Any], mask: MaskArray) -> npt.NDArray[Any]:
+    """``observations_of`` for one array, in a quarter of the time."""
+    objects = np.empty(len(mask), object)
+    indices = np.flatnonzero(mask)
+    for index, row in zip(indices.tolist(), rows[indices], strict=True):
+        objects[index] = row
+    return objects
 
 
 def observations_of(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:

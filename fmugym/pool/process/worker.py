@@ -278,6 +278,7 @@ def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> Pool:
         threads=setup.threads,
         first_index=setup.block.start,
         counts=counts,
+        attended=False,  # the parent does that for all of its workers
     )
 
 

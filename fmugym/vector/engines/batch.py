@@ -181,7 +181,7 @@ class BatchEngine(Engine):
     # Episodes.
 
     def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
         self.has_moved = False
@@ -274,7 +274,9 @@ class BatchEngine(Engine):
             if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
                 row = variables[name] = results.variable(name, row, self._n)
         else:
-            row = self._parameters.setdefault(name, np.full(self._n, np.nan))
+            known = self._parameters.get(name)
+            row = np.full(self._n, np.nan) if known is None else known
+            self._parameters[name] = row
         return row
 
     # Steps.
