@@ -274,7 +274,9 @@ class BatchEngine(Engine):
             if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
                 row = variables[name] = results.variable(name, row, self._n)
         else:
-            row = self._parameters.setdefault(name, np.full(self._n, np.nan))
+            known = self._parameters.get(name)
+            row = np.full(self._n, np.nan) if known is None else known
+            self._parameters[name] = row
         return row
 
     # Steps.
