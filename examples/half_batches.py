@@ -6,9 +6,10 @@ the learner works on the other half.
 
     python examples/half_batches.py
 
-searches for a linear policy that swings the pendulum up: each environment tries a policy of its
-own, and the next policies are drawn around the best ones (R. Y. Rubinstein, "The cross-entropy
-method", 1999). The result does not depend on how fast the FMUs or the learner are.
+searches for a policy that swings the pendulum up: each environment tries a policy of its own from
+the same start, and the next policies are drawn around the best ones (R. Y. Rubinstein, "The
+Cross-Entropy Method for Combinatorial and Continuous Optimization", 1999). The result does not
+depend on how fast the FMUs or the learner are.
 """
 
 from __future__ import annotations
@@ -39,17 +40,15 @@ class Half:
 
     Args:
         num_envs: Their number.
-        seed: The seed of the first one.
     """
 
-    def __init__(self, num_envs: int, seed: int) -> None:
+    def __init__(self, num_envs: int) -> None:
         self.envs = gymnasium.make_vec("fmugym/Pendulum-v0", num_envs=num_envs)
-        self._seed = seed
 
-    def begin(self, weights: Array) -> None:
-        """Start an episode of each environment, and its first step."""
+    def begin(self, weights: Array, seed: int) -> None:
+        """Start an episode of each environment, all in the same state, and its first step."""
         self._weights, self.returns = weights, np.zeros(len(weights))
-        observations, _ = self.envs.reset(seed=self._seed)
+        observations, _ = self.envs.reset(seed=[seed] * len(weights))
         self._act(observations)
 
     def go_on(self) -> None:
@@ -71,10 +70,10 @@ class Half:
         return taken
 
 
-def evaluate(halves: Sequence[Half], weights: Array) -> Array:
+def evaluate(halves: Sequence[Half], weights: Array, seed: int) -> Array:
     """Return the return of each policy; the halves step in turn."""
     for half, part in zip(halves, np.split(weights, len(halves)), strict=True):
-        half.begin(part)
+        half.begin(part, seed)
     for _ in range(STEPS - 1):
         for half in halves:  # while this one takes its result, the others step
             half.go_on()
@@ -85,12 +84,12 @@ def evaluate(halves: Sequence[Half], weights: Array) -> Array:
 
 def search(num_envs: int, rounds: int, seed: int) -> Array:
     """Search for weights, and print the mean return of the best tenth in each round."""
-    halves = [Half(num_envs // 2, seed), Half(num_envs // 2, seed)]
+    halves = [Half(num_envs // 2), Half(num_envs // 2)]
     rng = np.random.default_rng(seed)
     mean, spread = np.zeros(FEATURES), np.full(FEATURES, 5.0)
     for number in range(rounds):
         weights = rng.normal(mean, spread, (2 * (num_envs // 2), FEATURES))
-        returns = evaluate(halves, weights)
+        returns = evaluate(halves, weights, seed + number)
         best = np.argsort(returns)[-max(2, num_envs // 10) :]
         mean, spread = weights[best].mean(axis=0), weights[best].std(axis=0) + 0.1
         print(f"round {number + 1:2}: mean return of the best tenth {returns[best].mean():7.1f}")
