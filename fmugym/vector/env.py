@@ -60,7 +60,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ``infos["final_obs"]`` and ``["final_info"]``) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
         hooks: The way of calling hooks. ``"auto"`` takes the fastest mode that gives correct
-            results. ``"compiled"`` has hooks that are plain arithmetic run by the native pool,
+            results. ``"compiled"`` has the native pool run hooks that can be traced,
             ``"array"`` calls them once for all environments, ``"per_env"`` one environment at a
             time; each is an error where it is not possible.
         pool_options: Passed to ``fmugym.trial.opening.make_pool``: ``backend``, ``threads``,
