@@ -38,7 +38,6 @@ size_t note_status(Task *task, size_t index, Status status) {
     return 1;
 }
 
-/* Resets or restores instances that need not be neighbours. */
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;

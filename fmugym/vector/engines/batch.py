@@ -325,7 +325,9 @@ class BatchEngine(Engine):
         if array.dtype != space.dtype:
             with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
                 array = array.astype(space.dtype)
-        return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
+        if array.ndim <= 2:
+            return np.ascontiguousarray(array.T)
+        return np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
