@@ -200,7 +200,7 @@ class Subject:
             )
             counts["played"] += 1
 
-    def start(self):
+    def start_episodes(self):
         observations = np.empty((self.n, len(self.outputs)), np.float32)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
             self.pool._pool.start(self.mask(), observations, np.empty((1, self.n)))
@@ -237,7 +237,18 @@ class Subject:
 
 ACTIONS = (
     *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "draw"),
-    *("play", "play", "play", "start", "save", "restore", "forget", "failure", "read", "health"),
+    *(
+        "play",
+        "play",
+        "play",
+        "start_episodes",
+        "save",
+        "restore",
+        "forget",
+        "failure",
+        "read",
+        "health",
+    ),
     *("recycle", "costs", "close"),
 )
 
