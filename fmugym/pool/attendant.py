@@ -128,6 +128,11 @@ class AttendedPool(CountedPool):
 
     _attendant: Attending | None = None
 
+    @property
+    def is_attended(self) -> bool:
+        """See ``Pool.is_attended``."""
+        return self._attendant is not None
+
     def attend(self, attendant: Attending | None) -> None:
         """Let somebody go with all calls of ``reset`` from now on."""
         self._attendant = attendant
