@@ -10,7 +10,14 @@ from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.config import EnvConfig
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
-from fmugym.errors import ConfigError, ContractError, FMUGymError, FMULoadError, SimulationError
+from fmugym.errors import (
+    ConfigError,
+    ContractError,
+    FMUGymError,
+    FMULoadError,
+    LicenceError,
+    SimulationError,
+)
 from fmugym.fmi.status import Status
 from fmugym.pool import Backend, Paced
 from fmugym.registration import register
@@ -32,6 +39,7 @@ __all__ = [
     "FMUGymError",
     "FMULoadError",
     "FMUVectorEnv",
+    "LicenceError",
     "LinearModel",
     "LogUniform",
     "Normal",

@@ -4,10 +4,9 @@ Arrays may be anything with a buffer: float64 for values, bool for masks, float3
 int8 for statuses. Those that are only read may have any strides.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final, TypedDict, final
 
-import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
@@ -17,6 +16,18 @@ MOST_INSTRUCTIONS: Final[int]
 
 def operations() -> tuple[str, ...]:
     """The operations of programs, in the order of their numbers."""
+
+def distributions() -> tuple[str, ...]:
+    """The kinds of distributions, in the order of their numbers."""
+
+def seed(states: Array, indices: Array, words: bytes, /) -> None:
+    """Seed M random streams as ``numpy.random.PCG64`` does.
+
+    Args:
+        states: The streams, uint64, shape (N, 6).
+        indices: Which of them, int64, shape (M,).
+        words: The seeds, the same number of 32-bit words for each, the lowest first.
+    """
 
 def statistics() -> dict[str, int]:
     """What helper threads have done in this process.
@@ -44,6 +55,30 @@ class Access:
     """
 
     def __new__(cls, version: int, types: bytes, references: bytes, /) -> Access: ...
+
+@final
+class Draws:
+    """The draws of an episode.
+
+    Args:
+        table: For each, as int64, its kind, the row of the start value that it sets or -1, and the
+            place and the number of its numbers.
+        numbers: The numbers of all, as float64.
+        standard_normal: The address of numpy's ``random_standard_normal``, or 0.
+
+    Raises:
+        ValueError: If a kind is unknown or does not have the numbers that it needs.
+    """
+
+    def __new__(cls, table: bytes, numbers: bytes, standard_normal: int, /) -> Draws: ...
+    def take(self, states: Array, indices: Array, values: Array, /) -> None:
+        """Draw an episode from each of M streams; ``given`` values stay.
+
+        Args:
+            states: The streams, uint64, shape (N, 6).
+            indices: Which of them, int64, shape (M,).
+            values: Filled, float64, shape (draws, M).
+        """
 
 @final
 class Snapshot:
@@ -75,6 +110,8 @@ class Experiment(TypedDict):
     restores: bool
     rebuilds: bool
     reloads: bool
+    one_initialization: bool
+    pace: tuple[float, int, int]
 
 class Variables(TypedDict):
     """What is set and read in each step, and the Strings that are set before initialization."""
@@ -96,15 +133,6 @@ class Arrays(TypedDict):
 Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
 """An episode: types and references of the start variables, start values, first outputs, and rows of
 inputs, of outputs and of statuses."""
-
-class Draws(TypedDict):
-    """See ``NativePool.prepare_play``."""
-
-    block: Array
-    used: Array
-    low: Array
-    width: Array
-    rows: Array
 
 class Episodes(TypedDict):
     """See ``NativePool.prepare_play``."""
@@ -175,16 +203,10 @@ class Pool:
         judgement: tuple[bytes, bytes, bytes],
         actions: tuple[int, int],
         draws: Draws,
+        states: Array,
         episodes: Episodes,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
-
-    def set_streams(self, generators: Sequence[np.random.BitGenerator], /) -> None:
-        """Take over the random stream of each instance's episodes, before the first ``play``.
-
-        Raises:
-            ValueError: If there is a wrong number of them.
-        """
 
     def play(
         self,

@@ -35,7 +35,13 @@ MOST_RETRIES: Final = 10
 
 _REWARDS: Final = ("positive_reward", "negative_reward", "fault_reward")
 _TIMES: Final = ("start_time", "stop_time")
-_DURATIONS: Final = ("time_step", "probe_timeout", "call_timeout", "tolerance")
+_POSITIVE: Final = (
+    "time_step",
+    "probe_timeout",
+    "call_timeout",
+    "tolerance",
+    "max_initializations_per_second",
+)
 _NAMES: Final = ("model_input_names", "model_output_names", "monitor_names", "preload")
 
 
@@ -82,6 +88,12 @@ class EnvConfig:
             ``fmugym.trial.opening.make_pool``.
         call_timeout: Seconds of real time that a call of an FMU may take in a worker process; None
             for no limit.
+        max_instances: How many instances may exist at once, for FMUs with licences: each instance
+            may take a seat. None for no limit.
+        max_initializations_per_second: How many instantiations and initializations may begin in a
+            second of real time, counted together; None for no limit.
+        licence_wait: Seconds of real time to wait for a licence that the FMU does not get; 0 to
+            give up at once.
 
     Raises:
         ConfigError: For a value of the wrong type or range.
@@ -112,6 +124,9 @@ class EnvConfig:
     probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
     isolation: str | None = None
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT
+    max_instances: int | None = None
+    max_initializations_per_second: float | None = None
+    licence_wait: float = 0.0
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any] | EnvConfig) -> EnvConfig:
@@ -174,15 +189,16 @@ class EnvConfig:
     def _take_floats(self) -> None:
         for key in _REWARDS:
             self._set(key, check_number(key, getattr(self, key)))
-        self._set("warm_up", check_number("warm_up", self.warm_up, minimum=0))
-        for key in _TIMES + _DURATIONS:
+        for key in ("warm_up", "licence_wait"):
+            self._set(key, check_number(key, getattr(self, key), minimum=0))
+        for key in _TIMES + _POSITIVE:
             value = getattr(self, key)
             if value is not None:
-                self._set(key, check_number(key, value, positive=key in _DURATIONS))
+                self._set(key, check_number(key, value, positive=key in _POSITIVE))
 
     def _take_integers(self) -> None:
         self._set("substeps", check_count("substeps", self.substeps))
-        for key in ("max_episode_steps", "leak_limit"):
+        for key in ("max_episode_steps", "leak_limit", "max_instances"):
             value = getattr(self, key)
             if value is not None:
                 self._set(key, check_count(key, value, sys.maxsize))

@@ -11,9 +11,9 @@ writes it. All numbers become Python floats, whatever type they were given in.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -25,10 +25,12 @@ __all__ = [
     "Distribution",
     "LogUniform",
     "Normal",
+    "Recipe",
     "Uniform",
     "as_distribution",
     "draw",
     "is_distribution",
+    "recipe_of",
 ]
 
 
@@ -38,6 +40,20 @@ class Distribution(Protocol):
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value with the given generator."""
         ...
+
+
+class Recipe(NamedTuple):
+    """How the C extension draws the values of ``sample``, to the last bit.
+
+    Attributes:
+        kind: One of the kinds of ``native/draws.h``.
+        numbers: The numbers that this kind needs.
+        limits: All values lie between these.
+    """
+
+    kind: str
+    numbers: tuple[float, ...]
+    limits: tuple[float, float]
 
 
 def _kind(name: str) -> Any:
@@ -68,6 +84,9 @@ class Uniform:
         """Draw one value."""
         return float(rng.uniform(self.low, self.high))
 
+    def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
+        return Recipe("uniform", (self.low, self.high - self.low), (self.low, self.high))
+
 
 @dataclass(frozen=True)
 class LogUniform:
@@ -89,6 +108,10 @@ class LogUniform:
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value."""
         return math.exp(rng.uniform(math.log(self.low), math.log(self.high)))
+
+    def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
+        low, high = math.log(self.low), math.log(self.high)
+        return Recipe("log_uniform", (low, high - low), (0.0, self.high * (1 + 1e-9)))
 
 
 @dataclass(frozen=True)
@@ -131,6 +154,10 @@ class Normal:
             if self.low <= value <= self.high and math.isfinite(value):
                 return value
 
+    def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
+        limits = max(self.low, -_LARGEST), min(self.high, _LARGEST)
+        return Recipe("normal", (self.mean, self.std, self.low, self.high), limits)
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -170,6 +197,14 @@ class Choice:
         index = rng.choice(len(self.values), p=self.probabilities)
         return self.values[int(index)]
 
+    def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
+        values = tuple(map(convert, self.values))
+        limits = min(values), max(values)
+        if self.probabilities is None:
+            return Recipe("choice", values, limits)
+        cumulated = np.cumsum(np.array(self.probabilities))
+        return Recipe("weighted", (*(cumulated / cumulated[-1]).tolist(), *values), limits)
+
 
 _KINDS: Final[Mapping[str, type[Any]]] = {
     "uniform": Uniform,
@@ -178,6 +213,7 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
     "choice": Choice,
 }
 _OURS: Final = tuple(_KINDS.values())
+_LARGEST: Final = float(np.finfo(np.float64).max)
 
 
 def as_distribution(what: str, value: Any) -> Any:
@@ -238,6 +274,27 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
     except Exception as error:
         raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
     return drawn if isinstance(drawn, str) else check_number(f"what {shown(value)} draws", drawn)
+
+
+def recipe_of(distribution: Any, convert: Callable[[Any], float]) -> Recipe | None:
+    """Describe a distribution for the C extension.
+
+    Args:
+        distribution: A distribution.
+        convert: Turns a value into a number for its variable; raises ``ConfigError`` if it cannot.
+
+    Returns:
+        The description, or None if only Python can draw from it.
+    """
+    if type(distribution) not in _OURS:  # a subclass may have its own sample
+        return None
+    try:
+        recipe: Recipe = distribution._recipe(convert)
+        for limit in recipe.limits:
+            convert(limit)
+    except ConfigError:  # some draws may be errors
+        return None
+    return recipe
 
 
 def _items(values: Any) -> list[Any]:

@@ -28,6 +28,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.health import fault_rates
+from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import (
     elements_of,
@@ -303,7 +304,7 @@ class FMUEnv(Pictured):
         try:
             pool.reset(plan.model_variables, episode.start_values)
             if pool.statuses.item(0) > Status.WARNING:
-                raise SimulationError(pool.failure(0))
+                raise failed_reset(pool.failure(0))
             self._begin_episode(episode)
             observation, info = self._observation_and_info()
         except BaseException:

@@ -7,6 +7,7 @@
     │   └── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
     ├── FMULoadError      an archive, a model description or a library cannot be used
     ├── SimulationError   an FMI call failed, or a method was called out of order
+    │   └── LicenceError  an FMU got no licence; it is a ``FMULoadError``, too
     └── ContractError     ``fmugym.testing`` found an environment that breaks its contract
 
 Every error takes one argument, its text, and so survives pickling between processes. The text is
@@ -25,6 +26,7 @@ __all__ = [
     "ContractError",
     "FMUGymError",
     "FMULoadError",
+    "LicenceError",
     "SimulationError",
     "printable",
     "shown",
@@ -80,6 +82,10 @@ class FMULoadError(FMUGymError):
 
 class SimulationError(FMUGymError):
     """An FMI function failed, or a method was called out of order."""
+
+
+class LicenceError(SimulationError, FMULoadError):
+    """An FMU got no licence, by its own words, when it was instantiated or initialized."""
 
 
 class ContractError(FMUGymError):

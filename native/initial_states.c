@@ -69,8 +69,11 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     if (status > STATUS_WARNING) {
         return status;
     }
+    pace_wait(&pool->pace);
+    instance_begin_turn(pool);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
+    instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         return fail_initialization(pool, me, &context, doing, status);

@@ -7,15 +7,28 @@ static const char *name_of(const Pool *pool, size_t index) {
     return pool->names + index * pool->name_size;
 }
 
+void instance_begin_turn(Pool *pool) {
+    if (pool->settings.one_initialization) {
+        mutex_lock(pool->making);
+    }
+}
+
+void instance_end_turn(Pool *pool) {
+    if (pool->settings.one_initialization) {
+        mutex_unlock(pool->making);
+    }
+}
+
 static bool build(Pool *pool, Instance *me, bool logging) {
     const Settings *s = &pool->settings;
     const size_t index = index_of(pool, me);
     const Identity identity = {name_of(pool, index), s->token, s->resources,
                                log_environment(&pool->log, index), logging};
 
-    mutex_lock(&pool->making);
+    pace_wait(&pool->pace);
+    mutex_lock(pool->making);
     me->component = s->fmi->instantiate(me->library, &identity);
-    mutex_unlock(&pool->making);
+    mutex_unlock(pool->making);
     floats_restore_if_seen(&pool->floats);
     me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
     me->hearing = logging ? HEARING_ALL : HEARING_LITTLE;
@@ -123,9 +136,9 @@ void instance_discard(Pool *pool, Instance *me) {
         instance_judge(me, fmi->terminate(me->library, me->component));
     }
     if (me->phase != PHASE_DEAD) {
-        mutex_lock(&pool->making);
+        mutex_lock(pool->making);
         fmi->free_instance(me->library, me->component);
-        mutex_unlock(&pool->making);
+        mutex_unlock(pool->making);
     }
     floats_restore_if_seen(&pool->floats);
     me->component = NULL;
@@ -202,7 +215,9 @@ Status instance_return_to_start(Pool *pool, Instance *me) {
         return STATUS_OK;
     }
     if (me->phase != PHASE_DEAD) {
+        instance_begin_turn(pool);
         const Status status = pool->settings.fmi->reset(me->library, me->component);
+        instance_end_turn(pool);
         floats_restore_if_seen(&pool->floats);
         if (status <= STATUS_WARNING) {
             me->phase = PHASE_INSTANTIATED;

@@ -5,6 +5,11 @@
 
 #include "pool.h"
 
+/* Around a call that no other instance may make at the same time if the pool allows only one
+ * initialization at a time. */
+void instance_begin_turn(Pool *pool);
+void instance_end_turn(Pool *pool);
+
 /* Returns whether the FMU could be instantiated. */
 bool instance_build(Pool *pool, Instance *me);
 /* If the FMU failed without a message, makes an instance anew that logs everything until its next

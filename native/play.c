@@ -19,51 +19,22 @@ bool play_has_bad_action(const Turn *turn) {
     return is_any_outside(turn->actions, play->count, play->lowest_action, play->highest_action);
 }
 
-static double *block_of(const Draws *d, size_t index) {
-    return d->block + index * d->episodes * d->draws;
-}
-
-/* How many episodes of its block an environment has used. The owner can write to this memory, so
- * an invalid number counts as all of them. */
-static size_t used_by(const Draws *d, size_t index) {
-    const uint64_t used = (uint64_t)d->used[index];
-    return used < d->episodes ? (size_t)used : d->episodes;
-}
-
 void play_foresee(const Play *play, size_t index) {
-    const Draws *d = &play->draws;
-    prefetch(block_of(d, index) + used_by(d, index) * d->draws);
+    prefetch(&play->streams[index]);
 }
 
-static void draw_ahead(const Draws *d, const Stream *stream, size_t index) {
-    double *fractions = block_of(d, index);
-
-    for (size_t i = 0; i < d->episodes * d->draws; i++) {
-        fractions[i] = stream->next_double(stream->state);
-    }
-}
-
-/* Uses the same arithmetic as EpisodePlan.scaled, without fused operations. */
 void play_draw(const Turn *turn, size_t index) {
     const Play *play = turn->play;
-    const Draws *d = &play->draws;
+    const Draws *d = play->draws;
+    double *values = turn->drawn + index;
 
-    if (d->draws == 0) {
-        return;
+    draws_take(d, &play->streams[index], values, play->count);
+    for (size_t i = 0; i < d->count; i++) {
+        if (d->draws[i].row >= 0) {
+            play->start_values[(size_t)d->draws[i].row * play->count + index] =
+                values[i * play->count];
+        }
     }
-    size_t used = used_by(d, index);
-    if (used == d->episodes) {
-        draw_ahead(d, turn->streams[index], index);
-        used = 0;
-    }
-    const double *fractions = block_of(d, index) + used * d->draws;
-
-    for (size_t i = 0; i < d->draws; i++) {
-        const double scaled = d->width[i] * fractions[i], value = d->low[i] + scaled;
-        play->start_values[(size_t)d->rows[i] * play->count + index] = value;
-        turn->drawn[i * play->count + index] = value;
-    }
-    d->used[index] = (int64_t)used + 1;
 }
 
 static Source source_of(const Turn *turn) {

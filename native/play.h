@@ -7,26 +7,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "draws.h"
 #include "program.h"
-
-/* A random stream: the bit generator of numpy/random/bitgen.h. */
-typedef struct {
-    void *state;
-    uint64_t (*next_uint64)(void *state);
-    uint32_t (*next_uint32)(void *state);
-    double (*next_double)(void *state);
-    uint64_t (*next_raw)(void *state);
-} Stream;
-
-/* The draws of an episode: uniform numbers in [0, 1), drawn in advance for each environment. */
-typedef struct {
-    size_t draws;    /* draws of one episode */
-    size_t episodes; /* episodes drawn in advance for one environment */
-    double *block;   /* the draws of each episode of each environment */
-    int64_t *used;   /* episodes of its block that an environment has used */
-    const double *low, *width;
-    const int64_t *rows; /* the start value that each draw sets */
-} Draws;
 
 /* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
@@ -37,7 +19,8 @@ typedef struct {
     int64_t lowest_action, highest_action;
     double *input_rows;
     double *start_values; /* a row for each start variable */
-    Draws draws;
+    const Draws *draws;
+    Stream *streams; /* the random stream of each environment */
     int64_t *step_counts;
     int64_t limit;  /* steps after which an episode is truncated */
     uint8_t *ended; /* which environments start an episode instead of taking a step */
@@ -46,11 +29,11 @@ typedef struct {
 /* One step of all environments, and where its results go. */
 typedef struct {
     const Play *play;
-    const Stream *const *streams; /* the stream of each environment */
     const int64_t *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
-    double *drawn; /* a row for each draw; only the values drawn in this step are written */
+    double *drawn; /* a row for each draw; only the values drawn in this step are written. Values
+                    * that were given are read from it */
 } Turn;
 
 /* Whether an action is out of range. */
@@ -72,7 +55,7 @@ size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 /* For an environment that is neither reset nor stepped because memory ran out. */
 void play_skip(const Turn *turn, size_t index);
 
-/* Prefetches the memory that play_draw will read. */
+/* Prefetches the memory that play_draw will use. */
 void play_foresee(const Play *play, size_t index);
 
 /* Draws the start values of an episode, before its instance is reset. */

@@ -12,6 +12,7 @@
 #include "threads.h"
 
 static Mutex list_lock = MUTEX_INITIALIZER;
+static Mutex shared_making = MUTEX_INITIALIZER; /* of all pools with one_initialization */
 static Pool *pools;
 
 static void link_pool(Pool *pool) {
@@ -106,8 +107,12 @@ static bool build_all(Pool *pool, char *error, size_t size) {
 bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     memset(pool, 0, sizeof *pool);
     mutex_reset(&pool->lock);
-    mutex_reset(&pool->making);
+    mutex_reset(&pool->own_making);
+    pool->making = settings->one_initialization ? &shared_making : &pool->own_making;
     pool->settings = *settings;
+    pool->pace.interval = (uint64_t)(settings->pace_interval * 1e9);
+    pool->pace.turn = (uint64_t)settings->turn;
+    pool->pace.turns = (uint64_t)settings->turns;
     pool->step_size = settings->time_step / (double)settings->substeps;
     pool->no_return = !settings->restores && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
@@ -156,7 +161,7 @@ void pool_close(Pool *pool) {
 void pool_dispose(Pool *pool) {
     snapshots_drop_all(pool);
     mutex_destroy(&pool->lock);
-    mutex_destroy(&pool->making);
+    mutex_destroy(&pool->own_making);
 }
 /* Fork. Only the forking thread exists in the child, so locks of other threads are free there. */
 
@@ -175,10 +180,11 @@ static void after_fork_in_parent(void) {
 static void after_fork_in_child(void) {
     log_after_fork_in_child();
     mutex_reset(&list_lock);
+    mutex_reset(&shared_making);
     threads_reset();
     for (Pool *pool = pools; pool != NULL; pool = pool->next) {
         mutex_reset(&pool->lock);
-        mutex_reset(&pool->making);
+        mutex_reset(&pool->own_making);
     }
 }
 

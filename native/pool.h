@@ -12,6 +12,7 @@
 #include "floats.h"
 #include "fmi.h"
 #include "log.h"
+#include "pace.h"
 #include "platform.h"
 #include "play.h"
 #include "tape.h"
@@ -38,6 +39,10 @@ typedef struct {
                     */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
+    bool one_initialization; /* whether only one instance in the process may be made, initialized,
+                              * reset or freed at a time */
+    double pace_interval;    /* see pace.h; in seconds */
+    int64_t turn, turns;
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -143,7 +148,9 @@ typedef struct Pool {
     bool direct;      /* whether a step is one exchange of doubles */
     Mutex lock;
     Floats floats; /* environment of the thread inside, which FMUs must find */
-    Mutex making;  /* held while an instance is made or freed: FMUs may keep lists of them */
+    Mutex own_making;
+    Pace pace;
+    Mutex *making; /* held while an instance is made or freed: FMUs may keep lists of them */
     bool open;
     Log log;
     Library *libraries;

@@ -25,7 +25,7 @@ import time
 
 import numpy as np
 
-from fmugym import FMU, SimulationError, bundled_fmu
+from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 from fmugym.vector.hooks.program import OPERATIONS, Program
@@ -62,6 +62,16 @@ JUDGEMENT = Program(
     np.array([0.2, 0.0]),
     np.array([3, 4, 2], np.uint16),
 )
+
+
+def draws(*rows):
+    """Uniform numbers from [0, 1), one for each row of the start values."""
+    kind = _native.distributions().index("uniform")
+    table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
+    return _native.Draws(table.tobytes(), np.array([0.0, 1.0]).tobytes(), 0)
+
+
+DRAWS = draws(0)
 
 
 class ReceiverError(Exception):
@@ -131,18 +141,21 @@ class Subject:
         self.pool.step_or_reset(None, self.start, self.values, self.mask(), observations)
 
     def prepare_play(self):
-        ends = np.zeros(1), np.ones(1), np.zeros(1, np.int64)
         self.pool.prepare_play(
             self.start,
             (INPUTS, JUDGEMENT),
             (0, 1),
             self.values.copy(),
-            (np.zeros((self.n, 4, 1)), np.full(self.n, 4), *ends),
+            (DRAWS, self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)),
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
         )
 
-    def set_streams(self):
-        self.pool.set_streams([np.random.PCG64(i) for i in range(self.n)])
+    def draw(self):
+        """Seed streams and draw from them while other threads play."""
+        states = self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)
+        indices = np.arange(self.n)
+        _native.seed(states, indices, self.rng.bytes(4 * self.n))
+        DRAWS.take(states, indices, np.empty((1, self.n)))
 
     def play(self):
         flags = np.empty(self.n, np.bool_), np.empty(self.n, np.bool_)
@@ -185,7 +198,7 @@ class Subject:
 
 
 ACTIONS = (
-    *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "set_streams"),
+    *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "draw"),
     *("play", "play", "play", "save", "restore", "forget", "failure", "read", "health"),
     *("recycle", "costs", "close"),
 )

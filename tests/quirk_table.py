@@ -28,6 +28,7 @@ STATES = (2, 3)
 
 NEEDS = {
     "independent": "share the process",
+    "one initialization at a time": "are initialized one at a time",
     "one thread": "are stepped by one thread",
     "libraries": "get a copy of the library each",
 }
@@ -109,7 +110,7 @@ QUIRKS = (
     Quirk("one in a process", "refuses a second instance", neighbours="libraries", log=DISTURB),
     Quirk("overruns with two", "writes beyond its memory if there is a second instance",
           neighbours="libraries", log=DISTURB),
-    Quirk("strtok", "initializes with `strtok`", neighbours="one thread", log=DISTURB),
+    Quirk("strtok", "initializes with `strtok`", neighbours="one initialization at a time"),
     # Memory, files and calls
     Quirk("overruns", "writes a byte beyond its memory (it runs in worker processes)",
           log="harms its process"),

@@ -22,6 +22,7 @@ from fmugym.vector.hooks.program import OPERATIONS
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():
+    from fmugym import _native
     from fmugym.pool.native import NativePool
 
 
@@ -96,21 +97,22 @@ def program(*rows, constants=(1.0,), results=(0,)):
     )
 
 
+def uniform_draws(*rows):
+    """Uniform numbers from [0, 1), one for each row of the start values."""
+    kind = _native.distributions().index("uniform")
+    table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
+    return _native.Draws(table.tobytes(), np.array([0.0, 1.0]).tobytes(), 0)
+
+
 def prepare(pool, inputs, judgement=None, rows=(0,)):
-    n, draws = pool.num_instances, len(rows)
+    n = pool.num_instances
     constant = [OPERATIONS.index("constant"), 0, 0, 0]
     pool.prepare_play(
         (pool.variable("theta_0"),),
         (inputs, judgement or program(constant, results=(0, 0, 0))),
         (0, 1),
         np.zeros((1, n)),
-        (
-            np.zeros((n, 2, draws)),
-            np.full(n, 2),
-            np.zeros(draws),
-            np.ones(draws),
-            np.array(rows, np.int64),
-        ),
+        (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
         (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
     )
 
@@ -157,33 +159,26 @@ class TestPrograms:
         with pytest.raises(ValueError, match=f"the {part} of a program"):
             prepare(cart_poles, long)
 
-    def test_rows_that_change_later_are_those_from_before(self, cart_poles):
+    @pytest.mark.parametrize("row", [1, 2**40])
+    def test_rows_beyond_the_start_values(self, cart_poles, row):
         """They say where in memory draws are written."""
-        rows = np.zeros(1, np.int64)
-        prepare(cart_poles, program(ACTION), rows=rows)
+        prepare(cart_poles, program(ACTION), rows=(0, -1))
         with pytest.raises(ValueError, match="a program does not fit the pool"):
-            prepare(cart_poles, program(ACTION), rows=(1,))
+            prepare(cart_poles, program(ACTION), rows=(row,))
 
-    def test_no_number_of_used_episodes_leads_out_of_the_block(self, cart_poles):
-        n = cart_poles.num_instances
-        used, rows, block = np.full(n, 2), np.zeros(1, np.int64), np.zeros((n, 2, 1))
+    def test_what_does_not_hold_draws(self, cart_poles):
+        draws, states = uniform_draws(0), np.zeros((6, 6), np.uint64)
         constant = program([OPERATIONS.index("constant"), 0, 0, 0], results=(0, 0, 0))
-        play = cart_poles.prepare_play(
-            (cart_poles.variable("theta_0"),),
-            (program(ACTION), constant),
-            (0, 1),
-            np.zeros((1, n)),
-            (block, used, np.zeros(1), np.ones(1), rows),
-            (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
-        )
-        cart_poles.set_streams([np.random.PCG64(i) for i in range(n)])
-        used[:] = [-1, 2**62, -(2**63), 3, 2, 10**9]
-        rows[:] = 2**40
-        drawn, flags = np.empty((1, n)), (np.empty(n, np.bool_), np.empty(n, np.bool_))
-        play(np.zeros(n, np.int64), np.empty((n, 2), "f4"), np.empty(n), *flags, drawn)
-        first = [np.random.Generator(np.random.PCG64(i)).random() for i in range(n)]
-        assert drawn[0].tolist() == first
-        assert used.tolist() == [1] * n
+        for odd in ((draws, states[:, :5]), (draws, states.view(np.int64)), (b"", states)):
+            with pytest.raises((TypeError, ValueError)):
+                cart_poles.prepare_play(
+                    (cart_poles.variable("theta_0"),),
+                    (program(ACTION), constant),
+                    (0, 1),
+                    np.zeros((1, 6)),
+                    odd,
+                    (np.zeros(6, np.int64), np.ones(6, np.bool_), 10),
+                )
 
 
 # Memory

@@ -19,7 +19,7 @@ from vector_tools import (
 )
 
 import fmugym
-from fmugym import ConfigError, Normal, Uniform
+from fmugym import ConfigError, Uniform
 from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
@@ -177,17 +177,6 @@ def test_compiled_hooks_after_a_change(change, monkeypatch):
     assert len(on_arrays) == already < 30
     ours.close()
     theirs.close()
-
-
-def normal_swing():
-    return PushedCart(model_parameters={"x_0": Normal(0.0, 0.1)})
-
-
-@needs_native
-def test_draws_that_the_pool_cannot_make_are_a_reason_against_compiling():
-    with pytest.raises(ConfigError, match=r"draws other than uniform ones.*'x_0'"):
-        FMUVectorEnv(normal_swing, 2, hooks="compiled")
-    FMUVectorEnv(normal_swing, 2, hooks="auto").close()
 
 
 class NotANumber(Arithmetic):

@@ -24,6 +24,8 @@ SLOW_MODULES = {
 
 EVERY = {
     "test_hostile_archive": 9,
+    "test_licences": 12,
+    "test_neighbours": 4,
     "test_pool": 8,
     "test_quirks": 31,
     "test_words": 17,

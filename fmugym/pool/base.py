@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -181,14 +181,6 @@ class Pool(ABC):
             SimulationError: If the pool does not support it; see ``can_play``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
-
-    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
-        """Set the generators from which the function of ``prepare_play`` draws episodes.
-
-        Raises:
-            SimulationError: If the pool does not support it; see ``can_play``.
-        """
-        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
 
     def watched(self, function: Callable[P, R]) -> Callable[P, R]:
         """Add the memory that a reset function allocates to the growth counter."""

@@ -9,12 +9,14 @@ from fmugym.errors import FMULoadError
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
+from fmugym.pool.patience import licence_errors
 from fmugym.pool.python import PythonPool
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["local_pool"]
 
 
+@licence_errors()
 def local_pool(
     fmu: LoadableFMU,
     spec: PoolSpec,
@@ -41,6 +43,7 @@ def local_pool(
         counts: See ``NativePool``.
 
     Raises:
+        LicenceError: If the FMU gets no licence.
         FMULoadError: If the FMU cannot be loaded or instantiated, or if the Python pool is asked
             for private libraries.
     """

@@ -18,7 +18,7 @@ import math
 import os
 import shutil
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, ParamSpec, Protocol, TypeVar
 
@@ -31,6 +31,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -74,7 +75,6 @@ _SAID: Final = "\x1d"
 """Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 
 FloatArray32 = npt.NDArray[np.float32]
-IndexArray = npt.NDArray[np.int64]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -140,6 +140,7 @@ class NativePool(CountedPool):
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self.step_own = self._pool.step_own
+        self._attendant = Attendant.of(spec, log)
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
@@ -175,6 +176,8 @@ class NativePool(CountedPool):
                     "restores": method == ResetMethod.RESTORE,
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
+                    "one_initialization": spec.one_initialization,
+                    "pace": (spec.initialization_interval, *spec.turn),
                 },
                 variables={
                     "inputs": self._access(spec.inputs),
@@ -214,8 +217,8 @@ class NativePool(CountedPool):
 
     @property
     def can_play(self) -> bool:
-        """See ``Pool.can_play``."""
-        return True
+        """See ``Pool.can_play``; nobody waits for licences within a step."""
+        return not self._spec.licence_wait
 
     # The contract of Pool.
 
@@ -223,7 +226,10 @@ class NativePool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        self.reset_into(variables, values, mask)
+        if self._attendant is None:
+            self.reset_into(variables, values, mask)
+        else:
+            self._attendant.reset(self, self.reset_into, variables, values, mask)
         return self._result
 
     def step(
@@ -421,7 +427,7 @@ class NativePool(CountedPool):
         programs: tuple[PlayProgram, PlayProgram],
         actions: tuple[int, int],
         start_values: FloatArray,
-        draws: tuple[FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray, IndexArray],
+        draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
     ) -> Callable[..., tuple[int, int]]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
@@ -433,19 +439,17 @@ class NativePool(CountedPool):
             programs: From the actions to the inputs; from the outputs to done, truncated, reward.
             actions: The lowest and the highest action.
             start_values: As the values of ``reset``; the pool writes the draws there.
-            draws: Uniform numbers drawn ahead, shape (N, episodes, draws); how many of their
-                episodes are used, shape (N,); the lower ends and widths of the distributions and
-                their rows in the start values, shape (draws,).
+            draws: The draws of an episode, and the random streams, shape (N, 6); see
+                ``EpisodeStreams``.
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
 
         Returns:
             A function of actions (int64), observations, rewards, terminated, truncated and drawn
             values (draws, N). It does a step and fills all but the actions; of the drawn values,
-            only those of episodes that start. It returns how many instances have a status worse
-            than a warning, and how many episodes have ended. Call ``set_streams`` before it.
+            only those of episodes that start; ``given`` ones are read. It returns how many
+            instances have a status worse than a warning, and how many episodes have ended.
         """
-        block, used, low, width, rows = draws
         count, ended, limit = episodes
         self._pool.prepare_play(
             start=self._access(variables),
@@ -453,18 +457,11 @@ class NativePool(CountedPool):
             inputs=_program_bytes(programs[0]),
             judgement=_program_bytes(programs[1]),
             actions=actions,
-            draws={"block": block, "used": used, "low": low, "width": width, "rows": rows},
+            draws=draws[0],
+            states=draws[1],
             episodes={"step_counts": count, "ended": ended, "limit": limit},
         )
         return self._pool.play
-
-    def set_streams(self, generators: Sequence[np.random.BitGenerator]) -> None:
-        """Set the generators that ``prepare_play`` uses when the numbers drawn ahead are used up.
-
-        Args:
-            generators: N bit generators of numpy. The pool draws from them without their locks.
-        """
-        self._pool.set_streams(generators)
 
     @property
     def uses_states(self) -> bool:

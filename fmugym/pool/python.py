@@ -16,9 +16,11 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.log import raise_caught
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import CountedPool, HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.pacing import Pacer
 from fmugym.pool.slot import Slot, Snapshot
 
 __all__ = ["PythonPool"]
@@ -56,10 +58,12 @@ class PythonPool(CountedPool):
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
+        self._attendant = Attendant.of(spec, log)
         self._library = Library(fmu, log)
+        pacer = Pacer(spec)
         try:
             self._slots = [
-                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i])
+                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
                 for i in range(num_instances)
             ]
             raise_caught()
@@ -75,13 +79,21 @@ class PythonPool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        if self._watch is None:
+        if self._attendant is None:
             self._reset(variables, values, mask)
         else:
-            self._watch.call(self._reset, variables, values, mask)
+            self._attendant.reset(self, self._reset, variables, values, mask)
         return self.outputs, self.statuses
 
     def _reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> None:
+        if self._watch is None:
+            self._reset_slots(variables, values, mask)
+        else:
+            self._watch.call(self._reset_slots, variables, values, mask)
+
+    def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
         for index, slot in enumerate(self._slots):

@@ -14,6 +14,7 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.health import Column, HealthArray
+from fmugym.pool.pacing import Pacer
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Slot", "Snapshot"]
@@ -58,7 +59,7 @@ class Slot:
         input_row: The inputs of the instance, shape (k_in,).
         output_row: Its outputs, shape (k,).
         counts: Its counts, shape (HEALTH_COUNTS,).
-        states: What the pool's instances know about FMU states.
+        pacer: Waits before an instance is made or initialized.
 
     Attributes:
         failure: Why the last status was worse than a warning.
@@ -72,11 +73,12 @@ class Slot:
         input_row: FloatArray,
         output_row: FloatArray,
         counts: HealthArray,
+        pacer: Pacer,
     ) -> None:
         self.failure = ""
         self.is_due = False
         self._unexplained = False
-        self._counts = counts
+        self._counts, self._pacer = counts, pacer
         self._count = self._counted = 0
         self._library = library
         self._spec = spec
@@ -87,6 +89,7 @@ class Slot:
         self._build()
 
     def _build(self, *, hear_all: bool = False) -> None:
+        self._pacer.wait()
         self._instance = self._library.instantiate(hear_all=hear_all)
         self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
         self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
@@ -184,6 +187,7 @@ class Slot:
             self._start_variables = variables
         self._start.values[:] = values
         spec = self._spec
+        self._pacer.wait()
         self._instance.initialize(
             spec.start_time, spec.stop_time, spec.tolerance, self._set_start_values
         )

@@ -64,6 +64,13 @@ class PoolSpec:
         leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
         reset_method: How instances start a new episode.
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
+        one_initialization: Whether only one instance in a process may be made, initialized, reset
+            or freed at a time. Steps run in parallel all the same.
+        initialization_interval: The least real time in seconds from one instantiation or
+            initialization to the next; see ``fmugym.pool.pacing``.
+        turn: Which turn this pool has in making and initializing instances, and how many turns
+            there are.
+        licence_wait: How long to wait for a refused licence, in seconds of real time.
     """
 
     inputs: tuple[Variable, ...]
@@ -80,6 +87,10 @@ class PoolSpec:
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET
     input_limits: tuple[tuple[float, float], ...] = ()
+    one_initialization: bool = False
+    initialization_interval: float = 0.0
+    turn: tuple[int, int] = (0, 1)
+    licence_wait: float = 0.0
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""

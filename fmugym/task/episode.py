@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.checks import check_number
-from fmugym.distributions import Uniform, draw, is_distribution
+from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import checked_value
 from fmugym.trial.rehearsal import Starts
@@ -71,13 +72,12 @@ class EpisodePlan:
             for index, (name, value) in enumerate(parameters.items())
             if is_distribution(value)
         ]
+        self._all_fit = not any(may_not_fit for *_, may_not_fit in self._random_parameters)
         self._random_variables = [n for n, v in episode_variables.items() if is_distribution(v)]
         names = [name for _, name, _ in self._random_parameters]
         distributions = [parameters[name] for name in names]
         distributions += [episode_variables[name] for name in self._random_variables]
         self._sampler = Sampler(distributions)
-        limits = np.array(self._sampler.limits).reshape(-1, 2)
-        self._low, self._width = limits[:, :1], limits[:, 1:]
         self._start_values = self.constants.reshape(-1, 1).copy()
 
     @property
@@ -86,14 +86,29 @@ class EpisodePlan:
         return list(self._parameters)
 
     @property
-    def limits(self) -> tuple[FloatArray, FloatArray]:
-        """The lower ends and widths of the uniform distributions, each of shape (draws,)."""
-        return self._low[:, 0].copy(), self._width[:, 0].copy()
-
-    @property
     def drawn_names(self) -> list[str]:
         """The names of the drawn parameters and variables, in the order of the draws."""
         return [name for _, name, _ in self._random_parameters] + self._random_variables
+
+    @property
+    def drawn_rows(self) -> list[int]:
+        """For each draw, the index of its parameter; -1 for an episode variable."""
+        rows = [index for index, *_ in self._random_parameters]
+        return rows + [-1] * len(self._random_variables)
+
+    @property
+    def recipes(self) -> list[Recipe] | None:
+        """The draws for the C extension; None if only Python can draw them."""
+        of_parameters = [
+            _recipe_of(self._parameters[name], self.model_variables[index])
+            for index, name, _ in self._random_parameters
+        ]
+        of_variables = [
+            recipe_of(self._variables[name], partial(check_number, name))
+            for name in self._random_variables
+        ]
+        recipes = [recipe for recipe in of_parameters + of_variables if recipe is not None]
+        return recipes if len(recipes) == len(self.drawn_names) else None
 
     @property
     def constant_parameters(self) -> dict[str, Any]:
@@ -106,17 +121,6 @@ class EpisodePlan:
         """The episode variables that are not drawn."""
         drawn = set(self.drawn_names)
         return {name: value for name, value in self._variables.items() if name not in drawn}
-
-    @property
-    def num_uniform(self) -> int | None:
-        """The number of draws if all are uniform draws of Reals; otherwise None."""
-        if any(may_not_fit for *_, may_not_fit in self._random_parameters):
-            return None
-        return len(self._sampler.limits) if self._sampler.all_uniform else None
-
-    def scaled(self, fractions: FloatArray) -> FloatArray:
-        """Scale uniform numbers from [0, 1) to the drawn values; both have shape (draws, M)."""
-        return self._low + self._width * fractions
 
     def starts(self) -> Starts:
         """Draw two episodes for the trial of resets, from a separate random stream."""
@@ -132,24 +136,34 @@ class EpisodePlan:
         """
         if not self._random_parameters and not self._random_variables:
             return self._episode(self._parameters.copy(), self._variables.copy(), {})
-        values = iter(self._sampler.draw(rng))
-        parameters, drawn = self._draw_parameters(values)
-        variables = self._variables.copy()
+        values = iter(self.draw_values(rng))
+        parameters, variables, drawn = self._parameters.copy(), self._variables.copy(), {}
+        for (index, name, _), value in zip(self._random_parameters, values, strict=False):
+            drawn[name] = parameters[name] = value
+            self._start_values[index, 0] = value
         for name, value in zip(self._random_variables, values, strict=True):
-            if type(value) is not float:
-                value = check_number(f"episode variable {name!r}", value)
             drawn[name] = variables[name] = value
         return self._episode(parameters, variables, drawn)
 
-    def _draw_parameters(self, values: Iterator[float]) -> tuple[dict[str, Any], dict[str, Any]]:
-        parameters, drawn = self._parameters.copy(), {}
-        for index, name, may_not_fit in self._random_parameters:
-            value = next(values)
+    def draw_values(self, rng: np.random.Generator) -> list[float]:
+        """Draw one episode.
+
+        Returns:
+            The drawn values in the order of ``drawn_names``.
+
+        Raises:
+            ConfigError: If a drawn value does not fit its variable's type.
+        """
+        values = self._sampler.draw(rng)
+        if self._sampler.all_uniform and self._all_fit:
+            return values
+        for place, (index, _, may_not_fit) in enumerate(self._random_parameters):
             if may_not_fit:
-                value = checked_value(self.model_variables[index], value)
-            drawn[name] = parameters[name] = value
-            self._start_values[index, 0] = value
-        return parameters, drawn
+                values[place] = checked_value(self.model_variables[index], values[place])
+        for place, name in enumerate(self._random_variables, len(self._random_parameters)):
+            if type(values[place]) is not float:
+                values[place] = check_number(f"episode variable {name!r}", values[place])
+        return values
 
     def _episode(
         self, parameters: dict[str, Any], variables: dict[str, Any], drawn: dict[str, Any]
@@ -160,7 +174,13 @@ class EpisodePlan:
 
 
 def _always_fits(distribution: Any, variable: Variable) -> bool:
-    return isinstance(distribution, Uniform) and variable.kind == "real"
+    return type(distribution) is Uniform and variable.kind == "real"
+
+
+def _recipe_of(distribution: Any, variable: Variable) -> Recipe | None:
+    recipe = recipe_of(distribution, partial(checked_value, variable))
+    discrete = recipe is not None and recipe.kind in {"choice", "weighted"}
+    return recipe if discrete or variable.kind == "real" else None
 
 
 class Sampler:
@@ -170,13 +190,13 @@ class Sampler:
     ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
 
     Attributes:
-        limits: Lower end and width of each uniform distribution.
+        limits: Lower end and width of each uniform distribution; a subclass may differ.
         all_uniform: Whether all distributions are uniform.
     """
 
     def __init__(self, distributions: Sequence[Any]) -> None:
         self._distributions = list(distributions)
-        self.limits = [(d.low, d.high - d.low) for d in distributions if isinstance(d, Uniform)]
+        self.limits = [(d.low, d.high - d.low) for d in distributions if type(d) is Uniform]
         self.all_uniform = len(self.limits) == len(distributions)
 
     def draw(self, rng: np.random.Generator) -> list[float]:

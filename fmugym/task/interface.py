@@ -92,6 +92,8 @@ class Interface:
             fault_retries=config.fault_retries,
             leak_limit=config.leak_limit,
             input_limits=tuple(map(self._limits, self.inputs)),
+            initialization_interval=_interval(config.max_initializations_per_second),
+            licence_wait=config.licence_wait,
         )
 
     def _warm_up_steps(self) -> int:
@@ -146,6 +148,10 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
                 config.model_input_names + config.model_output_names,
             )
     return interface
+
+
+def _interval(frequency: float | None) -> float:
+    return 0.0 if frequency is None else 1.0 / frequency
 
 
 def input_variable(description: ModelDescription, name: str) -> Variable:

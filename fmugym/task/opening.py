@@ -16,6 +16,7 @@ from typing import Any, Final
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_option, check_path
 from fmugym.config import EnvConfig
+from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.task.episode import EpisodePlan
@@ -110,6 +111,7 @@ class PoolOpening:
             ConfigError: If an argument is invalid.
             FMULoadError: If the FMU cannot be used on this machine.
         """
+        self._check_max_instances(num_instances)
         own: dict[str, Any] = {
             "isolation": self.isolation or self.config.isolation,
             "call_timeout": self.config.call_timeout,
@@ -120,6 +122,15 @@ class PoolOpening:
         if self.backend is not None:
             options["backend"] = self.backend
         return make_pool(self.fmu, self.spec, num_instances, self.log, **options)
+
+    def _check_max_instances(self, wanted: int) -> None:
+        most = self.config.max_instances
+        if most is not None and wanted > most:
+            self.fmu.close()
+            raise ConfigError(
+                f"{self.fmu.path.name}: {wanted} environments need {wanted} instances, but config "
+                f"key 'max_instances' allows {most}"
+            )
 
     def apart(self) -> PoolOpening:
         """Return the same with an FMU that is not shared."""

@@ -90,6 +90,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "reset_method": str(verdict.reset_method) if verdict.resets else None,
         "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
         "isolate": verdict.isolate,
+        "instances_at_once": verdict.instances,
         "deaths": list(verdict.reasons),
     }
 
@@ -225,7 +226,10 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
         parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
     if trial["isolate"]:
         parts.append("it harms its process and is isolated")
-    return "; ".join([*parts, *trial["deaths"]]) or "it survived"
+    count = trial["instances_at_once"]
+    parts = parts or ["it survived"]
+    parts.append(f"tried with {count} {'instance' if count == 1 else 'instances'} at once")
+    return "; ".join([*parts, *trial["deaths"]])
 
 
 _GRADES: Final = {
@@ -237,6 +241,7 @@ _GRADES: Final = {
 }
 _NEEDS: Final = {
     "independent": "independent",
+    "one initialization at a time": "initialized one at a time",
     "one thread": "one thread for all",
     "libraries": "a copy of the library each",
     "processes": "a process each",

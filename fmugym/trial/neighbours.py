@@ -9,19 +9,22 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Final
 
 import numpy as np
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMULoadError, SimulationError
+from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.local import local_pool
+from fmugym.pool.pacing import Pacer
+from fmugym.pool.patience import licence_errors, require_licence
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
 from fmugym.trial.trial import Candidate
@@ -82,6 +85,8 @@ def disturb_in_turn(
     alone, inputs = _run_alone(candidate, spec, private_libraries)
     try:
         beside = _run(candidate, spec, inputs, private_libraries)
+    except LicenceError:
+        raise
     except (FMULoadError, SimulationError) as error:
         logger.info("%s: a second instance fails: %s", candidate.path.name, error)
         return True
@@ -123,6 +128,7 @@ def _run(
 
 def _trajectory(pool: Pool, inputs: FloatArray) -> FloatArray:
     outputs, statuses = pool.reset((), np.zeros((0, pool.num_instances)))
+    require_licence(pool)
     rows = []
     for step in range(_STEPS + 1):
         if statuses[0] > Status.WARNING:
@@ -135,12 +141,16 @@ def _trajectory(pool: Pool, inputs: FloatArray) -> FloatArray:
     return np.array(rows)
 
 
-def disturb_in_threads(candidate: Candidate, spec: PoolSpec) -> bool:
+def disturb_in_threads(
+    candidate: Candidate, spec: PoolSpec, *, one_initialization: bool = False
+) -> bool:
     """Compare a lone instance with instances that are made and stepped at the same time.
 
     Args:
         candidate: The FMU.
         spec: What to do in a step.
+        one_initialization: Whether instances are made, initialized and freed in turn, so that only
+            steps run at the same time as other calls.
 
     Returns:
         Whether an instance gave different outputs, or failed, while another thread ran.
@@ -151,63 +161,148 @@ def disturb_in_threads(candidate: Candidate, spec: PoolSpec) -> bool:
     """
     library = Library(candidate.open(), logger)
     try:
-        inputs = _inputs_of_two(spec, 0.0)[0]
-        expected = _life(library, spec, inputs, _nobody_waits)
-        if _life(library, spec, inputs, _nobody_waits) != expected:
+        lives = _two_lives(library, spec)
+        if lives[0]() != lives[0].outputs:
             return False  # a lone instance does not repeat its outputs: nothing to compare
-        return not _Race(library, spec, inputs, expected).is_undisturbed()
+        company = _Turns() if one_initialization else _Crowd()
+        return not _Race(lives, company).is_undisturbed()
     finally:
         library.close()
+
+
+def _two_lives(library: Library, spec: PoolSpec) -> list[_Life]:
+    """Let two instances live one after the other, with inputs that differ if the FMU bears it."""
+    pacer = Pacer(spec)
+    try:
+        return [_Life(library, spec, inputs, pacer) for inputs in _inputs_of_two(spec, 1.0)]
+    except LicenceError:
+        raise
+    except SimulationError:
+        return [_Life(library, spec, _inputs_of_two(spec, 0.0)[0], pacer)] * 2
+
+
+class _Company:
+    """What an instance waits for in the course of its life; a lone one waits for nothing."""
+
+    turn: AbstractContextManager[Any] = nullcontext()
+    """Held while an instance is made, initialized or freed."""
+
+    def before_initialization(self) -> None:
+        """Wait until the other instance is about to be initialized, too."""
+
+    def before_steps(self) -> None:
+        """Wait until the other instance is about to be stepped, too."""
+
+    def leave(self) -> None:
+        """Let nobody wait any more."""
+
+
+class _Crowd(_Company):
+    """Two instances are initialized at the same moment."""
+
+    def __init__(self) -> None:
+        self._barrier = threading.Barrier(2)
+
+    def before_initialization(self) -> None:
+        self._barrier.wait()
+
+    def leave(self) -> None:
+        self._barrier.abort()
+
+
+class _Turns(_Crowd):
+    """Two instances are initialized in turn.
+
+    In every other round they step at the same moment. In the rounds between, the first one steps
+    while the second one is initialized.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.turn = threading.Lock()
+        self._rounds = threading.local()
+
+    def before_steps(self) -> None:
+        count = getattr(self._rounds, "count", 0)
+        self._rounds.count = count + 1
+        if count % 2:
+            self._barrier.wait()
 
 
 class _Race:
     """Two threads that each make, run and free an instance at the same time, several times."""
 
-    def __init__(
-        self, library: Library, spec: PoolSpec, inputs: FloatArray, expected: bytes
-    ) -> None:
-        self._arguments = library, spec, inputs
-        self._expected = expected
-        self._barrier = threading.Barrier(2)
+    def __init__(self, lives: Sequence[_Life], company: _Company) -> None:
+        self._lives, self._company = lives, company
+        self._refusal: LicenceError | None = None
         self._deadline = time.perf_counter() + _THREAD_SECONDS
         self._disturbed = False
 
     def is_undisturbed(self) -> bool:
-        threads = [threading.Thread(target=self._run) for _ in range(2)]
+        threads = [threading.Thread(target=self._run, args=[life]) for life in self._lives]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
+        if self._refusal is not None:
+            raise self._refusal
         return not self._disturbed
 
-    def _run(self) -> None:
+    def _run(self, life: _Life) -> None:
         try:
-            for _ in range(_ROUNDS):
-                if _life(*self._arguments, self._wait) != self._expected:
+            for number in range(_ROUNDS):
+                if life(self._company) != life.outputs:
                     self._disturbed = True
-                if self._disturbed or time.perf_counter() > self._deadline:
+                is_late = number > 0 and time.perf_counter() > self._deadline
+                if self._disturbed or is_late:
                     break
+        except LicenceError as error:
+            self._refusal = error
         except (FMULoadError, SimulationError) as error:
             logger.info("an instance fails beside another thread: %s", error)
             self._disturbed = True
         except threading.BrokenBarrierError:  # the other thread has ended
             pass
         finally:
-            self._barrier.abort()
-
-    def _wait(self) -> None:
-        self._barrier.wait()
+            self._company.leave()
 
 
-def _life(library: Library, spec: PoolSpec, inputs: FloatArray, wait: Callable[[], None]) -> bytes:
-    """Make, initialize, step and free an instance; return all outputs."""
-    instance = library.instantiate()
-    try:
-        wait()
-        instance.initialize(spec.start_time, spec.stop_time, spec.tolerance, _no_start_values)
-        return _steps(instance, spec, inputs)
-    finally:
-        library.discard(instance)
+class _Life:
+    """The life of an instance with given inputs; calling it makes another instance.
+
+    Args:
+        library: The FMU's library.
+        spec: What to do in a step.
+        inputs: Shape (steps, inputs).
+        pacer: Waits before an instance is made or initialized.
+
+    Attributes:
+        outputs: All outputs of a lone instance.
+    """
+
+    def __init__(self, library: Library, spec: PoolSpec, inputs: FloatArray, pacer: Pacer) -> None:
+        self._library, self._spec, self._inputs, self._pacer = library, spec, inputs, pacer
+        self.outputs = self()
+
+    def __call__(self, company: _Company | None = None) -> bytes:
+        """Make, initialize, step and free an instance; return all outputs."""
+        company = company or _Company()
+        spec = self._spec
+        with company.turn, licence_errors():
+            self._pacer.wait()
+            instance = self._library.instantiate()
+        try:
+            company.before_initialization()
+            with company.turn, licence_errors():
+                self._pacer.wait()
+                instance.initialize(
+                    spec.start_time, spec.stop_time, spec.tolerance, _no_start_values
+                )
+            company.before_steps()
+            return _steps(instance, spec, self._inputs)
+        finally:
+            with company.turn:
+                self._library.discard(instance)
 
 
 def _steps(instance: Instance, spec: PoolSpec, inputs: FloatArray) -> bytes:
@@ -227,7 +322,3 @@ def _steps(instance: Instance, spec: PoolSpec, inputs: FloatArray) -> bytes:
 
 def _no_start_values() -> None:
     """Keep the FMU's start values."""
-
-
-def _nobody_waits() -> None:
-    """Do nothing: a lone instance does not wait for others."""

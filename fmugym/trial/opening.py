@@ -8,11 +8,12 @@ from typing import Any
 
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import FMU
-from fmugym.errors import ConfigError, FMULoadError, SimulationError, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, LicenceError, SimulationError, unknown_name
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
+from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
@@ -64,6 +65,7 @@ def make_pool(
 
     Raises:
         ConfigError: If the backend, the isolation or the reset method is unknown.
+        LicenceError: If the FMU gets no licence within ``spec.licence_wait``.
         FMULoadError: If the FMU cannot be loaded or instantiated, or the backend is not available.
     """
     if not isinstance(backend, str):
@@ -77,15 +79,32 @@ def make_pool(
     if reset_method not in (None, *ResetMethod):
         raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
-    plan = plan.completed(fmu, _verdict(fmu, spec, starts, num_instances, plan), num_instances, log)
-    spec = replace(spec, reset_method=plan.method)
+
+    def attempt() -> Pool:
+        verdict = _verdict(fmu, spec, starts, num_instances, plan)
+        completed = plan.completed(fmu, verdict, num_instances, log)
+        return _open(fmu, spec, num_instances, log, completed, call_timeout)
+
+    return Patience(spec.licence_wait, log).call(attempt)
+
+
+@licence_errors()
+def _open(
+    fmu: FMU,
+    spec: PoolSpec,
+    num_instances: int,
+    log: logging.Logger,
+    plan: _Plan,
+    call_timeout: float | None,
+) -> Pool:
+    spec = replace(spec, reset_method=plan.method, one_initialization=plan.one_initialization)
     if plan.isolation == "process":
         return ProcessPool(
             fmu,
             spec,
             num_instances,
             log,
-            native=native,
+            native=plan.native,
             workers=plan.workers,
             threads=plan.threads,
             call_timeout=call_timeout,
@@ -95,7 +114,7 @@ def make_pool(
         spec,
         num_instances,
         log,
-        native=native,
+        native=plan.native,
         threads=plan.threads,
         private_libraries=plan.private_libraries,
     )
@@ -121,6 +140,7 @@ class _Plan:
     private_libraries: bool | None = None
     isolation: str | None = None
     workers: int | None = None
+    one_initialization: bool = False
 
     @property
     def method(self) -> ResetMethod:
@@ -154,6 +174,9 @@ class _Plan:
     ) -> _Plan:
         if neighbours is Neighbours.INDEPENDENT:
             return self
+        if neighbours is Neighbours.ONE_INITIALIZATION:
+            log.info("%s: its instances are initialized one at a time", fmu.path.name)
+            return replace(self, one_initialization=True)
         plan, what = replace(self, threads=1), "all are stepped by one thread"
         in_process = self.isolation == "none"
         if neighbours is Neighbours.LIBRARIES and (in_process or self._can_copy_libraries):
@@ -226,5 +249,7 @@ def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:
     """Compare two instances in this process, in which the FMU will run without a trial anyway."""
     try:
         return disturb_in_turn(candidate, spec)
+    except LicenceError:
+        raise
     except SimulationError:  # a lone instance fails too: it needs the caller's values
         return False

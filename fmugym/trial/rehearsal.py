@@ -17,10 +17,11 @@ from typing import Final
 import numpy as np
 
 from fmugym.archive.description import Variable
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.local import local_pool
+from fmugym.pool.patience import require_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.trial import Candidate
@@ -147,6 +148,7 @@ class Rehearsal:
         """Play one episode; a measured one determines how many steps a long episode has."""
         deadline = time.perf_counter() + _LONG_SECONDS
         outputs, statuses = pool.reset(self._starts.variables, self._starts.column(start))
+        require_licence(pool)
         rows = [outputs[:, 0].copy()]
         for row in self._inputs[:steps]:
             if statuses[0] > Status.WARNING:
@@ -170,6 +172,8 @@ class Rehearsal:
         """
         try:
             pool = self._open(method)
+        except LicenceError:
+            raise
         except FMUGymError:
             return Grade.FAILS
         try:

@@ -33,8 +33,9 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMULoadError
+from fmugym.errors import FMULoadError, LicenceError
 from fmugym.fmi.words import as_messages, quoted
+from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.cache import recall, remember
@@ -98,6 +99,7 @@ class Stage(StrEnum):
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
     THREADS = "the comparison with an instance in another thread"
+    TURNS = "the comparison with an instance in another thread, initialized in turn"
 
     @classmethod
     def of(cls, method: ResetMethod) -> Stage:
@@ -164,6 +166,7 @@ def meet(fmu: FMU) -> None:
 
     Raises:
         FMULoadError: If the process did not survive. The text has the reason and the last lines.
+        LicenceError: If the FMU got no licence.
     """
     candidate = Candidate.of(fmu)
     if not candidate.exempt and known_verdict(fmu) is None:
@@ -200,8 +203,10 @@ def examine(
 
     Raises:
         FMULoadError: As ``meet``, if ``must_survive``.
+        LicenceError: If an instance got no licence.
     """
-    asked = _digest(repr((spec, starts, candidate.preload)).encode())
+    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0)  # the rest is tried
+    asked = _digest(repr((tried, starts, candidate.preload)).encode())
     key = f"{_content_key(candidate.path)}-{asked}"
     known = Verdict.from_text(recall(key))
     if known is not None and (known.neighbours is not None or not several):
@@ -221,6 +226,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
             logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
             return Verdict()
         notes.add(outcome)
+        notes.require_licence(name, outcome)
         if "finished" in outcome.answer:
             break
         if "complete" not in outcome.answer:
@@ -232,6 +238,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
     verdict = notes.verdict
+    logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
     return verdict
@@ -260,22 +267,41 @@ class _Notes:
             deterministic=bool(answer.get("deterministic", True)),
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             neighbours=None if neighbours is None else Neighbours(neighbours),
+            instances=int(answer.get("instances", 1)),
             isolate=any(death.stage in _ALONE for death in self._deaths),
             reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
+
+    def require_licence(self, name: str, outcome: _Outcome) -> None:
+        """Give up if an instance got no licence: this tells nothing about the FMU itself.
+
+        Raises:
+            LicenceError: With the FMU's words.
+        """
+        answer, said = outcome.answer, outcome.said
+        words = answer.get("refused", "")
+        if "finished" not in answer and "complete" in answer and speaks_of_licence(said):
+            words = f"it {outcome.end}{said}"
+        if words:
+            raise LicenceError(
+                f"{name} got no licence in its trial, which used {answer['instances']} "
+                f"instance(s) at once: {words}"
+            )
 
     def died_alone(self, name: str, must_survive: bool) -> Verdict:
         """Report that even a lone instance dies, or that it needs a separate process.
 
         Raises:
             FMULoadError: If ``must_survive``.
+            LicenceError: If it also speaks of a licence.
         """
         last = self._deaths[-1]
         if must_survive:
-            raise FMULoadError(
+            text = (
                 f"{name} cannot be used: in {last.stage} it {last.end}{last.said}. That was a "
                 "trial in a process of its own; probe_timeout=None turns it off"
             )
+            raise LicenceError(text) if speaks_of_licence(last.said) else FMULoadError(text)
         return replace(self.verdict, isolate=True, neighbours=Neighbours.PROCESSES)
 
 

@@ -12,7 +12,7 @@ from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 
 
 class Grade(StrEnum):
@@ -34,6 +34,8 @@ class Neighbours(StrEnum):
     """What several instances need in order not to disturb each other."""
 
     INDEPENDENT = "independent"
+    ONE_INITIALIZATION = "one initialization at a time"
+    """Instances may step at the same time, but not be initialized."""
     ONE_THREAD = "one thread"
     """Instances give correct results in turn, but not at the same time."""
     LIBRARIES = "libraries"
@@ -52,6 +54,7 @@ class Verdict:
         resets: The grade of each reset method that was tried.
         neighbours: What several instances need; None if only one was tried.
         isolate: Whether a lone instance has harmed its process.
+        instances: How many instances the trial used at once, each of which may take a licence.
         reasons: The observations, one sentence each, for the log and ``fmugym info``.
     """
 
@@ -60,6 +63,7 @@ class Verdict:
     resets: Mapping[ResetMethod, Grade] = field(default_factory=dict)
     neighbours: Neighbours | None = None
     isolate: bool = False
+    instances: int = 1
     reasons: tuple[str, ...] = ()
 
     @property
@@ -81,6 +85,7 @@ class Verdict:
                 "resets": {str(method): str(grade) for method, grade in self.resets.items()},
                 "neighbours": None if self.neighbours is None else str(self.neighbours),
                 "isolate": self.isolate,
+                "instances": self.instances,
                 "reasons": list(self.reasons),
             }
         )
@@ -99,6 +104,8 @@ class Verdict:
         reasons = data["reasons"]
         if data["format"] != _FORMAT or not all(isinstance(flag, bool) for flag in flags):
             return None
+        if data["instances"] not in (1, 2):
+            return None
         if not isinstance(reasons, list) or not all(isinstance(one, str) for one in reasons):
             return None
         given = data["neighbours"]
@@ -108,5 +115,6 @@ class Verdict:
             resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
             neighbours=None if given is None else Neighbours(given),
             isolate=flags[2],
+            instances=data["instances"],
             reasons=tuple(reasons),
         )

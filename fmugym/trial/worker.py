@@ -14,23 +14,25 @@ import logging
 import os
 import pickle
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.local import local_pool
+from fmugym.pool.patience import require_licence
 from fmugym.pool.process.output import print_line_by_line
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.rehearsal import Rehearsal, Starts
-from fmugym.trial.trial import Candidate, Request, Stage
+from fmugym.trial.trial import Request, Stage
 from fmugym.trial.verdict import Grade, Neighbours
 
 _NO_DIALOGUES: Final = 0x0003
@@ -69,13 +71,21 @@ def main(folder: Path) -> None:
     request: Request = pickle.loads((folder / "request").read_bytes())
     _prepare(request.candidate.timeout or DEFAULT_PROBE_TIMEOUT)
     notes = Notes(folder)
-    complete = _try_alone(request.candidate, notes)
+    notes.answer(instances=1)
+    try:
+        _try(request, notes)
+    except LicenceError as error:
+        notes.answer(refused=str(error))
+    notes.answer(finished=True)
+
+
+def _try(request: Request, notes: Notes) -> None:
+    complete = _try_alone(request, notes)
     notes.answer(complete=complete)
     if complete and request.spec is not None:
         _try_resets(request, notes)
         if request.several:
             _try_several(request, notes)
-    notes.answer(finished=True)
 
 
 def _prepare(timeout: float) -> None:
@@ -91,7 +101,7 @@ def _prepare(timeout: float) -> None:
         print_line_by_line()
 
 
-def _try_alone(candidate: Candidate, notes: Notes) -> bool:
+def _try_alone(request: Request, notes: Notes) -> bool:
     """Try one instance; return whether another trial might show more of the FMU.
 
     The trial begins in Python, where messages arrive while the FMU runs. FMPy requires every
@@ -99,16 +109,20 @@ def _try_alone(candidate: Candidate, notes: Notes) -> bool:
     """
     for native in (False, True) if has_native_pool() else (False,):
         try:
-            _step_once(candidate, native, notes)
+            _step_once(request, native, notes)
             return True
+        except LicenceError:
+            raise
         except FMUGymError:  # the process is alive, and the caller will get the error too
             continue
     return False
 
 
-def _step_once(candidate: Candidate, native: bool, notes: Notes) -> None:
-    fmu = candidate.open()
+def _step_once(request: Request, native: bool, notes: Notes) -> None:
+    fmu = request.candidate.open()
     spec = default_spec(fmu)
+    if request.spec is not None:
+        spec = replace(spec, initialization_interval=request.spec.initialization_interval)
     notes.stage("loading and instantiation")
     pool = local_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native, threads=1)
     try:
@@ -121,6 +135,7 @@ def _step_once(candidate: Candidate, native: bool, notes: Notes) -> None:
 def _reset_and_step(pool: Pool, spec: PoolSpec, notes: Notes) -> None:
     notes.stage("initialization")
     _, statuses = pool.reset((), np.zeros((0, 1)))
+    require_licence(pool)
     if statuses[0] <= Status.WARNING:  # otherwise it may need the caller's values
         notes.stage("the first step")
         pool.step(start_inputs(spec)[:, None])
@@ -155,6 +170,7 @@ def _methods(request: Request) -> list[ResetMethod]:
 
 
 def _try_several(request: Request, notes: Notes) -> None:
+    notes.answer(instances=2)
     notes.answer(neighbours=_need_of_several(request, notes))
 
 
@@ -163,13 +179,24 @@ def _need_of_several(request: Request, notes: Notes) -> Neighbours:
     if request.alone or _disturbed(request, notes, private_libraries=False):
         copies = has_native_pool() and not _disturbed(request, notes, private_libraries=True)
         return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
-    notes.stage(Stage.THREADS)
+    if not _disturbed_in_threads(request, notes, Stage.THREADS):
+        return Neighbours.INDEPENDENT
+    if not _disturbed_in_threads(request, notes, Stage.TURNS):
+        return Neighbours.ONE_INITIALIZATION
+    return Neighbours.ONE_THREAD
+
+
+def _disturbed_in_threads(request: Request, notes: Notes, stage: Stage) -> bool:
+    notes.stage(stage)
+    if stage in request.skip:
+        return True
+    in_turn = stage is Stage.TURNS
     try:
-        if Stage.THREADS in request.skip or disturb_in_threads(request.candidate, request.spec):
-            return Neighbours.ONE_THREAD
+        return disturb_in_threads(request.candidate, request.spec, one_initialization=in_turn)
+    except LicenceError:
+        raise
     except FMUGymError:  # FMPy cannot load it, or it fails without the caller's values
-        pass
-    return Neighbours.INDEPENDENT
+        return False
 
 
 def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bool:
@@ -179,6 +206,8 @@ def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bo
         return True
     try:
         return disturb_in_turn(request.candidate, request.spec, private_libraries=private_libraries)
+    except LicenceError:
+        raise
     except FMUGymError:  # a lone instance fails too: it needs the caller's values
         return False
 

@@ -2,115 +2,178 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import ctypes
+import functools
+import secrets
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.utils import seeding
 
+from fmugym.distributions import Recipe
+from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
 from fmugym.task.episode import EpisodePlan
 
-__all__ = ["EpisodeStreams"]
+if TYPE_CHECKING:
+    from fmugym._native import Draws
 
-_BLOCK_BYTES = 16 * 2**20
-"""The most memory for values drawn ahead."""
+__all__ = ["EpisodeStreams", "given_draws"]
 
-_LONGEST_BLOCK = 32
-"""The most episodes drawn ahead for one environment."""
+IndexArray = npt.NDArray[np.intp]
+
+_WORD: Final = 2**64
+_NONE: Final = -1
+_SEED_BITS: Final = 128
+"""The bits of entropy that numpy takes from the system where no seed is given."""
 
 
 class EpisodeStreams:
-    """Draws the episodes of N environments from N generators.
+    """Draws the episodes of N environments from N random streams.
 
     Seeded with s, environment i draws what a single environment seeded with s + i draws, episode
-    after episode. If all distributions are uniform, each takes one number of the stream. Several
-    episodes are then drawn ahead in one call. When a reset needs other draws, the stream returns
-    to the position that the episodes have reached.
+    after episode. A stream is the state of a ``numpy.random.PCG64``. Where the C extension exists,
+    it seeds the streams and draws from them; a generator of numpy takes the place of a stream
+    only for distributions that Python must draw.
 
     Args:
         num_envs: N.
-        plan: The draws of an episode, without overrides.
 
     Attributes:
-        num_draws: How many numbers of the stream an episode takes; None if some are not uniform.
-        block: Uniform numbers drawn ahead, shape (N, episodes, draws).
-        used: How many episodes of its block an environment has used, shape (N,).
-        version: Goes up whenever an environment gets another generator.
+        states: The streams, shape (N, 6): state, increment (the higher half first), whether a half
+            of a number is left over, and that half.
     """
 
-    def __init__(self, num_envs: int, plan: EpisodePlan) -> None:
-        self._generators: list[np.random.Generator | None] = [None] * num_envs
-        self._seeds = [0] * num_envs
-        self.version = 0
-        self.num_draws = plan.num_uniform
-        self._draws = plan.num_uniform or 0
-        row = 8 * num_envs * max(self._draws, 1)
-        self._length = max(1, min(_LONGEST_BLOCK, _BLOCK_BYTES // row))
-        self.block = np.empty((num_envs, self._length, self._draws))
-        self._rows = list(self.block)
-        self.used = np.full(num_envs, self._length)
-
-    def generator(self, index: int) -> np.random.Generator:
-        """The generator of an environment, at the position that its episodes have reached."""
-        generator = self._generators[index] or self._unseeded(index)
-        ahead = int(self._length - self.used[index]) * self._draws
-        if ahead:
-            _take_back(generator.bit_generator, ahead)
-            self.used[index] = self._length
-        return generator
-
-    def _unseeded(self, index: int) -> np.random.Generator:
-        return self._renew(index, None)
-
-    def _renew(self, index: int, seed: int | None) -> np.random.Generator:
-        generator, self._seeds[index] = seeding.np_random(seed)
-        self._generators[index] = generator
-        self.version += 1
-        return generator
+    def __init__(self, num_envs: int) -> None:
+        self.states = np.zeros((num_envs, 6), np.uint64)
+        self._seeds = [_NONE] * num_envs
+        self._all_seeded = False
+        self._generator = np.random.Generator(np.random.PCG64(0))
+        self._latest: tuple[EpisodePlan, Draws | None] | None = None
 
     def seed_of(self, index: int) -> int:
-        """The seed that an environment's generator was made with."""
-        if self._generators[index] is None:
-            self._unseeded(index)
+        """The seed of an environment."""
+        self._seed_others([index])
         return self._seeds[index]
 
-    def bit_generators(self) -> list[np.random.BitGenerator]:
-        """The bit generators of all environments."""
-        generators = enumerate(self._generators)
-        return [(known or self._unseeded(index)).bit_generator for index, known in generators]
-
-    def seed(self, seeds: Sequence[int | None], indices: npt.NDArray[np.intp]) -> None:
+    def seed(self, seeds: Sequence[int | None], indices: IndexArray) -> None:
         """Seed some of the environments anew; None leaves a stream as it is."""
-        if not any(seed is not None for seed in seeds):
+        chosen = ((index, seeds[index]) for index in indices.tolist())
+        self._seed({index: seed for index, seed in chosen if seed is not None})
+
+    def _seed_others(self, indices: Sequence[int]) -> None:
+        """Seed those environments that have no seed yet from the system's entropy."""
+        unseeded = [index for index in indices if self._seeds[index] == _NONE]
+        self._seed({index: secrets.randbits(_SEED_BITS) for index in unseeded})
+
+    def _seed(self, seeds: dict[int, int]) -> None:
+        by_size: dict[int, list[int]] = {}
+        for index, seed in seeds.items():
+            self._seeds[index] = seed
+            by_size.setdefault(4 * (seed.bit_length() // 32 + 1), []).append(index)
+        for size, indices in by_size.items():
+            self._seed_rows(indices, [seeds[index] for index in indices], size)
+
+    def _seed_rows(self, indices: list[int], seeds: list[int], size: int) -> None:
+        """Seed streams with integers of at most so many bytes."""
+        if has_native_pool():
+            from fmugym import _native
+
+            words = np.frombuffer(b"".join([s.to_bytes(size, "little") for s in seeds]), "<u4")
+            _native.seed(self.states, np.array(indices), words.astype(np.uint32).tobytes())
             return
-        for index in indices.tolist():
-            if seeds[index] is not None:
-                self._renew(index, seeds[index])
-                self.used[index] = self._length
+        for index, seed in zip(indices, seeds, strict=True):
+            self.states[index] = _row_of(np.random.PCG64(seed).state)
 
-    def fractions(self, indices: npt.NDArray[np.intp]) -> FloatArray:
-        """Draw the uniform numbers of one episode for some environments, shape (draws, M)."""
-        used = self.used[indices]
-        if used.max() == self._length:
-            self._refill(indices[used == self._length])
-            used = self.used[indices]
-        self.used[indices] = used + 1
-        fractions: FloatArray = self.block[indices, used].T
-        return fractions
+    def draw(self, plan: EpisodePlan, indices: IndexArray) -> FloatArray:
+        """Draw one episode for each of some environments.
 
-    def _refill(self, indices: npt.NDArray[np.intp]) -> None:
-        """Draw new blocks for environments whose blocks are used up."""
-        generators, rows = self._generators, self._rows
-        for index in indices.tolist():
-            (generators[index] or self._unseeded(index)).random(out=rows[index])
-        self.used[indices] = 0
+        Returns:
+            The values in the order of ``plan.drawn_names``, shape (draws, M).
+
+        Raises:
+            ConfigError: If a drawn value does not fit its variable's type.
+        """
+        if not self._all_seeded:
+            self._seed_others(range(len(self._seeds)))
+            self._all_seeded = True
+        draws = self.native_draws(plan)
+        values = np.empty((len(plan.drawn_names), len(indices)))
+        if draws is not None:
+            draws.take(self.states, indices, values)
+            return values
+        for place, index in enumerate(indices.tolist()):
+            with self._as_generator(index) as generator:
+                values[:, place] = plan.draw_values(generator)
+        return values
+
+    def native_draws(self, plan: EpisodePlan) -> Draws | None:
+        """The draws of a plan for the C extension; None if it cannot draw them."""
+        if self._latest is None or self._latest[0] is not plan:
+            self._latest = plan, _native_draws(plan)
+        return self._latest[1]
+
+    @contextmanager
+    def _as_generator(self, index: int) -> Iterator[np.random.Generator]:
+        """Lend a generator that goes on with a stream."""
+        bits: Any = self._generator.bit_generator
+        bits.state = _state_of(self.states[index].tolist())
+        try:
+            yield self._generator
+        finally:
+            self.states[index] = _row_of(bits.state)
 
 
-def _take_back(bits: Any, count: int) -> None:
-    """Go back in a stream, but keep the unused half that an integer draw has left over."""
-    before = bits.state
-    bits.advance(-count)
-    if before["has_uint32"]:
-        bits.state = {**before, "state": bits.state["state"]}
+def _row_of(state: Any) -> list[int]:
+    inner = state["state"]
+    numbers = [*divmod(inner["state"], _WORD), *divmod(inner["inc"], _WORD)]
+    return [*numbers, state["has_uint32"], state["uinteger"]]
+
+
+def _state_of(row: list[int]) -> dict[str, Any]:
+    high, low, increment_high, increment_low, has_half, half = row
+    numbers = {"state": high * _WORD + low, "inc": increment_high * _WORD + increment_low}
+    return {"bit_generator": "PCG64", "state": numbers, "has_uint32": has_half, "uinteger": half}
+
+
+def given_draws(plan: EpisodePlan) -> Draws:
+    """The draws of a plan as values that are drawn before the C extension needs them."""
+    return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.drawn_names), plan.drawn_rows)
+
+
+def _native_draws(plan: EpisodePlan) -> Draws | None:
+    recipes = plan.recipes if has_native_pool() else None
+    if recipes is None:
+        return None
+    if not _standard_normal() and any(recipe.kind == "normal" for recipe in recipes):
+        return None
+    return _draws(recipes, plan.drawn_rows)
+
+
+def _draws(recipes: Sequence[Recipe], rows: Sequence[int]) -> Draws:
+    from fmugym import _native
+
+    known = _native.distributions()
+    counts = [len(recipe.numbers) for recipe in recipes]
+    firsts = np.cumsum([0, *counts])[:-1]
+    columns = [known.index(recipe.kind) for recipe in recipes], rows, firsts, counts
+    table = np.array(columns, np.int64).reshape(4, -1).T
+    numbers = np.array([number for recipe in recipes for number in recipe.numbers])
+    return _native.Draws(table.tobytes(), numbers.tobytes(), _standard_normal())
+
+
+@functools.cache
+def _standard_normal() -> int:
+    """The address of numpy's function for normal distributions; 0 if it cannot be found.
+
+    numpy's documentation, "Extending via CFFI", finds the functions of its ``distributions.h`` in
+    the same way. It keeps the values those of the numpy at hand.
+    """
+    try:
+        library = ctypes.CDLL(np.random._generator.__file__)
+        function = library.random_standard_normal
+    except (AttributeError, OSError):  # the system does not export it
+        return 0
+    return ctypes.cast(function, ctypes.c_void_p).value or 0

@@ -13,8 +13,8 @@ typedef struct {
 
 static const ItemType types[] = {
     [ITEM_FLOAT64] = {"float64", "d", 8}, [ITEM_FLOAT32] = {"float32", "f", 4},
-    [ITEM_INT64] = {"int64", "lq", 8},    [ITEM_INT8] = {"int8", "b", 1},
-    [ITEM_BOOLEAN] = {"bool", "?", 1},
+    [ITEM_INT64] = {"int64", "lq", 8},    [ITEM_UINT64] = {"uint64", "LQ", 8},
+    [ITEM_INT8] = {"int8", "b", 1},       [ITEM_BOOLEAN] = {"bool", "?", 1},
 };
 
 static bool has_type(const Py_buffer *buffer, const ItemType *type) {

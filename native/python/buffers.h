@@ -8,7 +8,14 @@
 
 #include <stdbool.h>
 
-typedef enum { ITEM_FLOAT64, ITEM_FLOAT32, ITEM_INT64, ITEM_INT8, ITEM_BOOLEAN } Item;
+typedef enum {
+    ITEM_FLOAT64,
+    ITEM_FLOAT32,
+    ITEM_INT64,
+    ITEM_UINT64,
+    ITEM_INT8,
+    ITEM_BOOLEAN
+} Item;
 
 typedef enum {
     COPIED,   /* any strides and alignment; the values are copied */

@@ -22,18 +22,28 @@ static PyObject *echo_to(PyObject *module, PyObject *memory) {
     Py_RETURN_NONE;
 }
 
-static PyObject *operations(PyObject *module, PyObject *unused) {
-    PyObject *names = PyTuple_New(NUMBER_OF_OPERATIONS);
+static PyObject *tuple_of(const char *const *texts, Py_ssize_t count) {
+    PyObject *names = PyTuple_New(count);
 
-    (void)module;
-    (void)unused;
-    for (int i = 0; names != NULL && i < NUMBER_OF_OPERATIONS; i++) {
-        PyObject *name = decode(operation_names[i]);
+    for (Py_ssize_t i = 0; names != NULL && i < count; i++) {
+        PyObject *name = decode(texts[i]);
         if (name == NULL || PyTuple_SetItem(names, i, name) < 0) {
             Py_CLEAR(names);
         }
     }
     return names;
+}
+
+static PyObject *operations(PyObject *module, PyObject *unused) {
+    (void)module;
+    (void)unused;
+    return tuple_of(operation_names, NUMBER_OF_OPERATIONS);
+}
+
+static PyObject *distributions(PyObject *module, PyObject *unused) {
+    (void)module;
+    (void)unused;
+    return tuple_of(kind_names, NUMBER_OF_KINDS);
 }
 
 static PyObject *statistics(PyObject *module, PyObject *unused) {
@@ -49,6 +59,8 @@ static PyObject *statistics(PyObject *module, PyObject *unused) {
 
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
+    {"distributions", distributions, METH_NOARGS, NULL},
+    {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
     {NULL, NULL, 0, NULL},
@@ -84,6 +96,7 @@ PyMODINIT_FUNC PyInit__native(void) {
     }
     pool_prepare_process();
     if (!find_error() || !add_type(module, &access_type, &access_spec) ||
+        !add_type(module, &draws_type, &draws_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         !add_type(module, &snapshot_type, &snapshot_spec) ||
         PyModule_AddIntConstant(module, "MOST_INSTRUCTIONS", PROGRAM_LENGTH) < 0) {

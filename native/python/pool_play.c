@@ -5,44 +5,29 @@
 
 #include "python.h"
 
-enum { STARTS, BLOCK, USED, LOW, WIDTH, ROWS, COUNTS, ENDED, PLAY_BUFFERS };
+enum { STARTS, STATES, COUNTS, ENDED, PLAY_BUFFERS };
 
 static const char *const PLAYING = "fmugym._native.playing";
-static const char *const STREAMS = "fmugym._native.streams";
 
 /* The result of prepare_play. It never changes; the next call replaces it as a whole. */
 typedef struct {
     Play play;
     Py_buffer buffers[PLAY_BUFFERS];
     PyObject *start; /* the Access of the variables set before initialization */
-    int64_t *rows;   /* a copy, because these values index memory */
+    PyObject *draws;
 } Playing;
-
-/* The result of set_streams. */
-typedef struct {
-    PyObject *generators, *capsules; /* these keep the targets of the streams alive */
-    const Stream *streams[];
-} Streams;
 
 static void playing_free(Playing *playing) {
     for (int i = 0; i < PLAY_BUFFERS; i++) {
         release_buffer(&playing->buffers[i]);
     }
     Py_XDECREF(playing->start);
-    free(playing->rows);
+    Py_XDECREF(playing->draws);
     free(playing);
 }
 
 static void playing_dealloc(PyObject *capsule) {
     playing_free(PyCapsule_GetPointer(capsule, PLAYING));
-}
-
-static void streams_dealloc(PyObject *capsule) {
-    Streams *streams = PyCapsule_GetPointer(capsule, STREAMS);
-
-    Py_XDECREF(streams->generators);
-    Py_XDECREF(streams->capsules);
-    free(streams);
 }
 
 static void replace_reference(PyObject **place, PyObject *object) {
@@ -100,28 +85,17 @@ static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObjec
                        (Py_ssize_t)self->pool.settings.count);
 }
 
-static bool take_draws(PyPool *self, Playing *playing, PyObject *group) {
-    static char *names[] = {"block", "used", "low", "width", "rows", NULL};
+static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject *states) {
     const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    const Py_ssize_t shape[] = {n, ANY_LENGTH, ANY_LENGTH};
-    Py_buffer *b = playing->buffers;
-    PyObject *block, *used, *low, *width, *rows;
 
-    if (!parse_group(group, "$OOOOO:draws", names, &block, &used, &low, &width, &rows) ||
-        !take_buffer(block, &b[BLOCK], WRITTEN, "block", ITEM_FLOAT64, 3, shape)) {
+    if (!PyObject_TypeCheck(draws, draws_type)) {
+        PyErr_SetString(PyExc_TypeError, "expected Draws");
         return false;
     }
-    const Py_ssize_t draws = b[BLOCK].shape[2];
-    playing->play.draws.episodes = (size_t)b[BLOCK].shape[1];
-    playing->play.draws.draws = (size_t)draws;
-    if (draws > 0 && b[BLOCK].shape[1] == 0) {
-        PyErr_SetString(PyExc_ValueError, "block must have room for an episode");
-        return false;
-    }
-    return take_vector(used, &b[USED], WRITTEN, "used", ITEM_INT64, n) &&
-           take_vector(low, &b[LOW], IN_PLACE, "low", ITEM_FLOAT64, draws) &&
-           take_vector(width, &b[WIDTH], IN_PLACE, "width", ITEM_FLOAT64, draws) &&
-           take_vector(rows, &b[ROWS], IN_PLACE, "rows", ITEM_INT64, draws);
+    playing->draws = Py_NewRef(draws);
+    playing->play.draws = &((PyDraws *)draws)->draws;
+    return take_matrix(states, &playing->buffers[STATES], WRITTEN, "states", ITEM_UINT64, n,
+                       STREAM_NUMBERS);
 }
 
 static bool take_episodes(PyPool *self, Playing *playing, PyObject *group) {
@@ -139,18 +113,6 @@ static bool take_episodes(PyPool *self, Playing *playing, PyObject *group) {
            take_vector(ended, &b[ENDED], WRITTEN, "ended", ITEM_BOOLEAN, n);
 }
 
-static bool copy_rows(Playing *playing) {
-    const size_t size = playing->play.draws.draws * sizeof *playing->rows;
-
-    playing->rows = malloc(size + 1);
-    if (playing->rows == NULL) {
-        PyErr_NoMemory();
-        return false;
-    }
-    memcpy(playing->rows, playing->buffers[ROWS].buf, size);
-    return true;
-}
-
 static void settle_play(PyPool *self, Playing *playing) {
     const Py_buffer *b = playing->buffers;
     const Settings *s = &self->pool.settings;
@@ -159,11 +121,7 @@ static void settle_play(PyPool *self, Playing *playing) {
     play->count = s->count;
     play->input_rows = self->buffers[INPUTS].buf;
     play->start_values = b[STARTS].buf;
-    play->draws.block = b[BLOCK].buf;
-    play->draws.used = b[USED].buf;
-    play->draws.low = b[LOW].buf;
-    play->draws.width = b[WIDTH].buf;
-    play->draws.rows = playing->rows;
+    play->streams = b[STATES].buf;
     play->step_counts = b[COUNTS].buf;
     play->ended = b[ENDED].buf;
     play->source = (Source){
@@ -179,15 +137,13 @@ static void settle_play(PyPool *self, Playing *playing) {
 }
 
 static bool is_sound(const Play *play) {
-    bool sound = play->judgement.length > 0 && program_is_sound(&play->inputs, &play->source) &&
+    const bool sound =
+        play->judgement.length > 0 && program_is_sound(&play->inputs, &play->source) &&
                  program_is_sound(&play->judgement, &play->source) &&
                  play->inputs.number_of_results == play->source.number_of_inputs &&
-                 play->judgement.number_of_results == 3;
+                 play->judgement.number_of_results == 3 &&
+        draws_fit(play->draws, play->source.number_of_parameters);
 
-    for (size_t i = 0; i < play->draws.draws; i++) {
-        const int64_t row = play->draws.rows[i];
-        sound = sound && row >= 0 && (size_t)row < play->source.number_of_parameters;
-    }
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a program does not fit the pool");
     }
@@ -196,22 +152,21 @@ static bool is_sound(const Play *play) {
 
 static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
     static char *names[] = {"start",   "start_values", "inputs",   "judgement",
-                            "actions", "draws",        "episodes", NULL};
-    PyObject *start, *values, *inputs, *judgement, *draws, *episodes;
+                            "actions", "draws",        "states", "episodes", NULL};
+    PyObject *start, *values, *inputs, *judgement, *draws, *states, *episodes;
     long long lowest, highest;
 
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "$OOO!O!(LL)O!O!:prepare_play", names, &start,
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "$OOO!O!(LL)OOO!:prepare_play", names, &start,
                                      &values, &PyTuple_Type, &inputs, &PyTuple_Type, &judgement,
-                                     &lowest, &highest, &PyDict_Type, &draws, &PyDict_Type,
-                                     &episodes)) {
+                                     &lowest, &highest, &draws, &states, &PyDict_Type, &episodes)) {
         return false;
     }
     playing->play.lowest_action = lowest;
     playing->play.highest_action = highest;
     if (!take_starts(self, playing, start, values) ||
         !take_program(inputs, &playing->play.inputs) ||
-        !take_program(judgement, &playing->play.judgement) || !take_draws(self, playing, draws) ||
-        !take_episodes(self, playing, episodes) || !copy_rows(playing)) {
+        !take_program(judgement, &playing->play.judgement) || !take_draws(self, playing, draws, states) ||
+        !take_episodes(self, playing, episodes)) {
         return false;
     }
     settle_play(self, playing);
@@ -234,67 +189,6 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
         return NULL;
     }
     replace_reference(&self->playing, capsule);
-    Py_RETURN_NONE;
-}
-
-/* Streams */
-
-static Streams *streams_new(Py_ssize_t count) {
-    Streams *streams = calloc(1, sizeof *streams + (size_t)count * sizeof *streams->streams);
-
-    if (streams == NULL) {
-        PyErr_NoMemory();
-        return NULL;
-    }
-    streams->capsules = PyTuple_New(count);
-    return streams;
-}
-
-static bool take_stream(Streams *streams, Py_ssize_t index) {
-    PyObject *generator = PyTuple_GetItem(streams->generators, index);
-    PyObject *capsule = PyObject_GetAttrString(generator, "capsule");
-    const Stream *stream = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, "BitGenerator");
-
-    if (capsule != NULL) {
-        PyTuple_SetItem(streams->capsules, index, capsule);
-    }
-    streams->streams[index] = stream;
-    return stream != NULL;
-}
-
-static bool take_streams(Streams *streams, PyObject *generators, Py_ssize_t count) {
-    streams->generators = PySequence_Tuple(generators);
-    if (streams->generators == NULL || streams->capsules == NULL) {
-        return false;
-    }
-    if (PyTuple_Size(streams->generators) != count) {
-        PyErr_Format(PyExc_ValueError, "there must be %zd bit generators, not %zd", count,
-                     PyTuple_Size(streams->generators));
-        return false;
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (!take_stream(streams, i)) {
-            return false;
-        }
-    }
-    return true;
-}
-
-PyObject *py_set_streams(PyObject *object, PyObject *generators) {
-    PyPool *self = (PyPool *)object;
-    const Py_ssize_t count = (Py_ssize_t)self->pool.settings.count;
-    Streams *streams = streams_new(count);
-    PyObject *capsule = streams == NULL ? NULL : PyCapsule_New(streams, STREAMS, streams_dealloc);
-
-    if (capsule == NULL) {
-        free(streams);
-        return NULL;
-    }
-    if (!take_streams(streams, generators, count)) {
-        Py_DECREF(capsule);
-        return NULL;
-    }
-    replace_reference(&self->streams, capsule);
     Py_RETURN_NONE;
 }
 
@@ -322,16 +216,15 @@ static bool take_arrays(PyPool *self, const Play *play, PyObject *const *args, P
            take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
            take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
            take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)play->draws.draws, n);
+                       (Py_ssize_t)play->draws->count, n);
 }
 
-static void settle_turn(PyPool *self, const Playing *playing, const Streams *streams, PyTurn *t) {
+static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
     const Py_buffer *b = t->buffers;
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
 
     t->turn = (Turn){
         .play = &playing->play,
-        .streams = streams == NULL ? NULL : streams->streams,
         .actions = b[ACTIONS].buf,
         .rewards = b[REWARDS].buf,
         .terminated = b[TERMINATED].buf,
@@ -371,16 +264,13 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
                : NULL;
 }
 
-static PyObject *play_with(PyPool *self, PyObject *playing_capsule, PyObject *streams_capsule,
-                           PyObject *const *args) {
-    const Playing *playing = PyCapsule_GetPointer(playing_capsule, PLAYING);
-    const Streams *streams =
-        streams_capsule == NULL ? NULL : PyCapsule_GetPointer(streams_capsule, STREAMS);
+static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     PyTurn t = {.bad_action = false};
     PyObject *result = NULL;
 
     if (take_arrays(self, &playing->play, args, &t)) {
-        settle_turn(self, playing, streams, &t);
+        settle_turn(self, playing, &t);
         result = play_turn(self, &t);
     }
     for (int i = 0; i < TURN_BUFFERS; i++) {
@@ -389,26 +279,18 @@ static PyObject *play_with(PyPool *self, PyObject *playing_capsule, PyObject *st
     return result;
 }
 
-static bool is_ready(const PyPool *self) {
-    const Playing *playing =
-        self->playing == NULL ? NULL : PyCapsule_GetPointer(self->playing, PLAYING);
-    const bool ready = playing != NULL && (self->streams != NULL || playing->play.draws.draws == 0);
-
-    if (!ready) {
-        PyErr_SetString(PyExc_ValueError, "play was not prepared, or has no streams");
-    }
-    return ready;
-}
-
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, TURN_BUFFERS) || !is_ready(self)) {
+    if (!has_arguments(nargs, TURN_BUFFERS)) {
         return NULL;
     }
-    PyObject *playing = Py_NewRef(self->playing), *streams = Py_XNewRef(self->streams);
-    PyObject *result = play_with(self, playing, streams, args);
+    if (self->playing == NULL) {
+        PyErr_SetString(PyExc_ValueError, "play was not prepared");
+        return NULL;
+    }
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = play_with(self, playing, args);
     Py_DECREF(playing);
-    Py_XDECREF(streams);
     return result;
 }

@@ -185,7 +185,6 @@ static void pool_dealloc(PyObject *object) {
     free(self->categories);
     free(self->strings);
     Py_XDECREF(self->playing);
-    Py_XDECREF(self->streams);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -198,7 +197,7 @@ typedef struct {
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
-    int restores, rebuilds, reloads;
+    int restores, rebuilds, reloads, one_initialization;
     long long substeps, warm_up_steps, retries;
 } Arguments;
 
@@ -226,11 +225,13 @@ static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
-                            "rebuilds",   "reloads",       NULL};
+                            "rebuilds",   "reloads",       "one_initialization",
+                            "pace",       NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLppp:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLpppp(dLL):experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
-                       &a->retries, &a->restores, &a->rebuilds, &a->reloads);
+                       &a->retries, &a->restores, &a->rebuilds, &a->reloads,
+                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -379,6 +380,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->restores = s->can_save && a->restores;
     s->rebuilds = a->rebuilds;
     s->reloads = a->reloads;
+    s->one_initialization = a->one_initialization;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
     s->num_observed = (size_t)a->num_observed;
@@ -456,7 +458,6 @@ static PyMethodDef methods[] = {
     FAST("step_or_reset", py_step_or_reset),
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
-    {"set_streams", py_set_streams, METH_O, NULL},
     FAST("play", py_play),
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),

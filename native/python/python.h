@@ -20,6 +20,11 @@ typedef struct {
 } PyAccess;
 
 typedef struct {
+    PyObject_HEAD Draws draws;
+    PyObject *table, *numbers; /* the memory of the draws, of type bytes */
+} PyDraws;
+
+typedef struct {
     PyObject_HEAD Snapshot *snapshot;
     PyObject *pool; /* keeps the memory of the pool alive, but not its instances */
 } PySnapshot;
@@ -35,13 +40,12 @@ typedef struct {
     const char **paths, **categories;
     StringValue *strings;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
-    PyObject *streams;
 } PyPool;
 
-extern PyTypeObject *access_type, *snapshot_type;
+extern PyTypeObject *access_type, *draws_type, *snapshot_type;
 extern PyObject *closed_error; /* raised by calls of a closed pool */
 
-extern PyType_Spec access_spec, snapshot_spec, pool_spec;
+extern PyType_Spec access_spec, draws_spec, snapshot_spec, pool_spec;
 
 /* The table of an FMI version; NULL with an exception if there is none. */
 const Fmi *fmi_of(int version);
@@ -88,8 +92,10 @@ PyObject *py_uses_states(PyObject *object, PyObject *unused);
 PyObject *py_save(PyObject *object, PyObject *unused);
 PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
+/* A function of the module */
+PyObject *py_seed(PyObject *module, PyObject *args);
+
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
-PyObject *py_set_streams(PyObject *object, PyObject *generators);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 #endif

@@ -25,6 +25,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -98,6 +99,7 @@ class ProcessPool(CountedPool):
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
         setups = _share_out(replace(setup, native=native, threads=threads), self.workers)
+        self._attendant = Attendant.of(spec, log)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
 
@@ -107,6 +109,15 @@ class ProcessPool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``; if a worker dies in it, a new worker tries again."""
+        if self._attendant is None:
+            self._reset_all(variables, values, mask)
+        else:
+            self._attendant.reset(self, self._reset_all, variables, values, mask)
+        return self.outputs, self.statuses
+
+    def _reset_all(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> None:
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
@@ -117,7 +128,6 @@ class ProcessPool(CountedPool):
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
             self._crew.note_lost()
-        return self.outputs, self.statuses
 
     def _as_mask(self, mask: MaskArray | None) -> MaskArray:
         if mask is None:
@@ -338,4 +348,10 @@ def _share_out(setup: Setup, workers: int) -> list[Setup]:
     """Give each worker a block of the instances, the blocks as equal as can be."""
     bounds = [setup.num_instances * index // workers for index in range(workers + 1)]
     blocks = itertools.starmap(slice, itertools.pairwise(bounds))
-    return [replace(setup, block=block, number=number) for number, block in enumerate(blocks)]
+    specs = (
+        replace(setup.spec, turn=(number, workers), licence_wait=0.0) for number in range(workers)
+    )
+    return [
+        replace(setup, block=block, number=number, spec=spec)
+        for number, (block, spec) in enumerate(zip(blocks, specs, strict=True))
+    ]

@@ -18,6 +18,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import fault_rates
+from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
@@ -49,7 +50,7 @@ class BatchEngine(Engine):
         self.env = env
         self._n = num_envs
         self._pool = env._open_pool("a vector environment")
-        self._streams = EpisodeStreams(num_envs, env._plan)
+        self._streams = EpisodeStreams(num_envs)
         self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
         self._foreign = np.zeros(num_envs, np.bool_)
@@ -237,7 +238,7 @@ class BatchEngine(Engine):
     def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
         for index in indices.tolist():
             if statuses[index] > Status.WARNING:
-                raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+                raise failed_reset(f"environment {index}: {self._pool.failure(index)}")
 
     def _draw(self, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
         """Draw episodes into the rows of the parameters and variables.
@@ -246,11 +247,7 @@ class BatchEngine(Engine):
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env._plan
-        if plan.num_uniform is not None and plan.num_uniform == self._streams.num_draws:
-            drawn = plan.scaled(self._streams.fractions(indices))
-            self._place(plan.drawn_names, drawn, indices)
-        else:
-            self._place_each(indices, plan)
+        self._place(plan.drawn_names, self._streams.draw(plan, indices), indices)
         if not default or self._any_foreign:
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
@@ -262,12 +259,6 @@ class BatchEngine(Engine):
         if default:
             return self._start_values
         return np.stack([self._parameters[variable.name] for variable in plan.model_variables])
-
-    def _place_each(self, indices: IndexArray, plan: EpisodePlan) -> None:
-        episodes = [plan.draw(self._streams.generator(index)) for index in indices.tolist()]
-        for name in plan.drawn_names:
-            values = [{**e.parameters, **e.variables}[name] for e in episodes]
-            self._place([name], [values], indices)
 
     def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
         for name, value in zip(names, values, strict=True):

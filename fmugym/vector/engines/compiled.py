@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
 from fmugym.vector.hooks.trace import trace_hooks
 from fmugym.vector.infos import not_finite
+from fmugym.vector.streams import given_draws
 from fmugym.vector.views import copied
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -65,11 +66,6 @@ def _require_playable(env: FMUEnv) -> None:
     """Refuse environments that the native pool cannot play, whatever their hooks are."""
     if not env._open_pool("a vector environment").can_play:
         raise UntraceableError("the pool is not the native one")
-    if env._plan.num_uniform is None:
-        raise UntraceableError(
-            "its episodes have draws other than uniform ones of Real variables: "
-            + ", ".join(map(repr, env._plan.drawn_names))
-        )
 
 
 def _require_same(env: FMUEnv, batch: Readings, programs: tuple[Program, Program]) -> None:
@@ -116,7 +112,6 @@ class CompiledEngine(BatchEngine):
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
         self._shape = num_envs, env._output_count
-        self._stream_version = -1
         self._prepare(programs)
 
     def _prepare(self, programs: tuple[Program, Program] | None) -> None:
@@ -124,19 +119,20 @@ class CompiledEngine(BatchEngine):
         plan, streams = self.env._plan, self._streams
         self._programs = programs
         self._prepared = False
-        if programs is None or plan.num_uniform is None or plan.num_uniform != streams.num_draws:
+        if programs is None:
             return
         space: Any = self.env.action_space
         self._may_overflow = not is_always_finite(programs[1], _REWARD)
         self._names = plan.drawn_names
-        rows = [plan.parameter_names.index(name) for name in self._names]
-        self._drawn_shape = len(rows), self._n
+        self._drawn_shape = len(self._names), self._n
+        draws = streams.native_draws(plan)
+        self._draws_ahead = draws is None
         self._play = self._pool.prepare_play(
             plan.model_variables,
             programs,
             (int(space.start), int(space.start + space.n - 1)),
             self._start_values,
-            (streams.block, streams.used, *plan.limits, np.array(rows, np.int64)),
+            (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
         )
         self._play_with_resets = self._pool.watched(self._play)
@@ -160,16 +156,6 @@ class CompiledEngine(BatchEngine):
             programs = None
         self._prepare(programs)
 
-    def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
-    ) -> tuple[Any, dict[str, Any]]:
-        """See ``Engine.reset``."""
-        result = super().reset(mask, seeds, options)
-        if self._stream_version != self._streams.version:
-            self._pool.set_streams(self._streams.bit_generators())
-            self._stream_version = self._streams.version
-        return result
-
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         if self._any_foreign or not self._prepared:
@@ -183,6 +169,9 @@ class CompiledEngine(BatchEngine):
         arrays = observations, rewards, terminated, truncated
         drawn = np.empty(self._drawn_shape)
         self.has_moved = False
+        if resetting is not None and self._draws_ahead:
+            actions = self._checked(actions)  # a refused step draws nothing
+            drawn[:, resetting] = self._streams.draw(self.env._plan, np.flatnonzero(resetting))
         play = self._play if resetting is None else self._play_with_resets
         try:
             troubled, ended = play(actions, *arrays, drawn)

@@ -1,0 +1,113 @@
+"""What to do when an FMU gets no licence: wait for one, or give up with its words."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import Final, TypeVar
+
+from fmugym.errors import FMUGymError, LicenceError, SimulationError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import Pool
+
+__all__ = ["Patience", "failed_reset", "licence_errors", "require_licence", "speaks_of_licence"]
+
+R = TypeVar("R")
+
+_WORDS: Final = re.compile(
+    r"licen[cs]|\bseats?\b|\bcheck(ed|ing)?[ -]?out\b|flex(lm|net)|\blmgrd\b|\bdongles?\b"
+    r"|codemeter",
+    re.IGNORECASE,
+)
+"""What FMUs call a licence."""
+
+_REFUSAL: Final = re.compile(
+    r"\b(no|not|none|all|cannot|unable|without)\b|n't|fail|error|denied|deny|expired|taken|in use"
+    r"|unavailable|invalid|missing|exceed|refuse|reject|limit|lost|wait",
+    re.IGNORECASE,
+)
+"""How they say that they did not get it; most tell of a licence that they got, too."""
+
+_SAID: Final = re.compile(r"(?:the FMU said|its last lines|it printed): ")
+"""What comes before an FMU's words in the texts of errors."""
+
+_FIRST_PAUSE: Final = 0.5
+_LONGEST_PAUSE: Final = 10.0
+"""Seconds between two attempts to get a licence."""
+
+
+def speaks_of_licence(text: str) -> bool:
+    """Whether the FMU's words in the text of an error say that it got no licence."""
+    said = _SAID.split(text, maxsplit=1)[1:]
+    lines = " | ".join(said).split(" | ")
+    return any(_WORDS.search(line) and _REFUSAL.search(line) for line in lines)
+
+
+@contextlib.contextmanager
+def licence_errors() -> Iterator[None]:
+    """Turn errors in this context whose FMU speaks of a licence into a ``LicenceError``.
+
+    It is meant for calls that make or initialize instances.
+    """
+    try:
+        yield
+    except FMUGymError as error:
+        if isinstance(error, LicenceError) or not speaks_of_licence(str(error)):
+            raise
+        raise LicenceError(str(error)) from None
+
+
+def require_licence(pool: Pool) -> None:
+    """Look at the first instance of a pool after a reset.
+
+    Raises:
+        LicenceError: If it got no licence.
+    """
+    if pool.statuses[0] > Status.WARNING:
+        failure = pool.failure(0)
+        if speaks_of_licence(failure):
+            raise LicenceError(failure)
+
+
+def failed_reset(failure: str) -> SimulationError:
+    """Make the error for a reset that failed: a ``LicenceError`` if the FMU speaks of a licence."""
+    return LicenceError(failure) if speaks_of_licence(failure) else SimulationError(failure)
+
+
+class Patience:
+    """How long to wait for a licence that was refused.
+
+    Args:
+        seconds: The real time in seconds; 0 to give up at once.
+        log: Is told of each refusal.
+    """
+
+    def __init__(self, seconds: float, log: logging.Logger) -> None:
+        self._seconds, self._log = seconds, log
+
+    def call(self, function: Callable[[], R]) -> R:
+        """Call a function, again and again while it raises a ``LicenceError``.
+
+        Raises:
+            LicenceError: If the time is over. The text says how long this has waited.
+        """
+        deadline, pause = time.monotonic() + self._seconds, _FIRST_PAUSE
+        while True:
+            try:
+                return function()
+            except LicenceError as error:
+                left = deadline - time.monotonic()
+                if left <= 0.0:
+                    raise LicenceError(f"{error}; {self._advice}") from None
+                self._log.warning("%s; waiting for %.0f s more at most (licence_wait)", error, left)
+            time.sleep(min(pause, left))
+            pause = min(2.0 * pause, _LONGEST_PAUSE)
+
+    @property
+    def _advice(self) -> str:
+        if self._seconds:
+            return f"no licence came within {self._seconds:g} s (licence_wait)"
+        return "config key 'licence_wait' gives the seconds to wait for a licence"

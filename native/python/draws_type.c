@@ -1,0 +1,158 @@
+/* The type Draws: the distributions of an episode. Also the seeding of random streams. */
+
+#include "python.h"
+
+PyTypeObject *draws_type;
+
+static bool take_memory(PyDraws *self, PyObject *table, PyObject *numbers) {
+    const Py_ssize_t size = PyBytes_Size(table), length = PyBytes_Size(numbers);
+
+    self->table = Py_NewRef(table);
+    self->numbers = Py_NewRef(numbers);
+    self->draws.draws = (const Draw *)PyBytes_AsString(table);
+    self->draws.numbers = (const double *)PyBytes_AsString(numbers);
+    self->draws.count = (size_t)size / sizeof(Draw);
+    if ((size_t)size % sizeof(Draw) != 0 || (size_t)length % sizeof(double) != 0 ||
+        !draws_are_sound(&self->draws, (size_t)length / sizeof(double))) {
+        PyErr_SetString(PyExc_ValueError, "the numbers do not fit the kinds of distributions");
+        return false;
+    }
+    return true;
+}
+
+static PyObject *draws_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
+    PyObject *table, *numbers;
+    unsigned long long address;
+
+    (void)kwargs;
+    if (!PyArg_ParseTuple(args, "SSK", &table, &numbers, &address)) {
+        return NULL;
+    }
+    allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
+    PyDraws *self = (PyDraws *)allocate(type, 0);
+    if (self == NULL) {
+        return NULL;
+    }
+    self->draws.standard_normal = (StandardNormal *)(uintptr_t)address;
+    if (!take_memory(self, table, numbers)) {
+        Py_DECREF(self);
+        return NULL;
+    }
+    return (PyObject *)self;
+}
+
+static void draws_dealloc(PyObject *object) {
+    PyTypeObject *type = Py_TYPE(object);
+    freefunc release_memory = (freefunc)PyType_GetSlot(type, Py_tp_free);
+
+    Py_XDECREF(((PyDraws *)object)->table);
+    Py_XDECREF(((PyDraws *)object)->numbers);
+    release_memory(object);
+    Py_DECREF(type);
+}
+
+/* Streams, and which of them to use */
+
+typedef struct {
+    Py_buffer states, indices;
+} Chosen;
+
+static void release_chosen(Chosen *chosen) {
+    release_buffer(&chosen->states);
+    release_buffer(&chosen->indices);
+}
+
+static bool take_chosen(PyObject *states, PyObject *indices, Chosen *chosen) {
+    return take_matrix(states, &chosen->states, WRITTEN, "states", ITEM_UINT64, ANY_LENGTH,
+                       STREAM_NUMBERS) &&
+           take_vector(indices, &chosen->indices, IN_PLACE, "indices", ITEM_INT64, ANY_LENGTH);
+}
+
+/* The array of the indices may change at any time, so each is checked when it is used. */
+static Stream *stream_at(const Chosen *chosen, Py_ssize_t place) {
+    const int64_t index = ((const int64_t *)chosen->indices.buf)[place];
+
+    if (index < 0 || index >= chosen->states.shape[0]) {
+        PyErr_Format(PyExc_IndexError, "there is no stream %lld", (long long)index);
+        return NULL;
+    }
+    return (Stream *)chosen->states.buf + index;
+}
+
+static bool seed_chosen(const Chosen *chosen, PyObject *words) {
+    const Py_ssize_t count = chosen->indices.shape[0];
+    const size_t size = (size_t)PyBytes_Size(words) / sizeof(uint32_t);
+    const size_t width = count == 0 ? 0 : size / (size_t)count;
+    const uint32_t *seed = (const uint32_t *)PyBytes_AsString(words);
+
+    if ((size_t)PyBytes_Size(words) != (size_t)count * width * sizeof *seed) {
+        PyErr_SetString(PyExc_ValueError, "all seeds must have the same number of 32-bit words");
+        return false;
+    }
+    for (Py_ssize_t i = 0; i < count; i++, seed += width) {
+        Stream *stream = stream_at(chosen, i);
+        if (stream == NULL) {
+            return false;
+        }
+        stream_seed(stream, seed, width);
+    }
+    return true;
+}
+
+PyObject *py_seed(PyObject *module, PyObject *args) {
+    PyObject *states, *indices, *words;
+    Chosen chosen = {0};
+
+    (void)module;
+    if (!PyArg_ParseTuple(args, "OOS:seed", &states, &indices, &words)) {
+        return NULL;
+    }
+    const bool done = take_chosen(states, indices, &chosen) && seed_chosen(&chosen, words);
+    release_chosen(&chosen);
+    return done ? Py_NewRef(Py_None) : NULL;
+}
+
+static bool draw_chosen(const Draws *draws, const Chosen *chosen, const Py_buffer *values) {
+    const Py_ssize_t count = chosen->indices.shape[0];
+
+    for (Py_ssize_t i = 0; i < count; i++) {
+        Stream *stream = stream_at(chosen, i);
+        if (stream == NULL) {
+            return false;
+        }
+        draws_take(draws, stream, (double *)values->buf + i, (size_t)count);
+    }
+    return true;
+}
+
+static PyObject *draws_take_all(PyObject *object, PyObject *args) {
+    const Draws *draws = &((PyDraws *)object)->draws;
+    PyObject *states, *indices, *array;
+    Chosen chosen = {0};
+    Py_buffer values = {0};
+
+    if (!PyArg_ParseTuple(args, "OOO:take", &states, &indices, &array)) {
+        return NULL;
+    }
+    const bool done = take_chosen(states, indices, &chosen) &&
+                      take_matrix(array, &values, WRITTEN, "values", ITEM_FLOAT64,
+                                  (Py_ssize_t)draws->count, chosen.indices.shape[0]) &&
+                      draw_chosen(draws, &chosen, &values);
+    release_buffer(&values);
+    release_chosen(&chosen);
+    return done ? Py_NewRef(Py_None) : NULL;
+}
+
+static PyMethodDef methods[] = {
+    {"take", draws_take_all, METH_VARARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyType_Slot slots[] = {
+    {Py_tp_new, (void *)draws_new},
+    {Py_tp_dealloc, (void *)draws_dealloc},
+    {Py_tp_methods, methods},
+    {0, NULL},
+};
+
+PyType_Spec draws_spec = {"fmugym._native.Draws", sizeof(PyDraws), 0, Py_TPFLAGS_DEFAULT, slots};

@@ -1,0 +1,289 @@
+"""FMUs that need a licence for each instance."""
+
+import itertools
+import logging
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from demanding_tools import DemandingEnv, expected_outputs, make_fmu
+
+import fmugym
+from fmugym.errors import LicenceError
+from fmugym.pool.patience import speaks_of_licence
+from fmugym.tools.cli import main
+from fmugym.trial.trial import known_verdict
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
+
+WAYS = ["native", "python"]
+TOKENS = ["licensed", "licensed at initialization"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("licences")
+
+
+class Seats:
+    """The licence server of the FMUs in a test."""
+
+    def __init__(self, path, monkeypatch):
+        self._path = path
+        monkeypatch.setenv("SEATS", str(path))
+        self.limit = lambda count: monkeypatch.setenv("SEATS_LIMIT", str(count))
+        self.limit(1)
+
+    def _numbers(self, suffix):
+        path = self._path.with_name(f"{self._path.name}.{suffix}")
+        return [float(line) for line in path.read_text().split()] if path.exists() else []
+
+    @property
+    def most(self):
+        """The most seats that were taken at once."""
+        return max(self._numbers("most"), default=0)
+
+    @property
+    def calls(self):
+        """The times of all instantiations and initializations, in seconds."""
+        return sorted(self._numbers("calls"))
+
+    @property
+    def taken(self):
+        return len(self._path.read_bytes()) // 4 if self._path.exists() else 0
+
+    def take(self, process):
+        """Give a seat to another program until it ends."""
+        self._path.write_bytes(process.pid.to_bytes(4, sys.byteorder))
+
+
+@pytest.fixture
+def seats(tmp_path, monkeypatch):
+    """Trials as users have them, with a cache for each test, and a licence server."""
+    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
+    return Seats(tmp_path / "seats", monkeypatch)
+
+
+@pytest.fixture
+def other_program(seats, caplog):
+    """Start another program that has a seat until this one waits for it."""
+    over, threads = threading.Event(), []
+
+    def start():
+        program = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+        seats.take(program)
+        threads.append(threading.Thread(target=end, args=[program]))
+        threads[-1].start()
+
+    def end(program):
+        while not over.wait(0.05) and "waiting for" not in caplog.text:
+            pass
+        program.kill()
+        program.wait()
+
+    yield start
+    over.set()
+    for thread in threads:
+        thread.join()
+
+
+def play(env, steps=3):
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(np.array([0.5], np.float32))
+    return float(env.state[0])
+
+
+EXPECTED = expected_outputs(1.5, [0.5] * 3)[-1]
+
+
+class TestSeats:
+    @pytest.mark.parametrize("token", TOKENS)
+    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}, {"backend": "python"}])
+    def test_one_is_enough_for_one_environment(self, folder, seats, token, config):
+        env = DemandingEnv(make_fmu(folder, token), max_instances=1, **config)
+        assert [play(env), play(env)] == [EXPECTED, EXPECTED]
+        assert seats.taken == 1
+        env.close()
+        assert seats.most == 1
+        assert seats.taken == 0
+
+    @pytest.mark.parametrize("options", [{}, {"isolation": "process", "workers": 2}])
+    def test_a_vector_environment_takes_one_for_each(self, folder, seats, options):
+        seats.limit(3)
+        path = make_fmu(folder, "licensed")
+        envs = fmugym.FMUVectorEnv(lambda: DemandingEnv(path, max_instances=3), 3, **options)
+        envs.reset(seed=0)
+        for _ in range(3):
+            envs.step(np.full((3, 1), 0.5, np.float32))
+        assert [state[0] for state in envs.get_attr("state")] == [EXPECTED] * 3
+        assert seats.taken == 3
+        envs.close()
+        assert seats.most == 3
+
+    def test_no_trial_starts_if_more_are_asked_for_than_allowed(self, folder, seats):
+        path = make_fmu(folder, "licensed")
+        make = lambda: DemandingEnv(path, max_instances=2)  # noqa: E731
+        with pytest.raises(fmugym.ConfigError, match=r"3 environments need 3 .*allows 2"):
+            fmugym.FMUVectorEnv(make, 3)
+        with pytest.raises(fmugym.ConfigError, match=r"3 environments need 3 .*allows 2"):
+            fmugym.FMUVectorEnv(make, 3, isolation="process", workers=1)
+        assert seats.most == 0
+
+    @pytest.mark.parametrize(("count", "text"), [(1, "1 instance at"), (2, "2 instances at")])
+    def test_the_trial_says_how_many_it_used(self, folder, seats, caplog, capsys, count, text):
+        caplog.set_level(logging.INFO, "fmugym")
+        seats.limit(count)
+        path = make_fmu(folder, "licensed")
+        fmugym.FMUVectorEnv(lambda: DemandingEnv(path), count).close()
+        assert seats.most == count
+        assert known_verdict(fmugym.FMU(path)).instances == count
+        assert f"was tried with {count} instance(s) at once" in caplog.text
+        main(["info", str(path)])
+        assert f"tried with {text} once" in capsys.readouterr().out
+
+
+class TestRefusal:
+    @pytest.mark.parametrize(
+        ("token", "config"),
+        [
+            *itertools.product(TOKENS, [{}, {"isolation": "process"}, {"probe_timeout": None}]),
+            *itertools.product(["licensed or dead"], [{}, {"isolation": "process"}]),
+        ],
+    )
+    def test_has_the_words_of_the_fmu(self, folder, seats, token, config):
+        seats.limit(0)
+        with pytest.raises(LicenceError) as caught:
+            DemandingEnv(make_fmu(folder, token), **config).reset()
+        text = str(caught.value)
+        assert "FLEXlm error -4: checkout of Demanding failed, all 0 seats taken" in text
+        assert "licence_wait" in text or token == "licensed at initialization"
+        assert isinstance(caught.value, fmugym.FMULoadError)
+        assert isinstance(caught.value, fmugym.SimulationError)
+
+    @pytest.mark.parametrize("token", TOKENS)
+    def test_of_a_second_instance_is_no_sign_of_shared_globals(self, folder, seats, token, caplog):
+        path = make_fmu(folder, token)
+        with pytest.raises(LicenceError, match=r"used 2 instance\(s\) at once.*all 1 seats taken"):
+            fmugym.FMUVectorEnv(lambda: DemandingEnv(path), 2)
+        assert "disturb" not in caplog.text
+        seats.limit(2)
+        envs = fmugym.FMUVectorEnv(lambda: DemandingEnv(path), 2)  # nothing wrong was remembered
+        envs.reset()
+        envs.close()
+        assert "disturb" not in caplog.text
+
+    @pytest.mark.parametrize("backend", WAYS)
+    def test_in_a_later_reset(self, folder, seats, backend):
+        env = DemandingEnv(
+            make_fmu(folder, "licensed at initialization"),
+            backend=backend,
+            reset_method="instance",
+        )
+        env.reset()
+        seats.limit(0)
+        with pytest.raises(LicenceError, match="all 0 seats taken"):
+            env.reset()
+        seats.limit(1)
+        assert play(env) == EXPECTED
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("said", "expected"),
+        [
+            ("no licence for 5 seats", True),
+            ("License checkout failed", True),
+            ("ready | Could not connect to lmgrd", True),
+            ("the dongle is missing", True),
+            ("License checked out. | the table is not there", False),
+            ("failed to find the heat source", False),
+        ],
+    )
+    def test_is_recognized_by_its_words(self, said, expected):
+        assert speaks_of_licence(f"no seats.fmu failed; the FMU said: {said}") is expected
+        assert not speaks_of_licence(said)  # these are not the FMU's words
+
+
+class TestWaiting:
+    @pytest.mark.parametrize("token", TOKENS)
+    @pytest.mark.parametrize(
+        "config", [{}, {"backend": "python"}, {"isolation": "process"}, {"probe_timeout": None}]
+    )
+    def test_ends_when_another_program_returns_its_seat(
+        self, folder, seats, other_program, token, config, caplog
+    ):
+        other_program()
+        env = DemandingEnv(make_fmu(folder, token), licence_wait=20, **config)
+        assert play(env) == EXPECTED
+        env.close()
+        assert "all 1 seats taken; waiting for" in caplog.text
+        assert seats.most == 1
+
+    def test_ends_when_its_time_is_over(self, folder, seats):
+        seats.limit(0)
+        start = time.monotonic()
+        with pytest.raises(LicenceError, match=r"no licence came within 0\.8 s \(licence_wait\)"):
+            DemandingEnv(make_fmu(folder, "licensed"), licence_wait=0.8, probe_timeout=None)
+        assert 0.8 <= time.monotonic() - start < 30.0
+
+    @pytest.mark.parametrize("options", [{}, {"isolation": "process"}])
+    def test_in_a_reset_of_some_environments(self, folder, seats, other_program, options):
+        seats.limit(2)
+        path = make_fmu(folder, "licensed at initialization")
+        envs = fmugym.FMUVectorEnv(
+            lambda: DemandingEnv(path, reset_method="instance", licence_wait=20), 2, **options
+        )
+        other_program()
+        envs.reset(seed=0)
+        for _ in range(3):
+            envs.step(np.full((2, 1), 0.5, np.float32))
+        assert [state[0] for state in envs.get_attr("state")] == [EXPECTED] * 2
+        envs.close()
+
+
+class TestPace:
+    @pytest.mark.parametrize("config", [{"backend": "native"}, {"backend": "python"}])
+    def test_of_one_environment(self, folder, seats, config):
+        env = DemandingEnv(
+            make_fmu(folder, "licensed"), max_initializations_per_second=20, **config
+        )
+        for _ in range(3):
+            env.reset(seed=0)
+        env.close()
+        self.check(seats, 20)
+
+    @pytest.mark.parametrize("options", [{"threads": 2}, {"isolation": "process", "workers": 3}])
+    def test_of_several(self, folder, seats, options):
+        seats.limit(6)
+        path = make_fmu(folder, "licensed")
+        make = lambda: DemandingEnv(path, max_initializations_per_second=20)  # noqa: E731
+        envs = fmugym.FMUVectorEnv(make, 6, **options)
+        envs.reset(seed=0)
+        envs.close()
+        self.check(seats, 20)
+
+    @staticmethod
+    def check(seats, limit):
+        """Any window of a second has at most so many calls; a late start may add one."""
+        calls = np.array(seats.calls)
+        assert len(calls) > 10
+        assert max(np.count_nonzero((calls >= t) & (calls < t + 0.95)) for t in calls) <= limit
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("max_instances", value) for value in (0, -1, 1.5, "2", True)),
+        *(("max_initializations_per_second", value) for value in (0, -1.0, float("nan"), "2")),
+        *(("licence_wait", value) for value in (-1, float("nan"), "2", None)),
+    ],
+)
+def test_odd_values_are_refused(key, value):
+    with pytest.raises(fmugym.ConfigError, match=key):
+        fmugym.EnvConfig.from_dict(
+            {"model_input_names": "u", "model_output_names": "y", key: value}
+        )
