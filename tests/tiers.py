@@ -28,6 +28,7 @@ EVERY = {
     "test_neighbours": 4,
     "test_pool": 8,
     "test_quirks": 31,
+    "test_rehearsals": 3,
     "test_words": 17,
     "test_zoo": 29,
 }

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import Variable
+from fmugym.fmi.status import Status
 from fmugym.pool.spec import ResetMethod
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.is_on = self.is_waiting = False
-        self._resets = self._due_resets = self._due_steps = self._steps = 0
+        self._resets = self._due_resets = self._due_steps = 0
         self._rows: list[tuple[Array, Array, int]] = []
         self._start: tuple[tuple[Variable, ...], Array, Array] = ((), np.zeros(0), np.zeros(0))
 
@@ -120,22 +121,27 @@ class Recorder:
         self.is_on, self.is_waiting = False, True
         self._resets, self._due_resets, self._due_steps = 0, resets, steps
 
-    def begin(self, variables: tuple[Variable, ...], starts: Array, outputs: Array) -> None:
-        """Note a reset of the first instance that went well."""
+    def turn(self, steps: int) -> bool:
+        """Note a reset of the first instance, after so many steps in all.
+
+        Returns:
+            Whether to begin a recording.
+        """
         self._resets += 1
-        due = self._resets >= self._due_resets and self._steps >= self._due_steps
-        if self.is_on or (self.is_waiting and due):
-            self.is_on, self.is_waiting, self._rows = True, False, []
-            self._start = variables, np.array(starts, np.float64), outputs.copy()
+        due = self._resets >= self._due_resets and steps >= self._due_steps
+        return self.is_on or (self.is_waiting and due)
+
+    def begin(self, variables: tuple[Variable, ...], starts: Array, outputs: Array) -> None:
+        """Begin a recording after a reset that went well."""
+        self.is_on, self.is_waiting, self._rows = True, False, []
+        self._start = variables, np.array(starts, np.float64), outputs.copy()
 
     def add(self, inputs: Array, outputs: Array, status: int) -> Tape | None:
         """Note a step of the first instance; returns the recording once it is long enough."""
+        if self._rows and self._rows[-1][2] > Status.WARNING:  # the episode had ended before
+            return None
         self._rows.append((inputs.copy(), outputs.copy(), status))
         return self.finish() if len(self._rows) == TAPE_ROWS else None
-
-    def count(self, steps: int) -> None:
-        """Note how many steps the first instance has done."""
-        self._steps = steps
 
     def finish(self) -> Tape | None:
         """End a recording before a reset; None if it has no step."""

@@ -32,6 +32,7 @@ from fmugym.pool.leaks import ProcessGrowth
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
 
@@ -215,6 +216,10 @@ class BlockWorker:
         self._pool.reset(self._variables[number], values, mask)
         self._publish()
         return self._growth.after(int(np.count_nonzero(mask)))
+
+    def begin_by(self, method: str) -> None:
+        """See ``Pool.begin_by``."""
+        self._pool.begin_by(ResetMethod(method))
 
     def save(self) -> int:
         """See ``Pool.save``; the snapshot stays here, and its number is returned."""
