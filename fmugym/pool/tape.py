@@ -11,7 +11,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +19,6 @@ import numpy.typing as npt
 from fmugym.archive.description import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool.spec import ResetMethod
-
-if TYPE_CHECKING:
-    from fmugym.pool.health import CountedPool
 
 __all__ = ["TAPE_ROWS", "Judge", "Recorder", "Rehearsals", "Tape"]
 
@@ -63,6 +60,20 @@ Judge = Callable[[Tape, Callable[[ResetMethod], bool]], bool]
 whether the pool can do that. Returns whether to go on recording."""
 
 
+class _Recording(Protocol):
+    """A pool that records."""
+
+    num_instances: int
+
+    def begin_by(self, method: ResetMethod) -> bool:
+        """See ``Pool.begin_by``."""
+        ...
+
+    def record(self, resets: int, steps: int) -> None:
+        """See ``CountedPool.record``."""
+        ...
+
+
 class Rehearsals:
     """Decides when a pool records, and passes on what it has recorded.
 
@@ -74,7 +85,7 @@ class Rehearsals:
         count: The number of recordings so far.
     """
 
-    def __init__(self, pool: CountedPool, judge: Judge) -> None:
+    def __init__(self, pool: _Recording, judge: Judge) -> None:
         self._pool = weakref.ref(pool)
         self._num_instances = pool.num_instances
         self._judge = judge
