@@ -85,12 +85,13 @@ class EnvConfig:
             default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's; a relative path is relative to the
             class's file.
-        probe_timeout: Seconds of real time that an unknown FMU may take for a first load and step
-            in a process of its own; None to skip this trial.
+        probe_timeout: Seconds of real time that a call of an unknown FMU may take in its trial in a
+            process of its own. An initialization may take ten times as long. None to skip the
+            trial.
         isolation: Where the FMU runs: ``"process"`` or ``"none"``; see
             ``fmugym.trial.opening.make_pool``.
-        call_timeout: Seconds of real time that a call of an FMU may take in a worker process; None
-            for no limit.
+        call_timeout: Seconds of real time that a call of an FMU may take in a worker process. A
+            reset or an instantiation may take ten times as long. None for no limit.
         max_instances: How many instances may exist at once, for FMUs with licences: each instance
             may take a seat. None for no limit.
         max_initializations_per_second: How many instantiations and initializations may begin in a

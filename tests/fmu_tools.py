@@ -149,15 +149,24 @@ def probe_xml(version):
 
 
 @functools.cache
-def probe_library(version):
-    """The compiled probe; made once a session, in about a second."""
+def compiled(source, *flags):
+    """The shared library that a C file of this folder makes; once a session, in about a second.
+
+    Args:
+        source: The name of the file.
+        flags: More arguments of the compiler.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / f"Probe{fmpy.sharedLibraryExtension}"
+        library = Path(folder) / f"library{fmpy.sharedLibraryExtension}"
         command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
-        command += ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter"]
-        command += [f"-DFMI_VERSION={version}", str(HERE / "probe.c"), "-o", str(library), "-lm"]
-        subprocess.run(command, check=True)
+        command += ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", *flags]
+        subprocess.run([*command, str(HERE / source), "-o", str(library), "-lm"], check=True)
         return library.read_bytes()
+
+
+def probe_library(version):
+    """The compiled probe."""
+    return compiled("probe.c", f"-DFMI_VERSION={version}")
 
 
 def stubs(version, prefix, source):

@@ -4,34 +4,24 @@
 
 Each case is a sound FMU with one to four mutations of its bytes, its archive, its model description
 or its library. The program opens and describes it as ``fmugym info`` and ``fmugym skeleton`` do,
-makes a config of it, and extracts it. Nothing of the FMU is loaded. A case fails with an exception
-outside of ``FMUGymError``, with control characters in a text for people, if it leaves a file, if it
-takes more than ``SLOW`` seconds of processor time, or if it needs ``LARGE`` more bytes of memory
-than any case before. A crash, or a hang after ``HANG`` seconds, ends the program with the Python
-stack, and ``case.fmu`` stays in a temporary folder.
-
-A case is determined by its seed and number while the bundled FMUs stay the same: ``--first N``
-and ``--count 1`` repeat case N.
+makes a config of it, and extracts it. Nothing of the FMU is loaded. A case also fails with control
+characters in a text for people. If the program ends with a crash or a hang, ``case.fmu`` stays in a
+temporary folder. The bundled FMUs must stay the same for a case to be repeated. See
+``fuzz_driver.py``.
 """
 
-import argparse
 import contextlib
 import copy
-import faulthandler
 import functools
 import io
 import math
-import random
 import stat
 import sys
-import tempfile
-import time
 import warnings
 import zipfile
-from collections import Counter
-from pathlib import Path
 
 from fmu_tools import library_name, probe_xml, read_fmu
+from fuzz_driver import Case, main, require
 from lxml import etree
 
 from fmugym import FMU, EnvConfig, FMUGymError
@@ -42,8 +32,6 @@ from fmugym.task.spaces import action_space, observation_space
 from fmugym.tools.overview import as_text, overview
 from fmugym.tools.skeleton import Skeleton
 
-SLOW, HANG = 5.0, 60.0
-LARGE = 300 * 2**20
 XML = "modelDescription.xml"
 
 VALUES = (
@@ -281,9 +269,8 @@ def slim(files, library):
     return {name: files[name] for name in (XML, library)} | {"resources/table.csv": b"0,1\n" * 9}
 
 
-def make_case(bases, seed, number):
-    """The bytes of a case."""
-    rng = random.Random(f"{seed}/{number}")
+def broken_fmu(bases, rng):
+    """The bytes of a broken FMU, and what was done to it."""
     files = dict(rng.choice(bases))
     library = next(name for name in files if name.startswith("binaries/"))
     kinds = rng.choices(KINDS, (8, 2, 3, 2, 4, 2), k=rng.choice((1, 1, 1, 1, 2, 4)))
@@ -301,33 +288,22 @@ def make_case(bases, seed, number):
     for kind in kinds:
         if kind in {"zip", "bytes"}:
             content = {"zip": mutate_zip, "bytes": mutate_bytes}[kind](rng, content)
-    return content
+    return content, kinds
 
 
 def use(path):
-    """Do what is done with an FMU before it is loaded; returns how far it came."""
-    reached = "refused"
-    fmu = None
-    try:
-        fmu = FMU(path)
-        reached = "described"
+    """Do what is done with an FMU before it is loaded."""
+    with contextlib.closing(FMU(path)) as fmu:
         check_text(as_text(overview(fmu, everything=True)).replace("\n", " "))
         with contextlib.suppress(FMUGymError):
             check_text(Skeleton(fmu).text().replace("\n", " "))
         configure(fmu)
         fmu.extract()
-        reached = "extracted"
-    except FMUGymError as error:
-        check_text(str(error))
-    finally:
-        if fmu is not None:
-            fmu.close()
-    return reached
 
 
 def check_text(text):
     """Fail if a terminal could obey a text, or a log take it for several lines."""
-    assert text.isprintable(), ascii(text[:200])
+    require(text.isprintable(), ascii(text[:200]))
 
 
 def configure(fmu):
@@ -349,98 +325,28 @@ def make_spaces(fmu, inputs, outputs):
         observation_space(interface)
         action_space(interface)
         default_inputs = [variable.start_number for variable in interface.inputs]
-        assert all(map(math.isfinite, default_inputs))
+        require(all(map(math.isfinite, default_inputs)), "an input that is not finite")
 
 
-def run(count, seed, first=0, report=lambda line: None):
-    """Run cases one after another.
-
-    Returns:
-        How many cases came how far, and the failures as texts.
-    """
+@contextlib.contextmanager
+def program():
+    """See ``fuzz_driver.run``; asks the loader once for the same libraries, which is slow."""
     bases = list(sound_fmus())
-    counts, failures = Counter(), []
-    with temporary_folder() as folder, one_answer_for_each_library():
-        path = folder / "case.fmu"
-        for number in range(first, first + count):
-            path.write_bytes(make_case(bases, seed, number))
-            reached, trouble = watch(path)
-            counts[reached] += 1
-            if trouble:
-                failures.append(f"case {number}: {trouble}")
-                report(failures[-1])
-    return counts, failures
-
-
-@contextlib.contextmanager
-def temporary_folder():
-    """A folder in which all others are made, so that it is seen when one is left."""
-    before = tempfile.tempdir
-    with tempfile.TemporaryDirectory() as folder:
-        tempfile.tempdir = folder
-        try:
-            yield Path(folder)
-        finally:
-            tempfile.tempdir = before
-
-
-@contextlib.contextmanager
-def one_answer_for_each_library():
-    """Ask the loader once for the same libraries: a child process for each case is slow."""
     before = fmu_module.ask_in_a_child
     remembered = functools.cache(before)
+
+    def make(rng, folder):
+        path = folder / "case.fmu"
+        content, kinds = broken_fmu(bases, rng)
+        path.write_bytes(content)
+        return Case(lambda: use(path), kinds[0], kinds)
+
     fmu_module.ask_in_a_child = lambda names: remembered(tuple(names))
     try:
-        yield
+        yield make
     finally:
         fmu_module.ask_in_a_child = before
 
 
-def watch(path):
-    """Use an FMU; returns how far it came and what is wrong with that."""
-    faulthandler.dump_traceback_later(HANG, exit=True)
-    begin, memory = time.process_time(), peak_memory()  # other programs do not count
-    try:
-        reached = use(path)
-    except Exception as error:
-        return "failed", f"{type(error).__name__}: {error}"
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-    duration = time.process_time() - begin
-    left = [other.name for other in path.parent.iterdir() if other != path]
-    growth = peak_memory() - memory
-    if growth > LARGE:
-        return reached, f"{growth // 2**20} MiB"
-    return reached, f"{duration:.1f} s" if duration > SLOW else f"left {left}" if left else ""
-
-
-def peak_memory():
-    """The most bytes that this process has had; 0 on Windows, where nothing is measured."""
-    if sys.platform == "win32":
-        return 0
-    import resource
-
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-def say(text):
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=20_000)
-    parser.add_argument("--seed", default="0")
-    parser.add_argument("--first", type=int, default=0)
-    arguments = parser.parse_args()
-    faulthandler.enable()
-    begin = time.perf_counter()
-    counts, failures = run(arguments.count, arguments.seed, arguments.first, say)
-    say(f"{dict(counts)}, {len(failures)} failures, {time.perf_counter() - begin:.0f} s")
-    return 1 if failures else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(program, __doc__, 20_000))

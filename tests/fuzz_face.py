@@ -5,51 +5,27 @@
 Each case is a call of the public face with one to three odd values: in the config, as arguments of
 constructors, as seeds, options and actions, in distributions, as attributes, and as results of
 hooks. Either the value is accepted and the environment works with it, or it is refused with an
-error of ``FMUGymError``. A case fails if it raises anything else, if it leaves a folder, if an
-environment does not work after it has refused a value, or if it takes more than ``SLOW`` seconds of
-processor time. A crash, or a hang of ``HANG`` seconds, ends the program with the Python stack.
-
-Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
+error of ``FMUGymError``. Then it works as before. See ``fuzz_driver.py``.
 """
 
-import argparse
 import contextlib
 import datetime
 import decimal
 import enum
-import faulthandler
 import fractions
 import math
 import pathlib
-import random
 import sys
-import time
-import warnings
-from collections import Counter
 
 import gymnasium
 import numpy as np
-from fuzz import temporary_folder
+from fuzz_driver import Case, describe, main
+from odd_values import circular, hostile
 
 import fmugym
-from fmugym import Choice, FMUGymError, FMUVectorEnv, LogUniform, Normal, Uniform, testing
+from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform, testing
 from fmugym.checks import integer_of
 from fmugym.config import EnvConfig
-
-SLOW, HANG = 5.0, 60.0
-
-
-class HostileError(Exception):
-    """Raised by objects that cannot be asked anything."""
-
-
-def _raise(*arguments, **keywords):
-    raise HostileError("do not touch me")
-
-
-def hostile(*names, base=object):
-    """Make an object whose special methods of these names raise."""
-    return type("Hostile", (base,), dict.fromkeys(names, _raise))()
 
 
 class Sampled:
@@ -82,12 +58,6 @@ class Whole(int):
 
 class Text(str):
     __slots__ = ()
-
-
-def circular():
-    values = [1.0]
-    values.append(values)
-    return values
 
 
 NUMBERS = (
@@ -215,14 +185,6 @@ def odd(rng):
     if kind == 0:
         return rng.choice(NUMBERS)
     return rng.choice(TEXTS) if kind == 1 else rng.choice(MAKERS)()
-
-
-def describe(value):
-    try:
-        text = " ".join(repr(value).split())
-    except Exception:
-        text = f"<{type(value).__name__} that raises in its repr>"
-    return text if len(text) < 80 else f"{text[:60]}..."
 
 
 # Environments
@@ -372,10 +334,19 @@ def of_bundled(rng):
 
 
 class Stage:
-    """Environments that are made once: a refused value must leave them as good as new."""
+    """Environments that serve many cases: a refused value must leave them as good as new."""
+
+    _CASES = 50
 
     def __init__(self):
         self._envs = {}
+        self._cases = 0
+
+    def begin_case(self):
+        """Make the environments anew now and then."""
+        self._cases += 1
+        if self._cases % self._CASES == 0:
+            self.close()
 
     def single(self, cls=Tracking):
         if cls not in self._envs:
@@ -395,6 +366,7 @@ class Stage:
     def close(self):
         for env in self._envs.values():
             env.close()
+        self._envs = {}
 
 
 def tried(env, call):
@@ -625,113 +597,20 @@ STAGED = {of_seed: 1, of_options: 2, of_action: 3, of_reading: 1, of_vector: 4, 
 KINDS = WHOLE | STAGED
 
 
-def make_case(seed, number, stage):
-    """The kind of a case, its values, and what to call."""
-    rng = random.Random(f"{seed}/{number}")
-    kind = rng.choices(list(KINDS), list(KINDS.values()))[0]
-    values, call = kind(rng, stage) if kind in STAGED else kind(rng)
-    return kind.__name__, values, call
-
-
-def run(count, seed, first=0, report=lambda line: None):
-    """Run cases one after another.
-
-    Returns:
-        How many were accepted, refused and failed, by kind, and the failures as texts.
-    """
-    counts, failures = Counter(), []
-    with temporary_folder() as folder, quiet():
-        for number in range(first, first + count):
-            if (number - first) % 50 == 0:
-                stage = Stage()
-            kind, values, call = make_case(seed, number, stage)
-            before = {path.name for path in folder.iterdir()}
-            outcome, trouble = watch(call)
-            if kind in {k.__name__ for k in WHOLE}:
-                left = {path.name for path in folder.iterdir()} - before
-                trouble = trouble or (f"left {sorted(left)}" if left else "")
-            counts[kind, "failed" if trouble else outcome] += 1
-            if trouble:
-                failures.append(f"case {number}: {kind} {describe(values)}: {trouble}")
-                report(failures[-1])
-            if (number - first) % 50 == 49 or number == first + count - 1:
-                stage.close()
-                left = [path.name for path in folder.iterdir()]
-                if left:
-                    failures.append(f"case {number}: left {left} at the end")
-                    report(failures[-1])
-    return counts, failures
-
-
 @contextlib.contextmanager
-def quiet():
-    """Without warnings, which odd values bring about by the thousand, and log messages."""
-    import logging
+def program():
+    """See ``fuzz_driver.run``."""
+    stage = Stage()
 
-    logging.disable(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(logging.NOTSET)
+    def make(rng, folder):
+        stage.begin_case()
+        kind = rng.choices(list(KINDS), list(KINDS.values()))[0]
+        values, call = kind(rng, stage) if kind in STAGED else kind(rng)
+        return Case(call, kind.__name__, values, keeps=kind in STAGED)
 
-
-def watch(call):
-    """Call; returns what became of it and what is wrong with that."""
-    faulthandler.dump_traceback_later(HANG, exit=True)
-    begin = time.process_time()
-    outcome, trouble = "accepted", ""
-    try:
-        call()
-    except FMUGymError as error:
-        outcome = "refused"
-        str(error)
-    except Exception as error:
-        trouble = f"{type(error).__name__}: {describe(str(error))} {place(error)}"
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-    duration = time.process_time() - begin
-    return outcome, trouble or (f"{duration:.1f} s" if duration > SLOW else "")
-
-
-def place(error):
-    """Where in the package an exception came out."""
-    trace, found = error.__traceback__, ""
-    while trace is not None:
-        name = pathlib.Path(trace.tb_frame.f_code.co_filename)
-        if "fmugym" in name.parts:
-            found = f"({name.name}:{trace.tb_lineno})"
-        trace = trace.tb_next
-    return found
-
-
-def totals(counts):
-    result = Counter()
-    for (_, outcome), number in counts.items():
-        result[outcome] += number
-    return dict(result)
-
-
-def say(text):
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", default="0")
-    parser.add_argument("--first", type=int, default=0)
-    arguments = parser.parse_args()
-    faulthandler.enable()
-    begin = time.perf_counter()
-    counts, failures = run(arguments.count, arguments.seed, arguments.first, say)
-    for kind in sorted({kind for kind, _ in counts}):
-        say(f"{kind}: { {o: n for (k, o), n in counts.items() if k == kind} }")
-    say(f"{totals(counts)}, {len(failures)} failures, {time.perf_counter() - begin:.0f} s")
-    return 1 if failures else 0
+    with contextlib.closing(stage):
+        yield make
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(program, __doc__, 10_000))

@@ -4,33 +4,24 @@
 
 Each case is a class with one to three odd hooks: they return wrong shapes, types, None, NaN or
 objects whose own methods fail, from the first call on or from a later one, or they raise. The class
-is played alone and in vector environments, with every way of calling hooks. A case fails with an
-exception that is neither of ``FMUGymError`` nor raised within a hook, if a reward is not finite, or
-if a result has another shape or type than the spaces promise. A crash, or a hang after ``HANG``
-seconds, ends the program with the Python stack.
-
-Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
+is played alone and in vector environments, with every way of calling hooks. A case also fails if a
+reward is not finite, or if a result has another shape or type than the spaces promise. Exceptions
+that hooks raise themselves are the caller's own. See ``fuzz_driver.py``.
 """
 
-import argparse
 import contextlib
 import decimal
-import faulthandler
 import fractions
-import logging
-import random
 import sys
-import time
-import warnings
-from collections import Counter
 
 import gymnasium
 import numpy as np
+from fuzz_driver import Case, main, require
+from odd_values import circular, hostile
 
 import fmugym
 from fmugym import FMUGymError, FMUVectorEnv, Normal, Uniform
 
-HANG = 60.0
 WAYS = ("single", "compiled", "array", "per_env", "auto")
 NUM_ENVS = 3
 STEPS = 4
@@ -40,23 +31,8 @@ class HookError(Exception):
     """Raised by hooks themselves: it is theirs, and reaches the caller."""
 
 
-def _fail(*arguments, **keywords):
-    raise ArithmeticError("this object fails")
-
-
-def hostile(*names, base=object):
-    """Make an object whose special methods of these names raise."""
-    return type("Hostile", (base,), dict.fromkeys(names, _fail))()
-
-
 def ragged():
     return [1.0, [2.0, 3.0]]
-
-
-def circular():
-    values = [1.0]
-    values.append(values)
-    return values
 
 
 # What a hook may return: functions of the hook's environment and of its good result.
@@ -227,13 +203,6 @@ def odd_class(rng):
     return type("Odd", (base,), hooks), f"{base.__name__} {'+'.join(names)} from call {first}"
 
 
-def make_case(seed, number):
-    """The way of calling hooks, what the case is, and the class."""
-    rng = random.Random(f"{seed}/{number}")
-    cls, title = odd_class(rng)
-    return rng.choice(WAYS), title, cls
-
-
 def play(way, cls):
     if way == "single":
         with contextlib.closing(cls()) as env:
@@ -272,15 +241,6 @@ def play_many(envs):
             require(isinstance(infos, dict), "infos")
 
 
-class ResultError(Exception):
-    """A result that was passed on is not what a caller may expect."""
-
-
-def require(holds, what):
-    if not holds:
-        raise ResultError(what)
-
-
 def require_element(space, value, exact=True):
     """Shapes are those of the space, and types in vector environments; limits are the user's."""
     if isinstance(space, gymnasium.spaces.Dict):
@@ -296,106 +256,27 @@ def require_element(space, value, exact=True):
 
 
 def is_of_a_hook(error):
-    """Whether an exception was raised within a hook, or by an object that a hook made."""
+    """Whether an exception has passed a hook."""
     trace = error.__traceback__
     while trace is not None:
         code = trace.tb_frame.f_code
-        if code.co_filename == __file__ and code.co_name in {"hook", "fail", "_fail", *HOOKS}:
-            return code.co_name != "_fail"
+        if code.co_filename == __file__ and code.co_name in {"hook", "fail", *HOOKS}:
+            return True
         trace = trace.tb_next
     return False
 
 
-def watch(way, cls):
-    """Play a case; returns what became of it and what is wrong with that."""
-    faulthandler.dump_traceback_later(HANG, exit=True)
-    try:
-        play(way, cls)
-    except FMUGymError:
-        return "refused", ""
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
-            raise
-        if is_of_a_hook(error):
-            return "raised by the hook", ""
-        return "failed", f"{type(error).__name__}: {place_of(error)}"
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-    return "accepted", ""
-
-
-def place_of(error):
-    """What an error says, and the last place in the package that it passed."""
-    place, trace = "", error.__traceback__
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        if "fmugym" in code.co_filename.replace("\\", "/").split("/"):
-            place = f"{code.co_filename.rpartition('fmugym/')[2]}:{trace.tb_lineno}"
-        trace = trace.tb_next
-    try:
-        text = str(error)
-    except Exception:
-        text = "?"
-    return f"{text[:100]} ({place})"
-
-
-def run(count, seed, first=0, report=lambda line: None):
-    """Run cases one after another.
-
-    Returns:
-        How many had which outcome, by way of calling hooks, and the failures as texts.
-    """
-    counts, failures = Counter(), []
-    with quiet():
-        for number in range(first, first + count):
-            way, title, cls = make_case(seed, number)
-            outcome, trouble = watch(way, cls)
-            counts[way, outcome] += 1
-            if trouble:
-                failures.append(f"case {number}: {way}: {title}: {trouble}")
-                report(failures[-1])
-    return counts, failures
-
-
 @contextlib.contextmanager
-def quiet():
-    """Without warnings, which odd hooks bring about by the thousand, and log messages."""
-    logging.disable(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(logging.NOTSET)
+def program():
+    """See ``fuzz_driver.run``."""
 
+    def make(rng, folder):
+        cls, title = odd_class(rng)
+        way = rng.choice(WAYS)
+        return Case(lambda: play(way, cls), way, title, is_own=is_of_a_hook)
 
-def table(counts):
-    outcomes = ("accepted", "refused", "raised by the hook", "failed")
-    return [
-        f"{way}: " + ", ".join(f"{counts[way, outcome]} {outcome}" for outcome in outcomes)
-        for way in WAYS
-    ]
-
-
-def say(text):
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=3000)
-    parser.add_argument("--seed", default="0")
-    parser.add_argument("--first", type=int, default=0)
-    arguments = parser.parse_args()
-    faulthandler.enable()
-    begin = time.perf_counter()
-    counts, failures = run(arguments.count, arguments.seed, arguments.first, say)
-    for line in table(counts):
-        say(line)
-    say(f"{len(failures)} of {arguments.count} failed, {time.perf_counter() - begin:.0f} s")
-    return 1 if failures else 0
+    yield make
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(program, __doc__, 3000))

@@ -3,16 +3,18 @@
     python tests/fuzz_identification.py --count 2000 --seed 0
 
 A case calls one public function, class or method with one or two arguments of a wrong type, range
-or shape. Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
+or shape. See ``fuzz_driver.py``.
 """
 
+import contextlib
 import functools
 import sys
 
 import numpy as np
-from fuzz_tools import check_text, main, odd, run_cases, spoil
+from fuzz_driver import Case, main
+from odd_values import odd, spoil
 
-from fmugym import FMUGymError, FMULoadError, bundled_fmu
+from fmugym import bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters, fit_swing, plot_comparison
 
 TIME = np.arange(0.0, 0.4, 0.02)
@@ -85,22 +87,19 @@ def method(rng):
     return lambda: call(value)
 
 
-def case(rng, folder):
-    """Run one case; see the top of this file."""
-    use = rng.choice((fit, trajectory, swing, method, method))(rng)
-    try:
-        use()
-    except FMULoadError:
-        return "refused", ""  # its text has the path as it was given
-    except FMUGymError as error:
-        return "refused", check_text(error)
-    return "accepted", ""
+KINDS = (fit, trajectory, swing, method, method)
 
 
-def run(count, seed, first=0, report=lambda line: None):
-    """Run cases; see ``fuzz_tools.run_cases``."""
-    return run_cases(case, count, seed, first, report)
+@contextlib.contextmanager
+def program():
+    """See ``fuzz_driver.run``."""
+
+    def make(rng, folder):
+        kind = rng.choice(KINDS)
+        return Case(kind(rng), kind.__name__)
+
+    yield make
 
 
 if __name__ == "__main__":
-    sys.exit(main(run, __doc__))
+    sys.exit(main(program, __doc__, 2000))

@@ -4,20 +4,19 @@
 
 A case calls one method of `Client` or `Lab`, or one constructor, and replaces one or two of its
 arguments by values of a wrong type, range or shape. A constructor may raise `ConfigError`; a call
-may raise `LabError` only. A case also fails if a refused call costs the user something, if a cell
-stays in use, if a file is left behind, or if the case takes more than ``SLOW`` seconds of processor
-time. A hang ends the program with the Python stack after ``HANG`` seconds.
-
-Case number n of a seed is always the same; ``--first`` and ``--count 1`` repeat it.
+may raise `LabError` only. A case also fails if a refused call costs the user something, or if a
+cell stays in use. See ``fuzz_driver.py``.
 """
 
+import contextlib
 import itertools
 import sys
 from pathlib import Path
 
-import fuzz_tools
 import numpy as np
-from fuzz_tools import NUMBERS, Unspeakable, check_text, main, run_cases
+import odd_values
+from fuzz_driver import Case, CaseError, main, require
+from odd_values import NUMBERS, Unspeakable
 
 from fmugym import ConfigError
 from fmugym.lab import (
@@ -88,7 +87,7 @@ OTHERS = (
 
 def odd(rng):
     """Draw an odd value, one of the lab's own now and then."""
-    return fuzz_tools.odd(rng, OTHERS)
+    return odd_values.odd(rng, OTHERS)
 
 
 def odd_clock(rng, folder):
@@ -213,20 +212,25 @@ def record(rng, folder):
     return scene, use
 
 
-def watch_call(rng, folder):
+def odd_call(rng, folder):
     scene, use = rng.choice((call, call, call, call, call, call, call, record))(rng, folder)
-    before = scene.rights()
-    try:
-        use()
-        outcome, trouble = "accepted", ""
-        scene.client.get_cells(USER)
-    except LabError as error:
-        outcome, trouble = "refused", check_text(error)
-        if scene.rights() != before:
-            trouble = f"a refused call cost {before} -> {scene.rights()}"
-    except ConfigError as error:  # only the mode of a view is no request to the lab
-        outcome, trouble = "refused", "" if "render mode" in str(error) else f"ConfigError: {error}"
-    return outcome, trouble or check_rest(scene)
+
+    def play():
+        before = scene.rights()
+        try:
+            use()
+            scene.client.get_cells(USER)
+        except LabError:
+            after = scene.rights()
+            require(after == before, f"a refused call cost {before} -> {after}")
+            raise
+        except ConfigError as error:  # only the mode of a view is no request to the lab
+            require("render mode" in str(error), f"ConfigError: {error}")
+            raise
+        finally:
+            check_rest(scene)
+
+    return play
 
 
 def check_rest(scene):
@@ -237,7 +241,8 @@ def check_rest(scene):
     token, _ = scene.client.start_episode(gym, "SimplePendulum", 1)
     works = np.isfinite(scene.client.get_position(token))
     scene.lab.close()
-    return "a cell stayed in use" if busy else "" if works else "a cell is broken"
+    require(not busy, "a cell stayed in use")
+    require(works, "a cell is broken")
 
 
 # Constructors
@@ -326,20 +331,19 @@ def any_clock(rng, folder):
     return odd(rng)
 
 
-def watch_constructor(rng, folder):
-    try:
-        options, session = construct(rng, folder)
-        lab = Lab(**{"preset": "ideal", "clock": ManualClock(), **options})
-    except ConfigError as error:
-        return "refused", check_text(error)
-    except LabError as error:
-        return "refused", f"LabError of a constructor: {error}"
-    try:
-        return live(lab, session)
-    except LabError as error:
-        return "refused later", check_text(error)
-    finally:
-        lab.close()
+def odd_lab(rng, folder):
+    """Make a lab of odd arguments, and use it."""
+
+    def play():
+        try:
+            options, session = construct(rng, folder)
+            lab = Lab(**{"preset": "ideal", "clock": ManualClock(), **options})
+        except LabError as error:
+            raise CaseError(f"LabError of a constructor: {error}") from error
+        with contextlib.closing(lab):
+            live(lab, session)
+
+    return play
 
 
 def live(lab, session):
@@ -355,30 +359,25 @@ def live(lab, session):
     client.get_logs(token)
     client.stop_experiment(token)
     lab.view(client.start_gym(USER, 0.5, [CellType.SINGLE]))
-    return "accepted", ""
 
 
-def client_of(rng, folder):
-    try:
-        Client(odd(rng))
-    except ConfigError as error:
-        return "refused", check_text(error)
-    return "accepted", ""
+def odd_client(rng, folder):
+    return lambda: Client(odd(rng))
 
 
-# Cases
+KINDS = (odd_lab, odd_client, *(odd_call,) * 6)
 
 
-def case(rng, folder):
-    """Run one case; see the top of this file."""
-    kinds = (watch_constructor, client_of, *(watch_call,) * 6)
-    return rng.choice(kinds)(rng, folder)
+@contextlib.contextmanager
+def program():
+    """See ``fuzz_driver.run``."""
 
+    def make(rng, folder):
+        kind = rng.choice(KINDS)
+        return Case(kind(rng, folder), kind.__name__)
 
-def run(count, seed, first=0, report=lambda line: None):
-    """Run cases; see ``fuzz_tools.run_cases``."""
-    return run_cases(case, count, seed, first, report)
+    yield make
 
 
 if __name__ == "__main__":
-    sys.exit(main(run, __doc__))
+    sys.exit(main(program, __doc__))

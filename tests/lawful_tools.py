@@ -3,12 +3,9 @@
 import functools
 import mmap
 import struct
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-import fmpy
 import fmu_tools
 
 CALLS = (
@@ -62,12 +59,8 @@ def library(version):
     stubs = fmu_tools.stubs(version, _PREFIXES[version], _SOURCE)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "stubs.h").write_text(stubs)
-        path = Path(folder) / f"Lawful{fmpy.sharedLibraryExtension}"
-        command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
-        command += ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter"]
-        command += [f"-DFMI_VERSION={version}", f"-I{folder}", '-DSTUBS="stubs.h"']
-        subprocess.run([*command, str(_SOURCE), "-o", str(path), "-lm"], check=True)
-        return path.read_bytes()
+        flags = f"-DFMI_VERSION={version}", f"-I{folder}", '-DSTUBS="stubs.h"'
+        return fmu_tools.compiled(_SOURCE.name, *flags)
 
 
 _PARAMETER = 'causality="parameter" variability="fixed"'

@@ -1,14 +1,11 @@
 """An FMU that harms its process (``faulty.c``), and an environment over it."""
 
 import contextlib
-import functools
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
-import fmpy
 import fmu_tools
 
 import fmugym
@@ -46,17 +43,6 @@ def run_python(*command, timeout=100):
     )
 
 
-@functools.cache
-def _library():
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / f"Faulty{fmpy.sharedLibraryExtension}"
-        source = Path(__file__).parent / "faulty.c"
-        command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
-        command += ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter"]
-        subprocess.run([*command, source, "-o", library], check=True)
-        return library.read_bytes()
-
-
 def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
     """Write the FMU; the token ``{faulty-F}`` lets it fail in its instantiation."""
     variables = "".join(
@@ -69,7 +55,10 @@ def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
         f'canGetAndSetFMUstate="true" {capabilities}/>'
         f"<ModelVariables>{variables}</ModelVariables><ModelStructure/></fmiModelDescription>"
     )
-    files = {"modelDescription.xml": xml, fmu_tools.library_name(2, "Faulty"): _library()}
+    files = {
+        "modelDescription.xml": xml,
+        fmu_tools.library_name(2, "Faulty"): fmu_tools.compiled("faulty.c"),
+    }
     return fmu_tools.write_fmu(Path(folder) / "Faulty.fmu", files)
 
 

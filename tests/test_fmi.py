@@ -286,6 +286,16 @@ class TestDirectionalDerivatives:
 
 
 class TestLoading:
+    @pytest.mark.skipif(os.name != "posix", reason="Windows keeps the working directory")
+    def test_without_a_working_directory(self, probe, library, monkeypatch, tmp_path):
+        path = probe()
+        directory = tmp_path / "away"
+        directory.mkdir()
+        monkeypatch.chdir(directory)
+        directory.rmdir()
+        with pytest.raises(FMULoadError, match=r"Probe.fmu .* working directory"):
+            library(path=path)
+
     @all_versions
     def test_wrong_token(self, probe, tmp_path, library, version):
         """In FMPy, FMI 1.0, this passes and the next call ends the process."""

@@ -1,19 +1,82 @@
 """A short form of ``python tests/fuzz.py``; the full one is in docs/reliability.md."""
 
+import contextlib
+
 import fuzz
+import fuzz_driver
+from fuzz_driver import Case, CaseError
+
+from fmugym import ConfigError
 
 
 def test_broken_fmus_raise_nothing_but_our_own_errors(same_working_directory):
-    counts, failures = fuzz.run(400, seed="tests")
-    assert failures == []
-    assert sum(counts.values()) == 400
-    assert min(counts[stage] for stage in ("refused", "described", "extracted")) > 20
+    tally = fuzz_driver.run(fuzz.program, 400, seed="tests")
+    assert tally.failures == []
+    assert tally.total("accepted") + tally.total("refused") == 400
+    assert min(tally.total("accepted"), tally.total("refused")) > 20
+    assert {kind for kind, _ in tally.counts} == set(fuzz.KINDS)
 
 
 def test_a_failure_is_reported(monkeypatch):
-    """The reference is able to fail: an exception, and a folder that is left."""
+    """The fuzzing is able to fail: with an exception, and with a folder that is left."""
     monkeypatch.setattr(fuzz, "as_text", lambda facts: 1 / 0)
-    _, failures = fuzz.run(30, seed="tests")
-    assert any(failure.endswith("ZeroDivisionError: division by zero") for failure in failures)
-    monkeypatch.setattr(fuzz, "use", lambda path: (path.parent / "trace").mkdir(exist_ok=True))
-    assert fuzz.run(1, seed="tests")[1] == ["case 0: left ['trace']"]
+    tally = fuzz_driver.run(fuzz.program, 30, seed="tests")
+    assert tally.total("outside") > 0
+    assert any("ZeroDivisionError: division by zero" in failure for failure in tally.failures)
+    monkeypatch.setattr(fuzz, "use", lambda path: (path.parents[1] / "trace").mkdir(exist_ok=True))
+    first, last = fuzz_driver.run(fuzz.program, 1, seed="tests").failures
+    assert "left ['trace']" in first
+    assert last == "left ['trace'] at the end"
+
+
+class TestDriver:
+    """What becomes of cases that are known."""
+
+    def run(self, *plays, **case):
+        """Run one case after another."""
+        calls = iter(plays)
+
+        def program():
+            return contextlib.nullcontext(lambda rng, folder: Case(next(calls), **case))
+
+        return fuzz_driver.run(program, len(plays), seed="0")
+
+    def fail(self, error):
+        def play():
+            raise error
+
+        return play
+
+    def test_outcomes(self):
+        errors = ConfigError("no"), ZeroDivisionError("zero"), CaseError("wrong")
+        tally = self.run(lambda: None, *map(self.fail, errors), is_own=lambda error: False)
+        assert tally.line() == "1 accepted, 1 refused, 1 outside, 1 failed"
+        assert [failure.partition(": ")[0] for failure in tally.failures] == ["case 2", "case 3"]
+
+    def test_an_error_of_the_callers(self):
+        own = ZeroDivisionError("mine")
+        tally = self.run(self.fail(own), is_own=lambda error: error is own)
+        assert tally.line() == "0 accepted, 0 refused, 1 the caller's own, 0 outside"
+        assert tally.failures == []
+
+    def test_a_text_that_nobody_reads(self):
+        tally = self.run(self.fail(ConfigError("x" * 10_000)))
+        assert tally.line() == "0 accepted, 0 refused, 0 outside, 1 failed"
+
+    def test_a_slow_case(self, monkeypatch):
+        monkeypatch.setattr(fuzz_driver, "SLOW", 0.01)
+        assert self.run(lambda: sum(range(10**6))).total("failed") == 1
+
+    def test_a_case_is_repeated(self):
+        """The random numbers of a case depend on its number and the seed alone."""
+        drawn = []
+
+        def program():
+            return contextlib.nullcontext(
+                lambda rng, folder: Case(lambda: drawn.append(rng.random()))
+            )
+
+        fuzz_driver.run(program, 5, seed="7")
+        fuzz_driver.run(program, 1, seed="7", first=3)
+        assert drawn[5] == drawn[3]
+        assert len(set(drawn)) == 5

@@ -6,6 +6,7 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+import fuzz_driver
 import fuzz_identification
 import numpy as np
 import pytest
@@ -328,10 +329,10 @@ class TestOutputError:
 
 def test_odd_arguments_raise_nothing_but_our_own_errors(same_working_directory):
     """A short form of ``python tests/fuzz_identification.py``."""
-    counts, failures = fuzz_identification.run(400, seed="tests")
-    assert failures == []
-    assert sum(counts.values()) == 400
-    assert min(counts["accepted"], counts["refused"]) > 10
+    tally = fuzz_driver.run(fuzz_identification.program, 400, seed="tests")
+    assert tally.failures == []
+    assert tally.total("accepted") + tally.total("refused") == 400
+    assert min(tally.total("accepted"), tally.total("refused")) > 10
 
 
 class TestTrajectory:

@@ -6,11 +6,9 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import fmpy
 import fmu_tools
 import numpy as np
 import pytest
@@ -69,15 +67,6 @@ def native():
         pool.close()
 
 
-def busy_library(*options):
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / f"Busy{fmpy.sharedLibraryExtension}"
-        command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O2", "-g0"]
-        command += [*options, str(HERE / "busy.c"), "-o", str(library)]
-        subprocess.run(command, check=True)
-        return library.read_bytes()
-
-
 def busy_xml(flags=""):
     rows = ["work:input", "steps:output", "total:output", "restore_work:parameter"]
     rows += ["drift:parameter", "offset:output"]
@@ -97,7 +86,7 @@ def busy_xml(flags=""):
 
 def busy_fmu(folder, *options, flags=""):
     files = {"modelDescription.xml": busy_xml(flags)}
-    files[fmu_tools.library_name(2, "Busy")] = busy_library(*options)
+    files[fmu_tools.library_name(2, "Busy")] = fmu_tools.compiled("busy.c", "-O2", *options)
     return fmu_tools.write_fmu(folder / "Busy.fmu", files)
 
 

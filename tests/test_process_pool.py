@@ -34,7 +34,7 @@ from zoo_tools import ZooEnv, parameters, zoo_fmu
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
-from fmugym.archive.temporary import make_folder, sweep
+from fmugym.archive.temporary import folder_name, make_folder, sweep
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import launcher
@@ -553,6 +553,23 @@ class TestPool:
         done = run_python("-c", INTERRUPTED, str(faulty))
         assert done.stdout.splitlines() == ["True", "[0.5, 0.5]"], done.stderr
 
+    @posix_only
+    @pytest.mark.parametrize("when", ["before", "after"])
+    def test_without_a_working_directory(self, make_pool, faulty, monkeypatch, tmp_path, when):
+        """Workers start although theirs was removed before, or after the pool was made."""
+        directory = tmp_path / "away"
+        directory.mkdir()
+        monkeypatch.chdir(directory)
+        if when == "before":
+            directory.rmdir()
+        pool = make_pool()
+        if when == "after":
+            directory.rmdir()
+        os.kill(pool.processes()[0], signal.SIGKILL)
+        step(pool)
+        set_up(pool, faulty, ["none"])
+        assert step(pool)[0][0].tolist() == [0.5]
+
     def test_after_close(self, make_pool):
         pool = make_pool()
         pids = pool.processes()
@@ -759,7 +776,8 @@ class TestEndOfParent:
         wait_until(lambda: not any(map(is_alive, pids)))
         (left,) = temp_root.iterdir()
         sweep.cache_clear()
-        made = make_folder()
+        made = folder_name()
+        make_folder(made)
         assert not left.exists()
         sweep.cache_clear()
         sweep()

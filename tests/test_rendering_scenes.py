@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 
+import fuzz_driver
 import fuzz_rendering
 import numpy as np
 import pygame
@@ -434,10 +435,10 @@ class TestWindow:
 
 def test_odd_arguments_raise_nothing_but_our_own_errors():
     """A short form of ``python tests/fuzz_rendering.py``."""
-    counts, failures = fuzz_rendering.run(800, seed="tests")
-    assert failures == []
-    assert sum(counts.values()) == 800
-    assert min(counts["accepted"], counts["refused"]) > 20
+    tally = fuzz_driver.run(fuzz_rendering.program, 800, seed="tests")
+    assert tally.failures == []
+    assert tally.total("accepted") + tally.total("refused") == 800
+    assert min(tally.total("accepted"), tally.total("refused")) > 20
 
 
 def test_a_window_without_a_display_says_so_each_time(monkeypatch):

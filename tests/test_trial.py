@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from fmu_tools import HERE, PlainEnv, edited_fmu, library_name, write_fmu
+from fmu_tools import PlainEnv, compiled, edited_fmu, library_name, write_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
@@ -35,14 +35,6 @@ CONFIG = {
 }
 
 
-@functools.cache
-def mortal_library(folder):
-    path = folder / "Mortal.so"
-    command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
-    subprocess.run([*command, str(HERE / "mortal.c"), "-o", str(path)], check=True)
-    return path.read_bytes()
-
-
 @pytest.fixture(scope="module")
 def make_fmu(tmp_path_factory):
     """Make an FMU that does as it is told."""
@@ -51,7 +43,7 @@ def make_fmu(tmp_path_factory):
     def make(token="", **add):
         files = {
             "modelDescription.xml": XML.format(token=token),
-            library_name(2, "Mortal"): mortal_library(folder),
+            library_name(2, "Mortal"): compiled("mortal.c"),
         }
         return write_fmu(folder / token.replace(" ", "_") / "Mortal.fmu", files | add)
 

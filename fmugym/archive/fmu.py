@@ -25,7 +25,7 @@ from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
 from fmugym.archive.reading import read_model_description
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
-from fmugym.archive.temporary import make_folder, remove_folder
+from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 
@@ -34,7 +34,7 @@ __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
 logger = logging.getLogger(__name__)
 
 DEFAULT_PROBE_TIMEOUT: Final = 60.0
-"""Seconds that the trial of an unknown FMU may take, including the start of its process."""
+"""Seconds that a call may take in the trial of an unknown FMU; for an initialization, ten times."""
 
 _NEVER_NEEDED: Final = {"documentation", "sources"}
 _MOST_FINDINGS: Final = 20
@@ -133,8 +133,8 @@ class FMU(LoadableFMU):
         limits: What is too large to be opened; by default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's, which may need them: paths, or names
             that the system's loader finds.
-        probe_timeout: Seconds that the first load and step of an unknown FMU may take in a process
-            of its own; None to do without. See ``fmugym.trial``.
+        probe_timeout: Seconds that a call of an unknown FMU may take in a trial in a process of its
+            own; None to do without. See ``fmugym.trial``.
 
     Attributes:
         path: The file's absolute path.
@@ -234,8 +234,9 @@ class FMU(LoadableFMU):
             return ()
         if self._folder is not None:
             return self._missing_in(self._folder)
-        folder = make_folder()
+        folder = folder_name()
         try:
+            make_folder(folder)
             self._extract_to(folder, only="binaries")
             return self._missing_in(folder)
         finally:
@@ -258,9 +259,10 @@ class FMU(LoadableFMU):
         if self._folder is not None:
             return self._folder
         self._check_library()
-        folder = make_folder()
+        folder = folder_name()
         self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
         try:
+            make_folder(folder)
             self._extract_to(folder)
         except BaseException:
             self.close()

@@ -26,48 +26,50 @@ class Source(NamedTuple):
 
 _STAND_IN: Final = "no current distribution has it; 'fmugym stand-in FMU' makes a replacement"
 
-_SOURCES: Final[tuple[tuple[str, Source], ...]] = (
-    (r"libgfortran\.so\.3", Source("", "libgfortran=3", _STAND_IN)),
-    (r"libgfortran\.so\.4", Source("", "libgfortran-ng=7", _STAND_IN)),
-    (r"libgfortran\.so\.5", Source("libgfortran5", "libgfortran5")),
-    (r"libquadmath\.so\.0", Source("libquadmath0", "libquadmath")),
-    (r"libgomp\.so\.1", Source("libgomp1", "libgomp")),
-    (r"libgcc_s\.so\.1", Source("libgcc-s1", "libgcc")),
-    (r"libstdc\+\+\.so\.6", Source("libstdc++6", "libstdcxx")),
-    (r"libstdc\+\+\.so\.5", Source("libstdc++5", "")),
-    (r"libblas\.so\.3", Source("libblas3", "libblas")),
-    (r"liblapack\.so\.3", Source("liblapack3", "liblapack")),
-    (r"libopenblas\.so\.0", Source("libopenblas0", "libopenblas")),
-    (r"libsundials_.*\.so.*", Source("libsundials-dev", "sundials", "the version must match")),
-    (r"libklu\.so.*", Source("libsuitesparse-dev", "suitesparse", "the version must match")),
-    (r"libsuperlu\.so.*", Source("libsuperlu-dev", "superlu", "the version must match")),
-    (r"libhdf5.*\.so.*", Source("libhdf5-dev", "hdf5", "the version must match")),
-    (r"libxml2\.so\.2", Source("libxml2", "libxml2")),
-    (r"libexpat\.so\.1", Source("libexpat1", "libexpat")),
-    (r"libz\.so\.1", Source("zlib1g", "libzlib")),
-    (r"libcurl\.so\.4", Source("libcurl4", "libcurl")),
-    (r"lib(ssl|crypto)\.so\.3", Source("libssl3", "openssl=3")),
-    (r"lib(ssl|crypto)\.so\.1\.1", Source("", "openssl=1.1", "Debian had it up to release 11")),
-    (r"lib(ssl|crypto)\.so\.1\.0.*", Source("", "openssl=1.0", "Debian had it up to release 9")),
-    (r"libtbb\.so\.2", Source("libtbb2", "tbb=2020", "Debian had it up to release 11")),
-    (r"libtbb\.so\.12", Source("libtbb12", "tbb")),
-    (r"libQt5.*\.so\.5", Source("libqt5core5a", "qt-main=5", "Debian has a package a module")),
-    (r"libQt6.*\.so\.6", Source("libqt6core6", "qt6-main", "Debian has a package a module")),
-    (r"libboost_.*\.so.*", Source("libboost-all-dev", "libboost", "the version must match")),
-    (r"libjvm\.so", Source("default-jre-headless", "openjdk", "its folder must be searched")),
-    (r"libpython3\.\d+m?\.so\..*", Source("", "python", "the version must match")),
-    (r"libtinfo\.so\.5", Source("libtinfo5", "ncurses=5")),
-    (r"libncurses\.so\.5", Source("libncurses5", "ncurses=5")),
-    (r"libnsl\.so\.1", Source("libc6", "libnsl")),
-    (r"libcrypt\.so\.1", Source("libcrypt1", "libxcrypt")),
-    (r"libX11\.so\.6", Source("libx11-6", "xorg-libx11")),
-    (r"libGL\.so\.1", Source("libgl1", "libgl")),
-    (
-        r"libmw.*\.so.*|libmx\.so|libmex\.so",
-        Source("", "", "it belongs to MATLAB or its free runtime"),
-    ),
-    (r"ld-musl-.*", Source("musl", "", "the FMU was built for Alpine Linux")),
+_MATCHING: Final = "the version must match"
+
+_ROWS: Final[tuple[tuple[str, ...], ...]] = (
+    (r"libgfortran\.so\.3", "", "libgfortran=3", _STAND_IN),
+    (r"libgfortran\.so\.4", "", "libgfortran-ng=7", _STAND_IN),
+    (r"libgfortran\.so\.5", "libgfortran5", "libgfortran5"),
+    (r"libquadmath\.so\.0", "libquadmath0", "libquadmath"),
+    (r"libgomp\.so\.1", "libgomp1", "libgomp"),
+    (r"libgcc_s\.so\.1", "libgcc-s1", "libgcc"),
+    (r"libstdc\+\+\.so\.6", "libstdc++6", "libstdcxx"),
+    (r"libstdc\+\+\.so\.5", "libstdc++5"),
+    (r"libblas\.so\.3", "libblas3", "libblas"),
+    (r"liblapack\.so\.3", "liblapack3", "liblapack"),
+    (r"libopenblas\.so\.0", "libopenblas0", "libopenblas"),
+    (r"libsundials_.*\.so.*", "libsundials-dev", "sundials", _MATCHING),
+    (r"libklu\.so.*", "libsuitesparse-dev", "suitesparse", _MATCHING),
+    (r"libsuperlu\.so.*", "libsuperlu-dev", "superlu", _MATCHING),
+    (r"libhdf5.*\.so.*", "libhdf5-dev", "hdf5", _MATCHING),
+    (r"libxml2\.so\.2", "libxml2", "libxml2"),
+    (r"libexpat\.so\.1", "libexpat1", "libexpat"),
+    (r"libz\.so\.1", "zlib1g", "libzlib"),
+    (r"libcurl\.so\.4", "libcurl4", "libcurl"),
+    (r"lib(ssl|crypto)\.so\.3", "libssl3", "openssl=3"),
+    (r"lib(ssl|crypto)\.so\.1\.1", "", "openssl=1.1", "Debian had it up to release 11"),
+    (r"lib(ssl|crypto)\.so\.1\.0.*", "", "openssl=1.0", "Debian had it up to release 9"),
+    (r"libtbb\.so\.2", "libtbb2", "tbb=2020", "Debian had it up to release 11"),
+    (r"libtbb\.so\.12", "libtbb12", "tbb"),
+    (r"libQt5.*\.so\.5", "libqt5core5a", "qt-main=5", "Debian has a package a module"),
+    (r"libQt6.*\.so\.6", "libqt6core6", "qt6-main", "Debian has a package a module"),
+    (r"libboost_.*\.so.*", "libboost-all-dev", "libboost", _MATCHING),
+    (r"libjvm\.so", "default-jre-headless", "openjdk", "its folder must be searched"),
+    (r"libpython3\.\d+m?\.so\..*", "", "python", _MATCHING),
+    (r"libtinfo\.so\.5", "libtinfo5", "ncurses=5"),
+    (r"libncurses\.so\.5", "libncurses5", "ncurses=5"),
+    (r"libnsl\.so\.1", "libc6", "libnsl"),
+    (r"libcrypt\.so\.1", "libcrypt1", "libxcrypt"),
+    (r"libX11\.so\.6", "libx11-6", "xorg-libx11"),
+    (r"libGL\.so\.1", "libgl1", "libgl"),
+    (r"libmw.*\.so.*|libmx\.so|libmex\.so", "", "", "it belongs to MATLAB or its free runtime"),
+    (r"ld-musl-.*", "musl", "", "the FMU was built for Alpine Linux"),
 )
+"""A pattern of names of libraries, and the fields of their ``Source``."""
+
+_SOURCES: Final = tuple((re.compile(pattern), Source(*fields)) for pattern, *fields in _ROWS)
 
 
 _TOOLS: Final = (
@@ -109,8 +111,7 @@ def source_of(library: str) -> Source:
     Returns:
         The packages; empty texts if the library is not known.
     """
-    rows = (source for pattern, source in _SOURCES if re.fullmatch(pattern, library))
-    return next(rows, Source())
+    return next((source for names, source in _SOURCES if names.fullmatch(library)), Source())
 
 
 def describe_missing(fmu: str, libraries: Sequence[str]) -> str:

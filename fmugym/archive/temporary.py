@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import re
+import secrets
 import shutil
 import sys
 import tempfile
@@ -13,28 +14,49 @@ from typing import Final
 
 from fmugym.errors import FMULoadError
 
-__all__ = ["make_folder", "remove_folder", "sweep"]
+__all__ = ["folder_name", "make_folder", "remove_folder", "sweep"]
 
 _NAME: Final = re.compile(r"fmugym-(?P<pid>\d+)-(?P<namespace>\d+)-\w+")
 
 
-def make_folder() -> Path:
-    """Make a temporary folder of this process, after a first look for those of dead ones.
+def folder_name() -> Path:
+    """A name for a temporary folder of this process, after a first look for those of dead ones.
+
+    There is no such folder yet. So the caller can see to its removal before it makes it, and no
+    signal comes in between.
+
+    Raises:
+        FMULoadError: If the system has no folder for temporary files.
+    """
+    name = f"fmugym-{os.getpid()}-{_namespace()}-{secrets.token_hex(8)}"
+    try:
+        sweep()
+        return Path(tempfile.gettempdir(), name)
+    except OSError as error:
+        raise FMULoadError(f"no temporary folder can be made: {error}") from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a temporary folder, which only this user can read.
 
     Raises:
         FMULoadError: If the system refuses, for example because the disk is full.
     """
     try:
-        sweep()
-        return Path(tempfile.mkdtemp(prefix=f"fmugym-{os.getpid()}-{_namespace()}-"))
+        folder.mkdir(0o700)
     except OSError as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
 
 
 def remove_folder(folder: Path, owner: int) -> None:
     """Remove a folder, unless this process is only a fork of its owner."""
-    if os.getpid() == owner:
+    if os.getpid() != owner:
+        return
+    try:
         shutil.rmtree(folder, ignore_errors=True)
+    except BaseException:  # such as KeyboardInterrupt: nobody comes back for the rest
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 @functools.cache

@@ -96,7 +96,7 @@ class _Native:
             "unzipDirectory": str(folder),
         }
         with _load_lock:
-            working_directory = os.getcwd()
+            working_directory = _working_directory(self.fmu)
             try:
                 self.slave.__init__(**arguments)
             except Exception as error:
@@ -112,3 +112,13 @@ class _Native:
             fmpy.freeLibrary(self.slave.dll._handle)
             self.slave = None
         self.fmu.close()
+
+
+def _working_directory(fmu: LoadableFMU) -> str:
+    try:
+        return os.getcwd()
+    except OSError as error:
+        name = fmu.path.name
+        raise FMULoadError(
+            f"{name} cannot be loaded from this working directory: {error}"
+        ) from None

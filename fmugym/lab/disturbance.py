@@ -59,6 +59,18 @@ class Disturbance(Protocol):
         ...
 
 
+class _Pull:
+    """What the disturbances share that pull the joints to a position."""
+
+    disturbance_position: Sequence[float] | None
+    torque = None
+
+    @property
+    def position(self) -> Sequence[float]:
+        """The position to which it pulls the joints, in rad."""
+        return self.disturbance_position or (0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class TimedTorqueDisturbance:
     """An external torque at a fixed time.
@@ -86,7 +98,7 @@ class TimedTorqueDisturbance:
 
 
 @dataclass(frozen=True)
-class TimedPositionDisturbance:
+class TimedPositionDisturbance(_Pull):
     """A pull to a position at a fixed time.
 
     Args:
@@ -101,15 +113,9 @@ class TimedPositionDisturbance:
     trigger_time: float
     disturbance_position: Sequence[float] | None = None
     duration: float = 0.5
-    torque = None
 
     def __post_init__(self) -> None:
         _check_fields(self)
-
-    @property
-    def position(self) -> Sequence[float]:
-        """The position to which it pulls the joints, in rad."""
-        return self.disturbance_position or (0.0, 0.0)
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
         """See ``Disturbance.is_due``."""
@@ -148,7 +154,7 @@ class StateDependentTorqueDisturbance:
 
 
 @dataclass(frozen=True)
-class StateDependentPositionDisturbance:
+class StateDependentPositionDisturbance(_Pull):
     """A pull to a position that begins when the joints first come near another position.
 
     Args:
@@ -167,15 +173,9 @@ class StateDependentPositionDisturbance:
     duration: float = 0.5
     tolerance: float = 0.1
     earliest: float = 0.0
-    torque = None
 
     def __post_init__(self) -> None:
         _check_fields(self)
-
-    @property
-    def position(self) -> Sequence[float]:
-        """The position to which it pulls the joints, in rad."""
-        return self.disturbance_position or (0.0, 0.0)
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
         """See ``Disturbance.is_due``."""

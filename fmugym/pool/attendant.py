@@ -1,8 +1,10 @@
-"""What goes with resets of demanding FMUs: waiting for licences."""
+"""What goes with resets of demanding FMUs: waiting for licences, and telling what takes long."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -11,11 +13,13 @@ import numpy as np
 from fmugym.archive.description import Variable
 from fmugym.errors import LicenceError
 from fmugym.fmi.status import Status
-from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
+from fmugym.pool.health import CountedPool
 from fmugym.pool.patience import Patience, speaks_of_licence
+from fmugym.pool.progress import INITIALIZATION, STEP, announce, hears_calls, progress
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["Attendant", "Reset"]
+__all__ = ["Attendant", "AttendedPool"]
 
 Reset = Callable[[tuple[Variable, ...], FloatArray, MaskArray | None], Any]
 """A pool's own function for resets, without an attendant."""
@@ -25,17 +29,20 @@ class Attendant:
     """Goes with the resets of a pool.
 
     Args:
+        name: The FMU, for messages.
         spec: Says how long to wait for a licence.
         log: Is told what this waits for.
     """
 
-    def __init__(self, spec: PoolSpec, log: logging.Logger) -> None:
+    def __init__(self, name: str, spec: PoolSpec, log: logging.Logger) -> None:
+        self._name, self._log = name, log
         self._patience = Patience(spec.licence_wait, log)
 
     @classmethod
-    def of(cls, spec: PoolSpec, log: logging.Logger) -> Attendant | None:
-        """Make the attendant that a spec needs; None if it needs none."""
-        return cls(spec, log) if spec.licence_wait else None
+    def of(cls, name: str, spec: PoolSpec, log: logging.Logger) -> Attendant | None:
+        """Make the attendant that a pool needs; None if it needs none."""
+        needed = spec.licence_wait or log.isEnabledFor(logging.INFO) or hears_calls()
+        return cls(name, spec, log) if needed else None
 
     def reset(
         self,
@@ -55,19 +62,21 @@ class Attendant:
             mask: As for ``Pool.reset``.
         """
         chosen = np.ones(pool.num_instances, np.bool_) if mask is None else np.asarray(mask)
+        what = f"{self._name}: the initialization of {np.count_nonzero(chosen)} instance(s)"
 
         def attempt() -> None:
             nonlocal chosen
-            reset(variables, values, chosen)
+            with progress(self._log, what):
+                reset(variables, values, chosen)
             refused = _refusals(pool, chosen)
             if refused:
                 chosen = np.isin(np.arange(pool.num_instances), list(refused))
                 raise LicenceError(next(iter(refused.values())))
 
-        try:
+        announce(INITIALIZATION)
+        with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
             self._patience.call(attempt)
-        except LicenceError:  # the statuses tell, as for every failure
-            return
+        announce(STEP)
 
 
 def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
@@ -75,3 +84,29 @@ def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
     failed = np.flatnonzero(chosen & (pool.statuses > Status.WARNING)).tolist()
     texts = {index: pool.failure(index) for index in failed}
     return {index: text for index, text in texts.items() if speaks_of_licence(text)}
+
+
+class AttendedPool(CountedPool):
+    """A pool whose resets somebody may go with."""
+
+    _attendant: Attendant | None = None
+
+    def attend(self, attendant: Attendant | None) -> None:
+        """Let somebody go with all calls of ``reset`` from now on."""
+        self._attendant = attendant
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``."""
+        if self._attendant is None:
+            self._reset_some(variables, values, mask)
+        else:
+            self._attendant.reset(self, self._reset_some, variables, values, mask)
+        return self.outputs, self.statuses
+
+    @abstractmethod
+    def _reset_some(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> Any:
+        """Do what ``reset`` does, without an attendant."""

@@ -6,10 +6,11 @@ import logging
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError
-from fmugym.pool.base import Pool
+from fmugym.pool.attendant import Attendant, AttendedPool
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.patience import licence_errors
+from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.python import PythonPool
 from fmugym.pool.spec import PoolSpec
 
@@ -28,7 +29,8 @@ def local_pool(
     private_libraries: bool | None = False,
     first_index: int = 0,
     counts: HealthArray | None = None,
-) -> Pool:
+    attended: bool = True,
+) -> AttendedPool:
     """Make a pool that loads the FMU into this process.
 
     Args:
@@ -41,16 +43,26 @@ def local_pool(
         private_libraries: See ``NativePool``; the Python pool has one library.
         first_index: See ``NativePool``.
         counts: See ``NativePool``.
+        attended: Whether an ``Attendant`` goes with resets where one is needed.
 
     Raises:
         LicenceError: If the FMU gets no licence.
         FMULoadError: If the FMU cannot be loaded or instantiated, or if the Python pool is asked
             for private libraries.
     """
-    if has_native_pool() if native is None else native:
+    native = has_native_pool() if native is None else native
+    if private_libraries and not native:
+        fmu.close()
+        raise FMULoadError(
+            f"{fmu.path.name} needs a library of its own for each of {num_instances} "
+            "instances, which only the native pool or isolation='process' can provide"
+        )
+    announce(INITIALIZATION)  # an FMU may do all of its work when it is instantiated
+    pool: AttendedPool
+    if native:
         from fmugym.pool.native import NativePool
 
-        return NativePool(
+        pool = NativePool(
             fmu,
             spec,
             num_instances,
@@ -60,10 +72,9 @@ def local_pool(
             first_index=first_index,
             counts=counts,
         )
-    if private_libraries:
-        fmu.close()
-        raise FMULoadError(
-            f"{fmu.path.name} needs a library of its own for each of {num_instances} "
-            "instances, which only the native pool or isolation='process' can provide"
-        )
-    return PythonPool(fmu, spec, num_instances, log, counts=counts)
+    else:
+        pool = PythonPool(fmu, spec, num_instances, log, counts=counts)
+    if attended:
+        pool.attend(Attendant.of(fmu.path.name, spec, log))
+    announce(STEP)
+    return pool

@@ -32,7 +32,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
-from fmugym.pool.attendant import Attendant
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -41,7 +41,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import CountedPool, HealthArray, no_counts
+from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
@@ -82,7 +82,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(CountedPool):
+class NativePool(AttendedPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -143,7 +143,6 @@ class NativePool(CountedPool):
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self.step_own = self._pool.step_own
-        self._attendant = Attendant.of(spec, log)
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
@@ -225,16 +224,6 @@ class NativePool(CountedPool):
         return not self._spec.licence_wait
 
     # The contract of Pool.
-
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``."""
-        if self._attendant is None:
-            self.reset_into(variables, values, mask)
-        else:
-            self._attendant.reset(self, self.reset_into, variables, values, mask)
-        return self._result
 
     def step(
         self,
@@ -403,6 +392,8 @@ class NativePool(CountedPool):
             self._open_pool()
             values = np.asarray(values, np.float64)
             return self._reset(access, values, _as_mask(mask), observations)
+
+    _reset_some = reset_into
 
     def step_or_reset(
         self,

@@ -6,6 +6,7 @@ import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,9 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.log import raise_caught
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
-from fmugym.pool.attendant import Attendant
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
-from fmugym.pool.health import CountedPool, HealthArray, no_counts, note
+from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.slot import Slot, Snapshot
@@ -27,8 +28,11 @@ from fmugym.pool.spec import ResetMethod
 
 __all__ = ["PythonPool"]
 
+_WARNING: Final = int(Status.WARNING)
+"""An enumeration's member has Python code, in which numpy drops what a signal handler raises."""
 
-class PythonPool(CountedPool):
+
+class PythonPool(AttendedPool):
     """N instances stepped one after another; see ``Pool`` for the contract.
 
     Args:
@@ -60,7 +64,6 @@ class PythonPool(CountedPool):
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
-        self._attendant = Attendant.of(spec, log)
         self._library = Library(fmu, log)
         pacer = Pacer(spec)
         try:
@@ -77,17 +80,7 @@ class PythonPool(CountedPool):
         recycle = functools.partial(_recycle, self._slots)
         self._watch = watch_leaks(fmu, spec, self._counts, recycle, log)
 
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``."""
-        if self._attendant is None:
-            self._reset(variables, values, mask)
-        else:
-            self._attendant.reset(self, self._reset, variables, values, mask)
-        return self.outputs, self.statuses
-
-    def _reset(
+    def _reset_some(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
         if self._watch is None:
@@ -132,7 +125,7 @@ class PythonPool(CountedPool):
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
         self.step(None, None, self.observations)
-        return int(np.count_nonzero(self.statuses > Status.WARNING))
+        return int(np.count_nonzero(self.statuses > _WARNING))
 
     def save(self) -> list[Snapshot]:
         """See ``Pool.save``."""

@@ -12,6 +12,7 @@ from fmugym.archive.description import Variable
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "DEFAULT_LEAK_LIMIT",
+    "INITIALIZATION_FACTOR",
     "ISOLATIONS",
     "PoolSpec",
     "ResetMethod",
@@ -23,6 +24,9 @@ ISOLATIONS: Final = ("none", "process")
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
 """How long a call to a worker process may take, in seconds of real time."""
+
+INITIALIZATION_FACTOR: Final = 10
+"""How many times as long as another call an instantiation or initialization may take."""
 
 DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
 """How many bytes resets may leak."""

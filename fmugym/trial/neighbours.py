@@ -25,6 +25,7 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.local import local_pool
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.patience import licence_errors, require_licence
+from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
 from fmugym.trial.trial import Candidate
@@ -288,6 +289,7 @@ class _Life:
         """Make, initialize, step and free an instance; return all outputs."""
         company = company or _Company()
         spec = self._spec
+        announce(INITIALIZATION)
         with company.turn, licence_errors():
             self._pacer.wait()
             instance = self._library.instantiate()
@@ -299,6 +301,7 @@ class _Life:
                     spec.start_time, spec.stop_time, spec.tolerance, _no_start_values
                 )
             company.before_steps()
+            announce(STEP)
             return _steps(instance, spec, self._inputs)
         finally:
             with company.turn:

@@ -9,12 +9,14 @@ from typing import Any
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError, LicenceError, SimulationError, unknown_name
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.progress import progress
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
@@ -87,7 +89,8 @@ def make_pool(
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
-        pool = _open(fmu, spec, num_instances, log, completed, call_timeout)
+        with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
+            pool = _open(fmu, spec, num_instances, log, completed, call_timeout)
         if rehearse and reset_method is None:
             _rehearse(pool, fmu, spec, starts, verdict, completed, log)
         return pool
@@ -106,7 +109,7 @@ def _open(
 ) -> Pool:
     spec = replace(spec, reset_method=plan.method, one_initialization=plan.one_initialization)
     if plan.isolation == "process":
-        return ProcessPool(
+        pool = ProcessPool(
             fmu,
             spec,
             num_instances,
@@ -116,6 +119,8 @@ def _open(
             threads=plan.threads,
             call_timeout=call_timeout,
         )
+        pool.attend(Attendant.of(fmu.path.name, spec, log))
+        return pool
     return local_pool(
         fmu,
         spec,

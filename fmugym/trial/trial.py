@@ -22,6 +22,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
@@ -37,7 +38,8 @@ from fmugym.errors import FMULoadError, LicenceError
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.progress import INITIALIZATION
+from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 from fmugym.trial.cache import recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -59,6 +61,12 @@ _ALONE: Final = {"loading and instantiation", "initialization", "the first step"
 """The stages of a single instance. If a worker ends there only when memory is checked, the FMU
 writes to memory that it must not touch."""
 
+
+_LOOK: Final = 0.1
+"""Seconds between two looks at a worker."""
+
+_EVERY: Final = 10.0
+"""Seconds between two messages about a worker that takes long."""
 
 _MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
 """How glibc begins its messages about memory errors."""
@@ -349,12 +357,70 @@ def _watch(folder: Path, request: Request) -> tuple[str, list[str]]:
     )
     tail = OutputTail(cast(BinaryIO, process.stdout))
     try:
-        end = f"ended the process with {describe_exit(process.wait(timeout))}"
-    except subprocess.TimeoutExpired:
-        end = f"did not come back within {timeout:g} s (probe_timeout)"
+        end = _wait(process, _Watch(folder, request.candidate.path.name, timeout))
     finally:
         _end(process)
     return end, tail.lines()
+
+
+def patience(call: str, timeout: float) -> float:
+    """How many seconds a call may take in a trial: an initialization may take ten times as long."""
+    return timeout * INITIALIZATION_FACTOR if call == INITIALIZATION else timeout
+
+
+class _Watch:
+    """Looks at what a worker does, and for how long.
+
+    Args:
+        folder: Where it writes down its stage and the call it makes.
+        name: The FMU.
+        timeout: Seconds that a call may take.
+    """
+
+    def __init__(self, folder: Path, name: str, timeout: float) -> None:
+        self._file, self._folder = folder / "call", folder
+        self._name, self._timeout = name, timeout
+        self._change = 0
+        self._call = INITIALIZATION
+        self._begin = self._told = time.monotonic()
+
+    def look(self) -> str:
+        """Look at the worker, and log every ten seconds what takes so long.
+
+        Returns:
+            How it ended, if a call has taken too long; otherwise "".
+        """
+        self._notice_call()
+        seconds = time.monotonic() - self._begin
+        if time.monotonic() - self._told >= _EVERY:
+            self._told = time.monotonic()
+            stage = _stage(self._folder) or "its start"
+            doing = f"{stage}; {self._call}"
+            logger.info("%s: the trial is in %s has taken %.0f s", self._name, doing, seconds)
+        limit = patience(self._call, self._timeout)
+        if seconds < limit:
+            return ""
+        if limit == self._timeout:
+            return f"did not come back within {limit:g} s (probe_timeout)"
+        return f"did not come back from {self._call} within {limit:g} s (ten times probe_timeout)"
+
+    def _notice_call(self) -> None:
+        with contextlib.suppress(OSError):
+            change = self._file.stat().st_mtime_ns
+            if change != self._change:
+                self._change, self._begin = change, time.monotonic()
+                self._call = self._file.read_text() or self._call
+
+
+def _wait(process: subprocess.Popen[bytes], watch: _Watch) -> str:
+    """Wait for the end of a worker; return how it ended."""
+    while True:
+        try:
+            return f"ended the process with {describe_exit(process.wait(_LOOK))}"
+        except subprocess.TimeoutExpired:
+            late = watch.look()
+            if late:
+                return late
 
 
 def _environment(folder: Path, check_memory: bool) -> dict[str, str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import faulthandler
+import functools
 import json
 import logging
 import os
@@ -28,15 +29,20 @@ from fmugym.pool.extension import has_native_pool
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.process.output import print_line_by_line
+from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.rehearsal import Rehearsal, Starts
-from fmugym.trial.trial import Request, Stage
+from fmugym.trial.trial import Request, Stage, patience
 from fmugym.trial.verdict import Grade, Neighbours
 
 _NO_DIALOGUES: Final = 0x0003
 """``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""
+
+
+_GRACE: Final = 1.0
+"""Seconds that the parent has to end this process before it ends itself."""
 
 
 class Notes:
@@ -44,15 +50,21 @@ class Notes:
 
     Args:
         folder: The folder for the files.
+        timeout: Seconds that a call may take.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, timeout: float) -> None:
+        self._folder, self._timeout = folder, timeout
         self._answer: dict[str, Any] = {}
 
     def stage(self, stage: str) -> None:
         """Write down what comes next."""
         (self._folder / "stage").write_text(stage)
+
+    def call(self, call: str) -> None:
+        """Write down which call of the FMU comes next."""
+        (self._folder / "call").write_text(call)
+        _end_after(patience(call, self._timeout))
 
     def answer(self, **values: Any) -> None:
         """Add to the answer; the file is replaced atomically."""
@@ -69,8 +81,10 @@ def main(folder: Path) -> None:
         folder: The folder that has the request and gets the stage and the answer.
     """
     request: Request = pickle.loads((folder / "request").read_bytes())
-    _prepare(request.candidate.timeout or DEFAULT_PROBE_TIMEOUT)
-    notes = Notes(folder)
+    _prepare()
+    notes = Notes(folder, request.candidate.timeout or DEFAULT_PROBE_TIMEOUT)
+    notes.call(INITIALIZATION)
+    listen(notes.call)
     notes.answer(instances=1)
     try:
         _try(request, notes)
@@ -88,10 +102,18 @@ def _try(request: Request, notes: Notes) -> None:
             _try_several(request, notes)
 
 
-def _prepare(timeout: float) -> None:
-    """End at the time-out, even if the parent was killed; leave no core dump."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    faulthandler.dump_traceback_later(timeout, exit=True, file=nowhere)
+def _end_after(seconds: float) -> None:
+    """End this process then, even if the parent was killed, unless this is called again before."""
+    faulthandler.dump_traceback_later(seconds + _GRACE, exit=True, file=_nowhere())
+
+
+@functools.cache
+def _nowhere() -> int:
+    return os.open(os.devnull, os.O_WRONLY)
+
+
+def _prepare() -> None:
+    """Leave no dialog and no core dump, and lose no output."""
     if sys.platform == "win32":
         ctypes.windll.kernel32.SetErrorMode(_NO_DIALOGUES)
     else:

@@ -33,7 +33,8 @@ def require_settable(name: str) -> None:
     Raises:
         ConfigError: If the name is one of ``FMUEnv``'s own.
     """
-    if name in _KEPT_FOR_ALL or hasattr(FMUEnv, name) or name in FMUEnv.__annotations__:
+    declared = any(name in vars(cls).get("__annotations__", ()) for cls in FMUEnv.__mro__)
+    if name in _KEPT_FOR_ALL or hasattr(FMUEnv, name) or declared:
         raise ConfigError(f"{name!r} cannot be set: every environment keeps it itself")
 
 

@@ -17,7 +17,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import MaskArray
 from fmugym.pool.health import Column
 from fmugym.pool.process.shared_memory import Arrays, Memory
-from fmugym.pool.process.supervisor import LostError, Supervisor
+from fmugym.pool.process.supervisor import INSTANTIATION, LostError, Supervisor, patience_with
 from fmugym.pool.process.worker import Setup
 
 __all__ = ["Crew"]
@@ -75,7 +75,7 @@ class Crew:
             for supervisor in self.supervisors:
                 supervisor.start()
             for supervisor in self.supervisors:
-                supervisor.finish_opening(self._deadline())
+                supervisor.finish_opening(self._deadline(INSTANTIATION))
         except LostError as lost:
             self.close()
             raise FMULoadError(str(lost)) from None
@@ -83,8 +83,8 @@ class Crew:
             self.close()
             raise
 
-    def _deadline(self) -> float:
-        return time.monotonic() + self._call_timeout
+    def _deadline(self, doing: str) -> float:
+        return time.monotonic() + self._call_timeout * patience_with(doing)
 
     def run(
         self,
@@ -107,7 +107,7 @@ class Crew:
         """
         if self.refusal:
             raise SimulationError(self.refusal)
-        deadline = self._deadline()
+        deadline = self._deadline(doing)
         replies: dict[Supervisor, Any] = {}
         try:
             for supervisor in supervisors:
@@ -153,7 +153,7 @@ class Crew:
     def retire(self, supervisor: Supervisor, reason: str) -> None:
         """End a worker that has not failed; its instances are lost until their reset."""
         block = supervisor.block
-        supervisor.retire(reason, self._deadline())
+        supervisor.retire(reason, self._deadline("its end"))
         self.lost[block] = True
         self._arrays.counts[block, [[Column.REPLACEMENTS], [Column.RECYCLINGS]]] += 1
 
@@ -194,12 +194,14 @@ def _raise_any(replies: Iterable[Any]) -> None:
 
 def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, patience: float) -> None:
     deadline = time.monotonic() + patience
-    for supervisor in supervisors:
-        supervisor.begin_closing()
-    for supervisor in supervisors:
-        supervisor.close(deadline)
-    memory.close()
-    fmu.close()
+    try:
+        for supervisor in supervisors:
+            supervisor.begin_closing()
+        for supervisor in supervisors:
+            supervisor.close(deadline)
+    finally:  # also after KeyboardInterrupt
+        memory.close()
+        fmu.close()
 
 
 def _forget_crews() -> None:

@@ -25,7 +25,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status
-from fmugym.pool.attendant import Attendant
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -34,7 +34,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.health import CountedPool, HealthArray
+from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
@@ -45,7 +45,7 @@ from fmugym.pool.spec import ResetMethod
 __all__ = ["ProcessPool"]
 
 
-class ProcessPool(CountedPool):
+class ProcessPool(AttendedPool):
     """N instances in blocks of supervised processes; see ``Pool`` for the contract.
 
     Args:
@@ -57,8 +57,9 @@ class ProcessPool(CountedPool):
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
-        call_timeout: How long a call may take, in seconds of real time; None for ever. A worker
-            that takes longer is ended, unless a debugger holds it.
+        call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
+            may take ten times as long. None for ever. A worker that takes longer is ended, unless
+            a debugger holds it.
 
     Attributes:
         workers: How many processes there are.
@@ -99,25 +100,15 @@ class ProcessPool(CountedPool):
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
         setups = _share_out(replace(setup, native=native, threads=threads), self.workers)
-        self._attendant = Attendant.of(spec, log)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
 
     # The contract of Pool.
 
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``; if a worker dies in it, a new worker tries again."""
-        if self._attendant is None:
-            self._reset_all(variables, values, mask)
-        else:
-            self._attendant.reset(self, self._reset_all, variables, values, mask)
-        return self.outputs, self.statuses
-
-    def _reset_all(
+    def _reset_some(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
+        """Reset blocks; if a worker dies in it, a new worker tries again."""
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
@@ -373,9 +364,7 @@ def _share_out(setup: Setup, workers: int) -> list[Setup]:
     """Give each worker a block of the instances, the blocks as equal as can be."""
     bounds = [setup.num_instances * index // workers for index in range(workers + 1)]
     blocks = itertools.starmap(slice, itertools.pairwise(bounds))
-    specs = (
-        replace(setup.spec, turn=(number, workers), licence_wait=0.0) for number in range(workers)
-    )
+    specs = (replace(setup.spec, turn=(number, workers)) for number in range(workers))
     return [
         replace(setup, block=block, number=number, spec=spec)
         for number, (block, spec) in enumerate(zip(blocks, specs, strict=True))

@@ -20,9 +20,13 @@ from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo
 from fmugym.pool.process.worker import Setup
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 
-__all__ = ["LostError", "Supervisor"]
+__all__ = ["INSTANTIATION", "LostError", "Supervisor", "patience_with"]
+
+INSTANTIATION: Final = "the instantiation"
+_SLOW: Final = (INSTANTIATION, "a reset")
+"""What may take ten times as long as other calls: models may need minutes to initialize."""
 
 _MOST_DEATHS: Final = 5
 """Deaths in a row, without a successful reset, after which no worker is started any more."""
@@ -38,6 +42,11 @@ _LONGEST_KILL: Final = 2.0
 
 _TAIL: Final = 10
 """How many of the FMU's last messages the cause of a death quotes."""
+
+
+def patience_with(doing: str) -> int:
+    """How many call time-outs something may take."""
+    return INITIALIZATION_FACTOR if doing in _SLOW else 1
 
 
 class LostError(Exception):
@@ -76,6 +85,7 @@ class Supervisor:
         self._deaths = 0
         self._process: Process | None = None
         self._opening = self._busy = False
+        self._asked = 0.0
 
     @property
     def pid(self) -> int:
@@ -209,7 +219,7 @@ class Supervisor:
 
     def step(self, code: bytes) -> None:
         """Ask the worker to step; failures show in the reply."""
-        self._busy = True
+        self._busy, self._asked = True, time.monotonic()
         try:
             if self.released:
                 self._release()
@@ -219,7 +229,7 @@ class Supervisor:
 
     def tell(self, name: str, *arguments: Any) -> None:
         """Ask for a call of one of the worker's methods; failures show in the reply."""
-        self._busy = True
+        self._busy, self._asked = True, time.monotonic()
         self._output.pump()
         with contextlib.suppress(OSError):
             if self.released:
@@ -270,7 +280,7 @@ class Supervisor:
         Raises:
             LostError: If it could not make them.
         """
-        result = self._receive(deadline, "the instantiation")
+        result = self._receive(deadline, INSTANTIATION)
         self._opening = False
         if isinstance(result, Exception):
             self.bury(f"{result}{self.printed}")
@@ -311,7 +321,12 @@ class Supervisor:
 
     def _end_hang(self, doing: str) -> None:
         """End a worker that is late; messages that it has not sent yet are lost."""
-        what = f"worker process {self.pid} took longer than call_timeout for {doing} and was ended"
+        factor = "ten times " if patience_with(doing) > 1 else ""
+        seconds = time.monotonic() - self._asked
+        what = (
+            f"worker process {self.pid} took longer than {factor}call_timeout for {doing} and was "
+            f"ended after {seconds:.3g} s"
+        )
         self._output.drain()
         self.bury(self._cause(what))
         raise LostError(self.reason)

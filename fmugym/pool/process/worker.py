@@ -54,7 +54,7 @@ class Setup:
         spec: What to do at each reset and step.
         num_instances: N, the instances of all workers together.
         log_level: The level of the messages that are passed on.
-        directory: The working directory.
+        directory: The working directory; empty if it has been removed.
         environment: The environment variables.
         block: The indices of the worker's instances.
         number: Which of the pool's workers it is.
@@ -89,10 +89,25 @@ class Setup:
             spec=spec,
             num_instances=num_instances,
             log_level=logging.INFO if log.isEnabledFor(logging.INFO) else logging.WARNING,
-            directory=os.getcwd(),
+            directory=_working_directory(),
             environment=dict(os.environ),
             block=slice(num_instances),
         )
+
+
+def _working_directory() -> str:
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
+def _enter(directory: str, folder: Path) -> None:
+    """Make a directory the working directory, or a folder if the directory has been removed."""
+    try:
+        os.chdir(directory)
+    except OSError:
+        os.chdir(folder)
 
 
 class _Forwarder(logging.Handler):
@@ -181,7 +196,7 @@ class BlockWorker:
 
     def open(self, setup: Setup) -> None:
         """Make the pool; the first call."""
-        os.chdir(setup.directory)
+        _enter(setup.directory, setup.folder)
         os.environ.update(setup.environment)
         log = logging.getLogger(__name__)
         log.setLevel(setup.log_level)
@@ -268,6 +283,7 @@ def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> Pool:
         threads=setup.threads,
         first_index=setup.block.start,
         counts=counts,
+        attended=False,  # the parent does that for all of its workers
     )
 
 

@@ -22,6 +22,7 @@ from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
+from fmugym.task.step import conclude
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.column import PoolColumn
@@ -53,6 +54,7 @@ class BatchEngine(Engine):
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
+        self._idle: MaskArray | None = None
         self._foreign = np.zeros(num_envs, np.bool_)
         batched(env, num_envs, self._pool.outputs, self._pool.inputs).place_in(env)
         env._was_reset = True  # for the calls on single environments
@@ -188,7 +190,7 @@ class BatchEngine(Engine):
         drawn = self._begin(mask, indices, self.env._plan_of_reset(options))
         self.env._in_hooks = True
         try:
-            observations = self._observe(None)
+            observations = self._observe()
             self._require_finite_start(observations, mask)
             return observations, self._infos(mask) | drawn_info(drawn, mask)
         finally:
@@ -325,7 +327,7 @@ class BatchEngine(Engine):
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
         results.write_inputs(values, inputs)
-        if not self.env._real_inputs:
+        if not self.env._input_writer.all_real:
             for index in self._stepping(resetting):
                 inputs[:, index] = fmu_spaces.to_input_types(
                     self.env._interface.inputs, inputs[:, index]
@@ -353,31 +355,41 @@ class BatchEngine(Engine):
         return np.empty((self._n, self.env._output_count), np.float32)
 
     def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
-        env = self.env
-        if env._own.update:
-            self._update(resetting, self._failed(self._pool.statuses))
-        terminated = results.flags("_is_done", env._is_done(), self._n)
-        statuses = self._pool.statuses
+        env, statuses = self.env, self._pool.statuses
         has_faults = bool(np.count_nonzero(statuses))
-        if has_faults:
-            terminated |= self._stopped(statuses)
-        env.done = terminated
-        truncated = self._reached_limit()
-        if env._own.is_truncated:
-            truncated |= results.flags("_is_truncated", env._is_truncated(), self._n)
-        rewards = results.rewards(env._reward_policy(), self._n)
+        stopped = self._stopped(statuses) if has_faults else False
+        self._idle = self._failed(statuses) if has_faults else None
+        if resetting is not None:
+            self._idle = resetting if self._idle is None else self._idle | resetting
+        concluded = conclude(env, self, stopped, self._reached_limit(), observed)
+        observations, rewards, terminated, truncated = concluded
         if resetting is not None:
             terminated[resetting] = truncated[resetting] = False
             rewards[resetting] = 0.0
+        if observed is None:
+            observations = results.observations(observations, env.observation_space, self._n)
         infos = self._infos(np.ones(self._n, np.bool_)) if env._has_info else {}
-        result = StepResult(self._observe(observed), rewards, terminated, truncated, infos)
+        result = StepResult(observations, rewards, terminated, truncated, infos)
         if resetting is not None:
-            self._require_finite_start(result.observations, resetting)
+            self._require_finite_start(observations, resetting)
         self._handle_faults(result, statuses, has_faults)
         self.note_ends(terminated, truncated)
         return result
 
-    def _update(self, resetting: MaskArray | None, failed: MaskArray) -> None:
+    # The form of what hooks return.
+
+    flag_type: type | None = None
+    reward_type: type | None = None
+
+    def flags(self, hook: str, value: Any) -> MaskArray:
+        """See ``Form.flags``."""
+        return results.flags(hook, value, self._n)
+
+    def rewards(self, value: Any) -> FloatArray:
+        """See ``Form.rewards``."""
+        return results.rewards(value, self._n)
+
+    def update(self) -> None:
         """Call the hook, but keep the variables of environments that did not step.
 
         Values that it assigns are copied, because the next step may overwrite their array.
@@ -389,9 +401,8 @@ class BatchEngine(Engine):
         for name, row in before.items():
             if variables[name] is not row:
                 variables[name] = results.variable(name, variables[name], self._n)
-        idle = failed if resetting is None else failed | resetting
-        if idle.any():
-            self._restore_variables(idle)
+        if self._idle is not None and self._idle.any():
+            self._restore_variables(self._idle)
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._variables_before.items():
@@ -406,9 +417,7 @@ class BatchEngine(Engine):
         reached: MaskArray = self.env.step_count >= self._limit
         return reached
 
-    def _observe(self, observed: Any) -> Any:
-        if observed is not None:
-            return observed
+    def _observe(self) -> Any:
         env = self.env
         return results.observations(env._get_observation(), env.observation_space, self._n)
 
@@ -482,7 +491,7 @@ class BatchEngine(Engine):
         for index in np.flatnonzero(mask).tolist():
             pool.note_fault(index)
         env._halt()
-        again = results.observations(env._get_observation(), env.observation_space, self._n)
+        again = self._observe()
         for index in _indices(not_finite(again), mask):
             before = shown(observation_of(again, index))
             raise SimulationError(

@@ -236,7 +236,7 @@ def _concluded(env: FMUEnv) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     env.step_count += 1
     env._in_hooks = True
     try:
-        result = env._evaluate(pool, pool.statuses.item(0))
+        result = env._conclude(pool, pool.statuses.item(0))
     finally:
         env._in_hooks = False
     if env.render_mode is not None:

@@ -17,6 +17,7 @@ from fmugym.env import FMUEnv
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.task.readings import Readings, reading
+from fmugym.task.step import ORDER
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
 from fmugym.vector.views import batched, column, copied
@@ -29,15 +30,6 @@ CURE = (
 )
 """The advice that follows a difference."""
 
-_HOOKS = (
-    "_get_inputs",
-    "_update",
-    "_is_done",
-    "_is_truncated",
-    "_reward_policy",
-    "_get_observation",
-    "_get_info",
-)
 _IDLE = ("_update", "_is_truncated", "_get_info")
 """Hooks that do nothing by default."""
 
@@ -74,7 +66,7 @@ def find_difference(env: FMUEnv) -> str | None:
     obstacle = _obstacle(env)
     if obstacle is not None:
         return obstacle
-    hooks = [hook for hook in _HOOKS if hook not in _IDLE or hook in env._own]
+    hooks = [hook for hook in ORDER if hook not in _IDLE or hook in env._own]
     with np.errstate(all="ignore"), warnings.catch_warnings(), borrowed(env) as contents:
         warnings.simplefilter("ignore")
         kinds = [sample_states(env, some) for some in (_SCALES[:1], _SCALES[1:], _WILD_SCALES)]

@@ -236,7 +236,7 @@ def _require_simple(env: FMUEnv) -> None:
         "its steps have an info": env._has_info,
         "it is a goal task": env._own.goal_reward,
         "it has episode variables": env.config.episode_variables,
-        "it has inputs that are not Real": not env._real_inputs,
+        "it has inputs that are not Real": not env._input_writer.all_real,
     }
     for obstacle, is_there in obstacles.items():
         if is_there:

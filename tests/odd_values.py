@@ -1,23 +1,13 @@
-"""Odd values, and the running of cases that use them; see ``fuzz_lab.py`` and its siblings."""
+"""Odd values for the programs that call public functions with them, such as ``fuzz_lab.py``."""
 
-import argparse
-import contextlib
 import datetime
 import decimal
-import faulthandler
 import fractions
 import itertools
-import os
-import random
 import sys
-import tempfile
-import time
-import warnings
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from fuzz import HANG, SLOW, say, temporary_folder
 
 # Odd values
 
@@ -31,6 +21,26 @@ class Unspeakable:
     __repr__ = __str__ = __eq__ = __hash__ = __bool__ = __len__ = __iter__ = _refuse
     __float__ = __int__ = __index__ = __lt__ = __le__ = __gt__ = __ge__ = __fspath__ = _refuse
     __array__ = __getitem__ = __call__ = __contains__ = _refuse
+
+
+class HostileError(Exception):
+    """Raised by objects that cannot be asked anything."""
+
+
+def _refuse(*arguments, **keywords):
+    raise HostileError("do not touch me")
+
+
+def hostile(*names, base=object):
+    """Make an object whose special methods of these names raise."""
+    return type("Hostile", (base,), dict.fromkeys(names, _refuse))()
+
+
+def circular():
+    """Make a list that contains itself."""
+    values = [1.0]
+    values.append(values)
+    return values
 
 
 class Slippery(float):
@@ -52,13 +62,6 @@ class OddText(str):
 
     def __eq__(self, other):
         raise ZeroDivisionError("this text has no equal")
-
-
-def nested():
-    """Make a list that contains itself."""
-    circle = []
-    circle.append(circle)
-    return circle
 
 
 NUMBERS = (
@@ -85,7 +88,7 @@ OTHERS = (
     *(Path("x"), ValueError("a value"), sys, datetime.datetime(2020, 1, 1)),
 )
 MAKERS = (
-    *(nested, lambda: iter([1.0]), lambda: itertools.repeat(1.0), lambda: [nested()]),
+    *(circular, lambda: iter([1.0]), lambda: itertools.repeat(1.0), lambda: [circular()]),
     *(lambda: (1 / 0 for _ in range(2)), lambda: [Unspeakable()], lambda: {"a": Unspeakable()}),
 )
 
@@ -110,71 +113,3 @@ def spoil(rng, arguments, others=()):
     places = sorted(arguments)
     chosen = rng.sample(places, min(len(places), rng.choice((1, 1, 1, 2))))
     return arguments | {place: odd(rng, others) for place in chosen}
-
-
-def check_text(error):
-    """Return what is wrong with the text of an error."""
-    return "" if str(error).isprintable() and len(str(error)) < 1000 else f"text: {str(error)!r}"
-
-
-# Cases
-
-
-def run_cases(case, count, seed, first=0, report=lambda line: None):
-    """Run cases one after another.
-
-    Args:
-        case: Gets a random generator and an empty folder; returns an outcome, and what is wrong
-            with it or "".
-        count: How many to run.
-        seed: Part of the seed of each case.
-        first: The number of the first case.
-        report: Gets each failure at once.
-
-    Returns:
-        How many cases had which outcome, and the failures as texts.
-    """
-    counts, failures = Counter(), []
-    with temporary_folder() as folder:
-        for number in range(first, first + count):
-            outcome, trouble = watch(case, random.Random(f"{seed}/{number}"), folder)
-            counts[outcome] += 1
-            if trouble:
-                failures.append(f"case {number}: {trouble}")
-                report(failures[-1])
-    return counts, failures
-
-
-def watch(case, rng, folder):
-    """Run one case; returns its outcome and what is wrong with it."""
-    faulthandler.dump_traceback_later(HANG, exit=True)
-    begin = time.process_time()  # the machine may be busy with something else
-    try:
-        with tempfile.TemporaryDirectory(dir=folder) as own, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's, about odd values
-            here = Path(own, "here")
-            here.mkdir()
-            with contextlib.chdir(here):  # odd texts may be names of folders
-                outcome, trouble = case(rng, Path(own))
-    except Exception as error:
-        return "failed", f"{type(error).__name__}: {error}"
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-    duration = time.process_time() - begin
-    left = os.listdir(folder)
-    slow = f"{duration:.1f} s" if duration > SLOW else ""
-    return outcome, trouble or slow or (f"left {left}" if left else "")
-
-
-def main(run, about):
-    """Run what the command line asks for; returns the exit code."""
-    parser = argparse.ArgumentParser(description=about.splitlines()[0])
-    parser.add_argument("--count", type=int, default=4000)
-    parser.add_argument("--seed", default="0")
-    parser.add_argument("--first", type=int, default=0)
-    arguments = parser.parse_args()
-    faulthandler.enable()
-    begin = time.perf_counter()
-    counts, failures = run(arguments.count, arguments.seed, arguments.first, say)
-    say(f"{dict(counts)}, {len(failures)} failures, {time.perf_counter() - begin:.0f} s")
-    return 1 if failures else 0

@@ -1,0 +1,260 @@
+"""The construction of an environment: its FMU, names, spaces, hooks and pool."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Mapping
+from math import floor, nan
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Self, cast
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.checks import check_mapping
+from fmugym.config import EnvConfig
+from fmugym.distributions import as_distribution
+from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.pool import Pool, PoolSpec
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.actions import elements_of, no_action
+from fmugym.task.episode import EpisodePlan
+from fmugym.task.hooks import OwnHooks
+from fmugym.task.inputs import InputWriter
+from fmugym.task.interface import checked, resolve, start_variable
+from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
+from fmugym.task.pictures import Pictured
+from fmugym.task.results import finiteness_of
+from fmugym.task.step import Numbers
+from fmugym.task.values import EpisodeVariables, NamedValues
+
+__all__ = ["Constructed"]
+
+_FASTEST_FPS: Final = 1_000_000
+
+
+class Constructed(Pictured):
+    """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs."""
+
+    fmi_version: ClassVar[int | None]
+    reset_options: ClassVar[tuple[str, ...]]
+    metadata: dict[str, Any]
+
+    _base: ClassVar[type]
+    """``FMUEnv``, with whose methods those of an environment are compared."""
+
+    _values: Any
+    _number: int
+    _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
+
+    _has_info: bool
+    _pool_tells = False
+    _pool: Pool | None = None
+    _is_closed = False
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Keep the arguments, because an environment pickles as its class and arguments.
+
+        The number tells a vector environment which environments are new.
+        """
+        env = super().__new__(cls)
+        env._constructor_arguments = args, kwargs
+        env._number = next(env_numbers)
+        return env
+
+    def _construct(
+        self,
+        fmu_path: str | os.PathLike[str],
+        config: Mapping[str, Any] | EnvConfig,
+        log_level: int,
+        render_mode: str | None,
+    ) -> None:
+        """Do everything that a constructor does before there is a pool."""
+        self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
+        _set_level(self.logger, log_level)
+        self.config = EnvConfig.from_dict(config)
+        self.render_mode = self._checked_render_mode(render_mode)
+        self.fmu = open_fmu(type(self), fmu_path, self.config)
+        self._require_fmi_version()
+        self._interface = resolve(self.config, self.fmu.description)
+        self._spec = self._interface.pool_spec()
+        self._warn_of_peculiarities()
+        self._prepare_values()
+        self._prepare_episodes()
+        self._prepare_spaces()
+        self._prepare_hooks()
+
+    def _open(self, backend: Any, isolation: str | None) -> None:
+        """Open the pool, unless a vector environment is going to give one."""
+        self._opening = PoolOpening(
+            self.fmu, self._spec, self.config, self._plan, self.logger, backend, isolation
+        )
+        if not pools_are_deferred():
+            self._use(self._opening.open())
+
+    def _use(self, pool: Pool) -> None:
+        """Let a pool of one step this environment, or one of N if a vector environment does it."""
+        self._pool = pool
+        self._step_pool, self._halt = pool.step_own, pool.halt
+        self._input_row, self._output_row = pool.inputs[:, 0], pool.outputs[:, 0]
+        self._observation_row = pool.observations[0]
+        self._pool_tells = bool(pool.info())
+        self._has_info = self._has_info or self._pool_tells
+
+    def _open_pool(self, method: str) -> Pool:
+        if self._pool is None:
+            if self._is_closed:
+                raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
+            self._opening = self._opening.apart()
+            self.fmu = self._opening.fmu
+            self._use(self._opening.open())
+        return cast(Pool, self._pool)
+
+    def _close_pool(self) -> None:
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+
+    @property
+    def reset_method(self) -> str:
+        """How episodes begin; see ``EnvConfig``."""
+        return str(self._open_pool("reset_method").reset_method)
+
+    def _require_fmi_version(self) -> None:
+        found = self.fmu.description.fmi_major_version
+        if self.fmi_version is not None and found != self.fmi_version:
+            raise ConfigError(
+                f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
+                f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
+                f"derive from FMI{found}CSEnv instead"
+            )
+
+    def _warn_of_peculiarities(self) -> None:
+        internal = self.fmu.description.fixed_internal_step_size
+        if internal is not None and self._spec.communication_step_size < 0.999999 * internal:
+            self.logger.warning(
+                "the communication step of %g s is smaller than the internal step of %g s of %s: "
+                "some of the steps will do nothing",
+                self._spec.communication_step_size,
+                internal,
+                self.fmu.path.name,
+            )
+        if self.fmu.description.capabilities.needs_execution_tool:
+            self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
+
+    def _prepare_values(self) -> None:
+        """Set what hooks may read to what it is before the first reset."""
+        interface = self._interface
+        names = [variable.name for variable in interface.outputs + interface.monitors]
+        fps = min(1 / interface.time_step, _FASTEST_FPS)
+        self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
+        self._output_count = len(interface.outputs)
+        self._no_monitors = not interface.monitors
+        self._values = (nan,) * len(names)
+        self.out = NamedValues("output", names, lambda: self._values)
+        self.state = self._values[: self._output_count]
+        self.previous_state = self.state
+        self._start_inputs = [(v.name, v.start_number) for v in interface.inputs]
+        self.inputs = tuple(start for _, start in self._start_inputs)
+        self.action = None
+        self.previous_action = None
+        self.parameters: Mapping[str, Any] = MappingProxyType({})
+        self.variables = EpisodeVariables(self.config.episode_variables)
+        self.step_count = 0
+        self.done = False
+        self.after_end = False
+
+    def _prepare_episodes(self) -> None:
+        self._plan = self._plan_episode({})
+        self._step_limit = _step_limit(self.config, self._spec)
+        self._ended = True
+        self._in_hooks = False
+        self._was_reset = False
+
+    def _prepare_spaces(self) -> None:
+        self.action_space = self._get_action_space()
+        self.observation_space = self._get_observation_space()
+        for name, space in (("action", self.action_space), ("observation", self.observation_space)):
+            if not isinstance(space, spaces.Space):
+                raise ConfigError(
+                    f"{type(self).__name__}._get_{name}_space returned {shown(space)}, "
+                    "expected a gymnasium.spaces.Space"
+                )
+        self._no_action = no_action(self.action_space)
+
+    def _prepare_hooks(self) -> None:
+        """Find out which hooks the class overrides, and prepare the defaults of the others."""
+        interface, space = self._interface, self.observation_space
+        self._own = own = OwnHooks.of(self, self._base)
+        self._form = Numbers(self)
+        # A subclass with its own step may take other actions.
+        self._elements = None if own.step else elements_of(self.action_space)
+        derived = not own.get_action_space
+        values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
+        self._action_values = values
+        default = not own.get_observation
+        make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
+        self._observe = make(interface, space)
+        self._is_finite = finiteness_of(space)
+        # The pool writes this observation in the pass that steps the FMU.
+        self._pool_observes = (
+            default and isinstance(space, spaces.Box) and space.dtype == np.float32
+        )
+        self._has_info = own.get_info or self._pool_tells
+        self._input_writer = InputWriter(interface.inputs)
+
+    def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
+        if options is None:
+            return self._plan
+        options = check_mapping("the options of reset", options)
+        for name in options:
+            if name not in self.reset_options:
+                raise unknown_name("reset option", name, self.reset_options)
+        if not options:
+            return self._plan
+        parameters = self._get_episode_parameters(options)
+        return self._plan_episode(
+            check_mapping("what _get_episode_parameters returned", parameters)
+        )
+
+    def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
+        """Prepare the draws of episodes in which these parameters replace the config's."""
+        parameters = dict(self._interface.parameters)
+        for name, value in overrides.items():
+            value = as_distribution(repr(name), value)
+            variable = start_variable(self.fmu.description, name, value)
+            if not variable.numeric:
+                raise ConfigError(f"{name!r} is a String: it can be set in the config only")
+            parameters[name] = checked(variable, value)
+        return EpisodePlan(
+            tuple(map(self.fmu.variable, parameters)),
+            parameters,
+            self.config.episode_variables,
+            overrides.keys(),
+        )
+
+
+def _set_level(logger: logging.Logger, level: Any) -> None:
+    try:
+        logger.setLevel(level)
+    except Exception:  # a TypeError or ValueError; or the object's own method fails
+        raise ConfigError(f"log_level must be a level of logging, got {shown(level)}") from None
+
+
+def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
+    """The number of steps after which an episode is truncated."""
+    limit = sys.maxsize if config.max_episode_steps is None else config.max_episode_steps
+    if config.stop_time is None:
+        return limit
+    span = (config.stop_time - spec.start_time) / spec.time_step
+    if span > limit:
+        return limit
+    steps = floor(span + 1e-9) - spec.warm_up_steps
+    if steps < 1:
+        raise ConfigError(
+            f"stop_time = {config.stop_time} s leaves no time for a step of {spec.time_step} s "
+            f"after start_time = {spec.start_time} s and the warm-up"
+        )
+    return min(limit, steps)

@@ -1,0 +1,119 @@
+"""Every way of calling hooks follows the one order of a step."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from vector_tools import Drawing
+
+import fmugym
+from fmugym.pool import has_native_pool
+from fmugym.task.step import ORDER
+from fmugym.vector import FMUVectorEnv
+from fmugym.vector.hooks.trace import trace_hooks
+
+CALLED = []
+
+
+class Recording(Drawing):
+    """Notes which hooks are called, and what they read of the hooks before them."""
+
+    def __init__(self, **changes):
+        super().__init__(episode_variables={"updates": 0.0}, **changes)
+
+    def _note(self, hook, value):
+        CALLED.append(hook)
+        return value
+
+    def _get_inputs(self):
+        return self._note("_get_inputs", self.action)
+
+    def _update(self):
+        self.variables["updates"] = self.variables["updates"] + 1.0
+        self._note("_update", None)
+
+    def _is_done(self):
+        return self._note("_is_done", self.variables["updates"] >= 2.0)
+
+    def _is_truncated(self):
+        return self._note("_is_truncated", self.done & (self.step_count == 2))
+
+    def _reward_policy(self):
+        return self._note("_reward_policy", np.where(self.done, -1.0, self.variables["updates"]))
+
+    def _get_observation(self):
+        return self._note("_get_observation", np.array(self.state, np.float32))
+
+    def _get_info(self):
+        return self._note("_get_info", {"updates": self.variables["updates"]})
+
+
+def played(env, action):
+    """The hooks of two steps, and what came of them."""
+    env.reset(seed=1)
+    CALLED.clear()
+    results = [env.step(action) for _ in range(2)]
+    values = [[np.ravel(part)[0].item() for part in result[1:4]] for result in results]
+    return list(CALLED), values
+
+
+EXPECTED = [[1.0, False, False], [-1.0, True, True]]
+
+
+def test_of_one_environment():
+    env = Recording()
+    called, values = played(env, np.zeros(1, np.float32))
+    assert called == [*ORDER, *ORDER]
+    assert values == EXPECTED
+    env.close()
+
+
+def test_on_arrays():
+    env = FMUVectorEnv(Recording, 3, hooks="array")
+    called, values = played(env, np.zeros((3, 1), np.float32))
+    assert called == [*ORDER, *ORDER]
+    assert values == EXPECTED
+    env.close()
+
+
+def test_one_environment_at_a_time():
+    """The FMUs step between the first hook of all environments and the others."""
+    env = FMUVectorEnv(Recording, 3, hooks="per_env")
+    called, values = played(env, np.zeros((3, 1), np.float32))
+    step = [ORDER[0]] * 3 + [*ORDER[1:]] * 3
+    assert called == [*step, *step]
+    assert values == EXPECTED
+    env.close()
+
+
+class Plain(Recording):
+    """What can be compiled."""
+
+    _update = fmugym.FMUEnv._update
+    _get_info = fmugym.FMUEnv._get_info
+    _get_observation = fmugym.FMUEnv._get_observation
+
+    def __init__(self):
+        Drawing.__init__(self)
+
+    def _get_action_space(self):
+        return gym.spaces.Discrete(2)
+
+    def _is_done(self):
+        return self._note("_is_done", self.step_count >= 2)
+
+    def _reward_policy(self):
+        return self._note("_reward_policy", np.where(self.done, -1.0, 1.0 * self.step_count))
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="the C extension was not built")
+def test_compiled():
+    env = Plain()
+    CALLED.clear()
+    trace_hooks(env)
+    assert [hook for hook in ORDER if hook in CALLED] == list(dict.fromkeys(CALLED))
+    env.close()
+    vector = FMUVectorEnv(Plain, 3, hooks="compiled")
+    called, values = played(vector, np.zeros(3, np.int64))
+    assert called == []
+    assert values == EXPECTED
+    vector.close()
