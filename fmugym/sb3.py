@@ -22,6 +22,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
+from fmugym.vector.codec import handed_out
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -46,6 +47,7 @@ def make_sb3_env(
     *,
     seed: int | None = None,
     monitor: bool = True,
+    overlap: bool = False,
     **kwargs: Any,
 ) -> VecEnv:
     """Make N environments for Stable-Baselines3, as its own ``make_vec_env`` does.
@@ -56,6 +58,7 @@ def make_sb3_env(
         seed: Environment i is seeded with ``seed + i`` at the first reset.
         monitor: Whether to wrap them in a ``VecMonitor``, which writes returns and lengths to the
             log of the training.
+        overlap: As for ``FMUVecEnv``.
         kwargs: Arguments of ``FMUVectorEnv`` (``max_episode_steps``, ``hooks``, ``threads``, ...)
             and of the environment.
 
@@ -71,7 +74,7 @@ def make_sb3_env(
         vector_env = vectorized(env)(num_envs, **kwargs)
     else:
         raise ConfigError(f"env must be a registered id or a class, got {shown(env)}")
-    venv = FMUVecEnv(vector_env)
+    venv = FMUVecEnv(vector_env, overlap)
     if seed is not None:
         venv.seed(seed)
         venv.action_space.seed(seed)
@@ -100,6 +103,10 @@ class FMUVecEnv(VecEnv):
 
     Args:
         env: The vector environment, made with ``autoreset_mode="same_step"``.
+        overlap: Whether the FMUs step between ``step_async`` and ``step_wait``, while the caller
+            computes; otherwise they step in ``step_wait``. The algorithms of Stable-Baselines3 call
+            both at once, and handing a step to a thread takes some 50 us. So this is of use for
+            loops of your own.
 
     Attributes:
         vector_env: The vector environment, as given.
@@ -108,7 +115,7 @@ class FMUVecEnv(VecEnv):
         ConfigError: If ``env`` is something else, or has another autoreset mode.
     """
 
-    def __init__(self, env: FMUVectorEnv) -> None:
+    def __init__(self, env: FMUVectorEnv, overlap: bool = False) -> None:
         if not isinstance(env, FMUVectorEnv):
             raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
         mode = env.autoreset_mode
@@ -118,6 +125,7 @@ class FMUVecEnv(VecEnv):
                 "with autoreset_mode='same_step'"
             )
         self.vector_env = env
+        self._overlap = overlap
         self.spec = env.spec
         self._set_parameters: dict[str, list[Any]] = {}
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -138,7 +146,7 @@ class FMUVecEnv(VecEnv):
         for mask, options in groups:
             options = {**options, "reset_mask": mask}
             observations, infos = self.vector_env.reset(seed=self._seeds, options=options)
-            _hand_out(infos, self.reset_infos)
+            handed_out(infos, self.reset_infos)
         self._reset_seeds()
         self._reset_options()
         return observations
@@ -152,8 +160,10 @@ class FMUVecEnv(VecEnv):
         return [(np.array([o == kind for o in self._options]), kind) for kind in kinds]
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Keep the actions for ``step_wait``."""
+        """Begin a step, or keep the actions for ``step_wait``; see ``overlap``."""
         self._actions = actions
+        if self._overlap:
+            self.vector_env.step_async(actions)
 
     def step_wait(self) -> StepReturn:
         """Step all environments; those whose episode ends start the next one.
@@ -163,13 +173,15 @@ class FMUVecEnv(VecEnv):
             observation is the first of the next episode, and the info has
             ``"terminal_observation"``.
         """
-        observations, rewards, terminated, truncated, infos = self.vector_env.step(self._actions)
+        env = self.vector_env
+        result = env.step_wait() if self._overlap else env.step(self._actions)
+        observations, rewards, terminated, truncated, infos = result
         dones = terminated | truncated
         listed = list(map(dict.copy, repeat(_NOTHING_ENDED, self.num_envs)))
         if dones.any():
             self._end_episodes(dones, truncated & ~terminated, infos, listed)
         elif infos:
-            _hand_out(infos, listed)
+            handed_out(infos, listed)
         return observations, rewards.astype(np.float32), dones, listed
 
     def _end_episodes(
@@ -181,13 +193,13 @@ class FMUVecEnv(VecEnv):
     ) -> None:
         """Separate the infos of the last step from those of the reset that followed it."""
         last, last_infos = infos.pop("final_obs"), infos.pop("final_info")
-        _hand_out(last_infos, listed)
+        handed_out(last_infos, listed)
         others = list(listed)
         for index in np.flatnonzero(dones).tolist():
             listed[index]["TimeLimit.truncated"] = bool(cut_short[index])
             listed[index]["terminal_observation"] = last[index]
             others[index] = self.reset_infos[index] = {}
-        _hand_out(infos, others)
+        handed_out(infos, others)
 
     def close(self) -> None:
         """Free the FMU instances."""
@@ -265,29 +277,3 @@ class FMUVecEnv(VecEnv):
             warnings.warn(f"no pictures in the render mode {self.render_mode}", stacklevel=2)
             return [None] * self.num_envs
         return self.env_method("render")
-
-
-def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
-    """Distribute the infos of a vector environment, arrays with masks, to dicts.
-
-    Args:
-        infos: The infos; the mask of ``name`` is ``_name``.
-        into: The dict of each environment, by number.
-    """
-    for name, values in infos.items():
-        mask = infos.get(f"_{name}")
-        if mask is None:  # it is a mask itself
-            continue
-        indices = np.flatnonzero(mask).tolist()
-        for index, value in zip(indices, _parts(values, indices), strict=True):
-            into[index][name] = value
-
-
-def _parts(values: Any, indices: list[int]) -> list[Any]:
-    """Each environment's part; numbers become Python's, as in single environments."""
-    if isinstance(values, Mapping):
-        parts: dict[int, Any] = {index: {} for index in indices}
-        _hand_out(values, parts)
-        return list(parts.values())
-    chosen = values[indices]
-    return chosen.tolist() if chosen.ndim == 1 else list(chosen)

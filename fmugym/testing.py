@@ -11,10 +11,10 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -22,12 +22,16 @@ from gymnasium.utils.env_checker import data_equivalence
 
 from fmugym.checks import has_method
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, ContractError, shown
+from fmugym.errors import ConfigError, ContractError, FMUGymError, shown
 from fmugym.vector.hooks.check import CURE, find_difference
 
 __all__ = ["check_fmu_env", "check_hooks"]
 
 logger = logging.getLogger(__name__)
+
+
+_SHORT_EPISODE: Final = 3
+"""In steps."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,16 @@ class _Transition:
     reward: float
     terminated: bool
     truncated: bool
+    outputs: tuple[float, ...]
+    """Those of the FMU. They show more than an observation, which is rounded and may omit some."""
+
+
+@dataclass(frozen=True)
+class _Start:
+    """How an episode begins."""
+
+    seed: int | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
 
 def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 200) -> None:
@@ -112,27 +126,39 @@ def _fresh(env: FMUEnv) -> Iterator[FMUEnv]:
 
 def _rollout(env: FMUEnv, actions: list[Any], seed: int) -> list[_Transition]:
     """Run episodes one after another; only the first is seeded."""
-    observation, _ = env.reset(seed=seed)
-    transitions = [_Transition(observation, 0.0, False, False)]
+    transitions: list[_Transition] = []
+    start, played = _Start(seed), 0
+    while played < len(actions):
+        episode = _episode(env, actions[played:], start)
+        transitions += episode
+        start, played = _Start(), played + len(episode) - 1
+    return transitions
+
+
+def _episode(env: FMUEnv, actions: list[Any], start: _Start) -> list[_Transition]:
+    """Run an episode until it ends or there are no more actions."""
+    options = {"model_parameters": dict(start.parameters)}
+    observation, _ = env.reset(seed=start.seed, options=options)
+    transitions = [_Transition(observation, 0.0, False, False, tuple(env.out.values()))]
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(action)
         if "fault" in info:
             raise ContractError(f"a step with a sampled action failed: {info['fault']}")
-        transitions.append(_Transition(observation, reward, terminated, truncated))
+        outputs = tuple(env.out.values())
+        transitions.append(_Transition(observation, reward, terminated, truncated, outputs))
         if terminated or truncated:
-            observation, _ = env.reset()
-            transitions.append(_Transition(observation, 0.0, False, False))
+            break
     return transitions
 
 
 def _require_equal(what: str, first: list[_Transition], second: list[_Transition]) -> None:
+    for index, (a, b) in enumerate(zip(first, second, strict=False)):
+        for name in ("observation", "reward", "terminated", "truncated", "outputs"):
+            left, right = getattr(a, name), getattr(b, name)
+            if not data_equivalence(left, right, exact=True):
+                raise ContractError(f"{what}: at step {index} {name} was {left}, then {right}")
     if len(first) != len(second):
         raise ContractError(f"{what}: the episodes end at different steps")
-    for index, (a, b) in enumerate(zip(first, second, strict=True)):
-        for field in ("observation", "reward", "terminated", "truncated"):
-            left, right = getattr(a, field), getattr(b, field)
-            if not data_equivalence(left, right, exact=True):
-                raise ContractError(f"{what}: at step {index} {field} was {left}, then {right}")
 
 
 def _check_determinism(env: FMUEnv, actions: list[Any], seed: int) -> None:
@@ -145,12 +171,41 @@ def _check_determinism(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 def _check_reset(env: FMUEnv, actions: list[Any], seed: int) -> None:
+    """Compare episodes of one environment with those of fresh ones, as the trial of an FMU does.
+
+    Episodes follow short and long ones, with the same start values as before and with others.
+    """
+    starts = _Start(seed), _other_start(env, actions, seed)
+    references = [_fresh_episode(env, actions, start) for start in starts]
+    short, long = min(_SHORT_EPISODE, len(actions)), len(actions)
     with _fresh(env) as tried:
-        fresh = _rollout(tried, actions, seed)
-        _rollout(tried, actions[::-1], seed + 1)
-        for _ in range(3):  # once more by reset and initialization, then from a saved state
-            again = _rollout(tried, actions, seed)
-            _require_equal("reset does not restore everything", fresh, again)
+        for index, steps in ((0, short), (0, long), (0, long), (1, short), (0, long), (1, long)):
+            again = _episode(tried, actions[:steps], starts[index])
+            what = "reset does not restore everything: compared with a new environment"
+            _require_equal(what, references[index][: steps + 1], again)
+
+
+def _fresh_episode(env: FMUEnv, actions: list[Any], start: _Start) -> list[_Transition]:
+    with _fresh(env) as fresh:
+        return _episode(fresh, actions, start)
+
+
+def _other_start(env: FMUEnv, actions: list[Any], seed: int) -> _Start:
+    """Another seed and, if the FMU runs with them, parameters that differ by one percent."""
+    with _fresh(env) as tried:
+        tried.reset(seed=seed)
+        given = {
+            n: v for n, v in tried.parameters.items() if n not in tried.config.model_input_names
+        }
+        changed = {name: _changed(tried, name, value) for name, value in given.items()}
+        start = _Start(
+            seed + 1, {name: value for name, value in changed.items() if value is not None}
+        )
+        try:
+            _episode(tried, actions, start)
+        except FMUGymError:
+            return _Start(seed + 1)
+        return start
 
 
 def _check_spaces(env: FMUEnv, actions: list[Any], seed: int) -> None:

@@ -48,11 +48,24 @@ size_t pool_step_or_reset(Pool *pool, const Call *call) {
     return run_with_starts(&task, pool->settings.count);
 }
 
-size_t pool_play(Pool *pool, const Call *call, size_t *ended) {
+size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     Task task = {.pool = pool, .call = call, .operation = PLAY};
     const size_t troubled = run_with_starts(&task, pool->settings.count);
 
-    *ended = (size_t)atomic_get(&task.ended);
+    ends->ended = (size_t)atomic_get(&task.ended);
+    ends->started = (size_t)atomic_get(&task.started);
+    ends->outside = atomic_get(&task.outside) != 0;
+    return troubled;
+}
+
+size_t pool_start(Pool *pool, const Call *call) {
+    const size_t troubled = pool_reset(pool, call);
+
+    for (size_t i = 0; i < pool->settings.count; i++) {
+        if (call->mask.data != NULL && !is_in(call->mask, i)) {
+            write_observation(pool, i, call->observations);
+        }
+    }
     return troubled;
 }
 

@@ -220,7 +220,8 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     if (me->saved != NULL) {
         return status;
     }
-    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* restore failed */
+    /* the restore did not work, and it has overwritten the start values */
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values);
     return restart(pool, me, call, again, scratch);
 }
 
@@ -237,9 +238,10 @@ static void record_start(Pool *pool, const Instance *me, const Call *call, Scrat
     const Settings *s = &pool->settings;
 
     matrix_gather(&call->start_values, 0, call->start->count, scratch.values);
-    instance_copy_outputs(pool, me, scratch.outputs);
-    tape_begin(&pool->tape, call->start, scratch.values, s->inputs->count, scratch.outputs,
-               s->outputs->count, me->steps);
+    if (tape_begin(&pool->tape, call->start, scratch.values, s->inputs->count, s->outputs->count,
+                   me->steps)) {
+        instance_copy_outputs(pool, me, pool->tape.first_outputs);
+    }
 }
 
 Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch) {

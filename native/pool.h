@@ -35,8 +35,7 @@ typedef struct {
     const char *const *categories; /* the log categories of errors and warnings */
     size_t number_of_categories;
     bool can_save;
-    bool restores; /* whether episodes begin by a restored state where the start values are the same
-                    */
+    bool restores; /* whether an episode with the last start values begins with a restored state */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
@@ -59,7 +58,7 @@ typedef struct {
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
 } Settings;
 
-/* The health counters of each instance. fmugym/pool/base.py lists their names in this order. */
+/* The health counters of each instance. fmugym/pool/health.py lists their names in this order. */
 enum {
     RESETS,
     STEPS, /* communication steps until the last reset */
@@ -238,6 +237,13 @@ void pool_recycle(Pool *pool);
 /* Changes how episodes begin from now on. */
 void pool_begin_by(Pool *pool, bool restores, bool rebuilds);
 
+/* What became of the episodes in a step that plays. */
+typedef struct {
+    size_t ended;   /* how many have ended */
+    size_t started; /* how many of these were followed by another one in the same step */
+    bool outside;   /* whether a hook looked up an index outside of a table */
+} Ends;
+
 /* The following functions return how many instances now have a status worse than a warning. */
 
 /* Steps all instances except those in the mask. Writes all observations. */
@@ -247,8 +253,11 @@ size_t pool_reset(Pool *pool, const Call *call);
 /* Resets the instances in the mask and steps the others. Writes all observations. */
 size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
- * turn before and after. Writes all observations and how many episodes have just ended. */
-size_t pool_play(Pool *pool, const Call *call, size_t *ended);
+ * turn before and after. Writes all observations. */
+size_t pool_play(Pool *pool, const Call *call, Ends *ends);
+/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all
+ * observations. */
+size_t pool_start(Pool *pool, const Call *call);
 
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);

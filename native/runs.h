@@ -19,6 +19,8 @@ typedef struct {
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
     Atomic ended;                         /* episodes that have ended, when playing */
+    Atomic outside;                       /* threads that saw an index outside of a table */
+    Atomic started;                       /* those of them whose next episode has started */
     Atomic time;                          /* total ns of all threads, if measured */
 } Task;
 
@@ -37,6 +39,9 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);
 size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch);
 /* This one does the same and runs the programs before and after: */
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch);
+
+/* Keeps the status of an instance. Returns 1 if it is worse than a warning. */
+size_t note_status(Task *task, size_t index, Status status);
 
 /* Writes the first outputs of an instance. */
 void write_observation(const Pool *pool, size_t index, float *observations);

@@ -18,8 +18,6 @@ enum {
     MEASURE_EVERY = 16 /* with fewer instances, one call in this many is measured */
 };
 
-/* If even this little memory is missing, nothing else will work either. The caller's arrays are
- * still filled, with the previous values. */
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 
@@ -30,7 +28,7 @@ size_t task_give_up(Task *task, size_t begin, size_t end) {
         if (call->observations != NULL) {
             write_observation(task->pool, index, call->observations);
         }
-        if (call->turn != NULL) {
+        if (task->operation == PLAY) {
             play_skip(call->turn, index);
         }
     }

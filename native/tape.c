@@ -64,8 +64,8 @@ static void note_starts(Tape *tape, const Access *start, const double *starts) {
     memcpy(tape->starts, starts, start->count * sizeof *starts);
 }
 
-void tape_begin(Tape *tape, const Access *start, const double *starts, size_t width_in,
-                const double *outputs, size_t width_out, int64_t position) {
+bool tape_begin(Tape *tape, const Access *start, const double *starts, size_t width_in,
+                size_t width_out, int64_t position) {
     release(tape);
     tape->rows = 0;
     tape->width_in = width_in;
@@ -74,11 +74,11 @@ void tape_begin(Tape *tape, const Access *start, const double *starts, size_t wi
     tape->position = position;
     if (!allocate(tape)) {
         tape_free(tape);
-        return;
+        return false;
     }
     note_starts(tape, start, starts);
-    memcpy(tape->first_outputs, outputs, width_out * sizeof *outputs);
     tape->state = TAPE_RECORDING;
+    return true;
 }
 
 void tape_add(Tape *tape, const double *inputs, const double *outputs, int status,

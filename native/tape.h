@@ -40,9 +40,9 @@ void tape_wait(Tape *tape, int64_t resets, int64_t steps);
  * begins. */
 bool tape_turn(Tape *tape, int64_t steps);
 
-/* Begins a recording. Without memory, there is none. */
-void tape_begin(Tape *tape, const Access *start, const double *starts, size_t width_in,
-                const double *outputs, size_t width_out, int64_t position);
+/* Begins a recording, except for first_outputs. Returns false if memory runs out. */
+bool tape_begin(Tape *tape, const Access *start, const double *starts, size_t width_in,
+                size_t width_out, int64_t position);
 /* Records a step, after which the episode has so many communication steps. */
 void tape_add(Tape *tape, const double *inputs, const double *outputs, int status,
               int64_t position);

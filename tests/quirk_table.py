@@ -92,6 +92,12 @@ QUIRKS = (
     keeps("outputs"),
     keeps("parameters", "restore"),
     keeps("the time"),
+    Quirk(
+        "reset ignores parameters",
+        "uses the parameters of its first episode in all others",
+        "instance",
+        log=BAD_RESET,
+    ),
     Quirk("stops, reset keeps that", "keeps its wish to stop in a reset", "instance",
           log=BAD_RESET, versions=STATES),
     Quirk("second reset fails", "returns Error in its second reset (a new instance replaces it)"),

@@ -8,7 +8,10 @@ import sys
 import zipfile
 import zlib
 
+import makers
 import pytest
+import quirk_table
+import zoo_tools
 from fmu_tools import library_name, probe_fmu, read_fmu
 
 import fmugym
@@ -222,7 +225,7 @@ class TestSkeleton:
         assert f"class PendulumEnv(fmugym.FMI{fmi_version[0]}CSEnv):" in text
         assert '"tau",  # [N.m] Torque' in text
         assert '"g": 9.81,  # [m/s2]' in text
-        assert '"solver": "rk4",' in text
+        assert '"body": "point_mass",' in text
         assert '"bounds"' not in text  # the FMU has limits for its input
 
     def test_output_is_a_new_file_only(self, tmp_path, capsys):
@@ -238,7 +241,7 @@ class TestSkeleton:
         scaled = variable("w", '<Real start="0" nominal="300"/>')
         made = skeleton(make_fmu(INPUT, half, scaled, OUTPUT))
         config = config_of(made.out)
-        assert config["bounds"] == {"u": (-1.0, 1.0), "v": (2.0, 3.0), "w": (-300.0, 300.0)}
+        assert config["bounds"] == {"u": (0.0, 1.0), "v": (2.0, 3.0), "w": (-300.0, 300.0)}
         assert "limits of input 'u'" in made.err
         assert "no step size" in made.err
         assert "does not run on this machine" in made.err
@@ -247,8 +250,74 @@ class TestSkeleton:
         odd = variable("v", '<Real start="0" min="NaN" nominal="NaN"/>')
         experiment = '/><DefaultExperiment stopTime="1e300" stepSize="1e-300"'
         config = config_of(skeleton(make_fmu(odd, OUTPUT, flags=experiment)).out)
-        assert config["bounds"] == {"v": (-1.0, 1.0)}
+        assert config["bounds"] == {"v": (0.0, 1.0)}
         assert (config["time_step"], config["max_episode_steps"]) == (1e-300, 200)
+
+    @pytest.mark.parametrize(
+        ("attributes", "bounds"),
+        [
+            ('start="293.15"', (263.835, 322.465)),
+            ('start="293.15" nominal="20"', (273.15, 313.15)),
+            ('start="-2" max="-1.9"', (-2.2, -1.9)),
+            ('start="1e5" min="0"', (0.0, 1.1e5)),
+        ],
+    )
+    def test_guessed_limits_are_near_the_start_value(self, skeleton, make_fmu, attributes, bounds):
+        config = config_of(skeleton(make_fmu(variable("T", f"<Real {attributes}/>"), OUTPUT)).out)
+        assert config["bounds"]["T"] == pytest.approx(bounds)
+
+    @pytest.mark.parametrize(
+        ("experiment", "time_step", "steps"),
+        [
+            ('stopTime="3600"', 5.0, 720),
+            ('startTime="10" stopTime="10.01"', 2e-5, 500),
+            ('stopTime="1"', 0.002, 500),
+            ('stopTime="1" stepSize="5"', 0.002, 500),
+            ('stopTime="86400" stepSize="60"', 60.0, 1440),
+            ('startTime="5"', 0.01, 200),
+        ],
+    )
+    def test_time_step_fits_the_default_experiment(
+        self, skeleton, make_fmu, experiment, time_step, steps
+    ):
+        path = make_fmu(INPUT, OUTPUT, flags=f"/><DefaultExperiment {experiment}")
+        config = config_of(skeleton(path).out)
+        assert (config["time_step"], config["max_episode_steps"]) == (time_step, steps)
+
+    def test_time_step_is_a_multiple_of_the_internal_one(self, skeleton, tmp_path):
+        """FMI 3.0 has it; a shorter step does nothing."""
+        edits = {'modelIdentifier="Probe"': 'modelIdentifier="Probe" fixedInternalStepSize="0.3"'}
+        edits["<TypeDefinitions>"] = '<DefaultExperiment stopTime="1000"/><TypeDefinitions>'
+        config = config_of(skeleton(probe_fmu(tmp_path, 3, edits)).out)
+        assert config["time_step"] == pytest.approx(2.1)
+
+    def test_settings_of_the_solver_are_left_out(self, skeleton, make_fmu):
+        names = (
+            "_cs_solver",
+            "_log_level",
+            "a._enforce",
+            "solver",
+            "rel_tol",
+            "x.solver.tolerance",
+        )
+        names += ("dymola.maxStep", "max_step_size", "nle_solver_max_iter")
+        kept = ("dissolver", "tolerance_of_hatch", "step", "idaho", "tank.a_to_l")
+        rows = [parameter(name, '<Real start="1"/>') for name in names + kept]
+        made = skeleton(make_fmu(INPUT, OUTPUT, *rows))
+        assert tuple(config_of(made.out)["model_parameters"]) == kept
+        assert f"# {len(names)} more are listed by: fmugym info" in made.out
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_runs_for_fmus_of_the_tests(self, tmp_path, version):
+        made = [probe_fmu(tmp_path, version)]
+        made.append(quirk_table.quirk_fmu(tmp_path, version, "well behaved"))
+        made.append(zoo_tools.zoo_fmu(tmp_path, version))
+        for path in made:
+            assert_skeleton_runs(path)
+
+    @pytest.mark.parametrize("name", makers.MADE)
+    def test_runs_for_fmus_of_other_makers(self, tmp_path, name):
+        assert_skeleton_runs(makers.MADE[name].build(tmp_path))
 
     def test_what_a_number_cannot_carry_is_left_out(self, skeleton, make_fmu):
         made = skeleton(
@@ -304,6 +373,17 @@ class TestSkeleton:
         command = [sys.executable, "made.py"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert "DecayEnv keeps the contract" in done.stdout, done.stderr
+
+
+def assert_skeleton_runs(path):
+    """Write a skeleton beside an FMU and run it."""
+    program = path.with_suffix(".py")
+    assert run("skeleton", path, "--output", program).returncode == 0
+    command = [sys.executable, program.name]
+    done = subprocess.run(
+        command, cwd=path.parent, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert "keeps the contract" in done.stdout, done.stderr
 
 
 DECAY = """

@@ -4,19 +4,23 @@ The reference is FMPy, making the same calls on a new instance of a new copy of 
 table is in quirk_table.py and in docs/reliability.md.
 """
 
+import contextlib
 import functools
 import os
 import sys
 from pathlib import Path
 
 import fresh
+import gymnasium as gym
 import numpy as np
 import pytest
 import quirk_table
 from quirk_table import OUTPUTS, QUIRKS
 
 import fmugym
+from fmugym.errors import ContractError
 from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
 from fmugym.trial.trial import Candidate, examine
@@ -174,6 +178,41 @@ def test_verdict(make_fmu, version, quirk, caplog):
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert quirk.log in " ".join(warnings)
     assert bool(warnings) == bool(quirk.log)
+
+
+class HiddenEnv(QuirkEnv):
+    """Observes the output only, rounded."""
+
+    def _get_observation(self):
+        return np.array([self.out["y"] + 20.0], np.float32)
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-100.0, 100.0, (1,), np.float32)
+
+
+BAD_RESETS = [
+    (version, quirk)
+    for version, quirk in CASES
+    if quirk.method == "instance"
+    and quirk.token not in ("second episode hangs", "reset frees twice")
+]
+
+
+@pytest.mark.parametrize("gain", [1.5, fmugym.Uniform(0.5, 2.0)], ids=["fixed", "drawn"])
+@pytest.mark.parametrize(("version", "quirk"), BAD_RESETS, ids=str)
+def test_the_check_finds_bad_resets(make_fmu, version, quirk, gain):
+    """Also where the observation hides them, or where the parameters never change."""
+    path = make_fmu(quirk.token, version)
+    env = HiddenEnv(path, gain, reset_method="reset", probe_timeout=None, max_episode_steps=30)
+    with contextlib.closing(env), pytest.raises(ContractError, match="reset does not restore"):
+        check_fmu_env(env, num_steps=50)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_the_check_accepts_good_resets(make_fmu, version):
+    env = HiddenEnv(make_fmu("well behaved", version), max_episode_steps=30)
+    with contextlib.closing(env):
+        check_fmu_env(env, num_steps=50)
 
 
 def test_the_document_has_this_table():

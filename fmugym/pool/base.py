@@ -171,11 +171,12 @@ class Pool(ABC):
         self,
         variables: tuple[Variable, ...],
         programs: Any,
-        actions: tuple[int, int],
+        actions: Any,
         start_values: FloatArray,
         draws: Any,
         episodes: Any,
-    ) -> Callable[..., tuple[int, int]]:
+        surroundings: Any,
+    ) -> Callable[..., tuple[int, int, int]]:
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
 
         Raises:
@@ -194,6 +195,14 @@ class Pool(ABC):
             Whether the pool can do that.
         """
         return False
+
+    def start_of_play(self) -> Callable[..., int]:
+        """The function that starts episodes outside of a step; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``can_play``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
 
     def watched(self, function: Callable[P, R]) -> Callable[P, R]:
         """Add the memory that a reset function allocates to the growth counter."""

@@ -23,8 +23,27 @@ __all__ = ["Skeleton"]
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
 
+DEFAULT_STEP: Final = 0.01
+"""The step size in seconds where the FMU tells nothing about its time."""
+
 MOST_LOCALS: Final = 8
 """Locals that replace outputs where the FMU has none."""
+
+STEPS: Final = 500
+"""About as many steps has the default experiment where the FMU gives no usable step size."""
+
+MOST_STEPS: Final = 100_000
+"""More steps than this are no episode."""
+
+_SOLVER: Final = re.compile(
+    r"""(^|\.)_                 # as in JModelica's _cs_solver
+    |(^|[._])(
+        solver|jacobian|newton|cvode|ida|nle|sundials
+        |(rel|abs|r|a)_?tol(erance)?|(max|min|initial)_?step(_?size)?|log_?level
+    )($|[._\d])""",
+    re.VERBOSE | re.IGNORECASE,
+)
+"""Names of parameters that set up the exporter's solver rather than the model."""
 
 _PROGRAM: Final = '''\
 """An environment for the FMU {file}. Decide what is marked with TODO.
@@ -113,12 +132,16 @@ class Skeleton:
 
     @cached_property
     def parameters(self) -> list[Variable]:
-        """The parameters that can be set and have a start value, at most ``MOST_PARAMETERS``."""
+        """The parameters of the model that can be set and have a start value.
+
+        At most ``MOST_PARAMETERS``. Those of the exporter's solver are left out.
+        """
         return self._settable_parameters[:MOST_PARAMETERS]
 
     @cached_property
     def _settable_parameters(self) -> list[Variable]:
-        return [v for v in self._of("parameter") if v.settable_at_start and _literal(v)]
+        usable = (v for v in self._of("parameter") if v.settable_at_start and _literal(v))
+        return [v for v in usable if not _SOLVER.search(v.name)]
 
     def _of(self, causality: str) -> list[Variable]:
         return [v for v in self._description.variables.values() if v.causality == causality]
@@ -138,8 +161,8 @@ class Skeleton:
             yield "the FMU has no numeric input"
         if not self._of("output"):
             yield "the FMU has no outputs; locals replace them"
-        if self._description.step_size is None:
-            yield "the FMU gives no step size; set 'time_step'"
+        if not self._has_step_size:
+            yield "the FMU gives no step size that fits its default experiment; set 'time_step'"
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
 
@@ -167,7 +190,7 @@ class Skeleton:
     def _bounds(self) -> Iterator[str]:
         unbounded = [v for v in self.inputs if _needs_bounds(v)]
         if unbounded:
-            yield "# TODO: the FMU gives no limits of these; (low, high)."
+            yield "# TODO: the FMU gives no limits of these; (low, high) is a guess."
             yield from _listing("bounds", [_bounds_line(v) for v in unbounded], "{}")
 
     def _parameter_lines(self) -> Iterator[str]:
@@ -178,19 +201,37 @@ class Skeleton:
             yield f"# {left_out} more are listed by: fmugym info"
 
     def _times(self) -> Iterator[str]:
-        step = self._description.step_size
-        if step is None:
-            step = self._description.fixed_internal_step_size or 0.01
-            yield f'"time_step": {step!r},  # s; TODO: the FMU gives none'
-        else:
+        if self._has_step_size:
+            step = self._description.step_size or 0.0
             yield f'"time_step": {step!r},  # s, the default of the FMU'
-        yield f'"max_episode_steps": {self._episode_steps(step)},'
+        else:
+            step = self._guessed_step
+            yield f'"time_step": {step!r},  # s; TODO: the FMU gives none that fits'
+        steps = self._duration / step
+        yield f'"max_episode_steps": {round(steps) if 1 <= steps <= MOST_STEPS else 200},'
 
-    def _episode_steps(self, step: float) -> int:
-        """The steps of the FMU's default experiment, or 200 if it has none of sensible length."""
-        stop = self._description.stop_time
-        steps = 0.0 if stop is None else (stop - self._description.start_time) / step
-        return round(steps) if 1 <= steps <= 100_000 else 200
+    @property
+    def _duration(self) -> float:
+        """The seconds of the FMU's default experiment; 0 if it has none."""
+        description = self._description
+        seconds = 0.0 if description.stop_time is None else description.stop_time
+        return max(seconds - description.start_time, 0.0) if seconds else 0.0
+
+    @property
+    def _has_step_size(self) -> bool:
+        """Whether the FMU's own step size is not longer than its default experiment."""
+        step = self._description.step_size
+        return step is not None and (self._duration == 0.0 or step <= self._duration)
+
+    @property
+    def _guessed_step(self) -> float:
+        """A round number of seconds, or a multiple of the FMU's internal step size."""
+        internal = self._description.fixed_internal_step_size
+        if not 0.0 < self._duration < math.inf:
+            return internal or DEFAULT_STEP
+        if internal:
+            return internal * max(1, round(self._duration / STEPS / internal))
+        return _round_down(self._duration / STEPS)
 
 
 def _listing(key: str, lines: list[str], brackets: str = "[]") -> Iterator[str]:
@@ -212,14 +253,42 @@ def _needs_bounds(variable: Variable) -> bool:
 
 
 def _bounds_line(variable: Variable) -> str:
-    """Guess missing limits from the nominal value, which tells the scale of the variable."""
+    """Guess missing limits: a model often fails far away from its start value."""
     low, high = variable.minimum, variable.maximum
-    reach = abs(variable.nominal or 1.0)
+    down, up = _reach(variable)
+    start = _start(variable)
     if not math.isfinite(low):
-        low = -reach if not math.isfinite(high) else min(high - reach, -reach)
+        low = min(start, high) - down
     if not math.isfinite(high):
-        high = max(low + reach, reach)
+        high = max(start, low) + up
     return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # TODO"
+
+
+def _start(variable: Variable) -> float:
+    value = start_value(variable)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _reach(variable: Variable) -> tuple[float, float]:
+    """How far below and above its start value an input without limits may move.
+
+    A tenth of a start value, and at most the nominal value. Without both, nothing is known; a model
+    then fails more often with negative values than with positive ones.
+    """
+    start, nominal = abs(_start(variable)), abs(variable.nominal or 0.0)
+    sizes = [size for size in (start / 10, nominal) if size > 0.0]
+    if not sizes:
+        return 0.0, 1.0
+    reach = min(sizes)
+    return (max(1.0, round(reach)),) * 2 if variable.kind == "integer" else (reach, reach)
+
+
+def _round_down(value: float) -> float:
+    """The next lower of 1, 2 or 5 times a power of ten; rounding errors do not count."""
+    value *= 1.0 + 1e-9
+    power = 10.0 ** math.floor(math.log10(value))
+    digit = next(digit for digit in (5, 2, 1) if digit * power <= value or digit == 1)
+    return float(f"{digit * power:.0e}")
 
 
 def _literal(variable: Variable) -> str:

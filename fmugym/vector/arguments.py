@@ -28,10 +28,10 @@ __all__ = [
     "checked_hooks",
     "checked_mask",
     "checked_num_envs",
-    "checked_options",
     "checked_pool_options",
     "checked_seeds",
     "checked_step_limit",
+    "split_options",
 ]
 
 HOOKS: Final = ("auto", "compiled", "array", "per_env")
@@ -184,15 +184,19 @@ def _elements(values: Any) -> list[Any] | None:
         return None
 
 
-def checked_options(options: Any) -> dict[str, Any]:
-    """Copy the argument ``options`` of ``reset``.
+def split_options(options: Any, num_envs: int) -> tuple[dict[str, Any], MaskArray]:
+    """Take ``"reset_mask"`` out of the argument ``options`` of ``reset``.
+
+    Returns:
+        The other options, and a copy of the mask.
 
     Raises:
-        ConfigError: If it is neither None nor a dict.
+        ConfigError: If the options are neither None nor a dict, or the mask does not fit.
     """
-    if options is None:
-        return {}
-    return check_mapping("the options of reset", options)
+    if type(options) is dict and len(options) == 1 and "reset_mask" in options:  # most common
+        return {}, checked_mask(options["reset_mask"], num_envs)
+    remaining = {} if options is None else check_mapping("the options of reset", options)
+    return remaining, checked_mask(remaining.pop("reset_mask", None), num_envs)
 
 
 def checked_mask(mask: Any, num_envs: int) -> MaskArray:
@@ -203,6 +207,10 @@ def checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """
     if mask is None:
         return np.ones(num_envs, np.bool_)
+    if type(mask) is np.ndarray and mask.dtype == np.bool_ and mask.shape == (num_envs,):
+        copy: MaskArray = mask.copy()  # first, because the caller's array may change
+        if np.count_nonzero(copy):
+            return copy
     try:
         array = np.array(mask)
         fits = array.shape == (num_envs,) and array.dtype == np.bool_ and bool(array.any())

@@ -1,44 +1,47 @@
-"""Infos and observations of N environments.
-
-Infos are arrays by name, each with a mask that says which environments it is for, as in Gymnasium's
-vector environments. Outside of its mask an array holds zeros, or None where it holds objects.
-"""
+"""Infos and observations of N environments; ``fmugym.vector.codec`` has the form of infos."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.values import LateDict
+from fmugym.vector.codec import coded, within
 
 __all__ = [
     "copy_rows",
     "drawn_info",
+    "final_infos",
     "merged",
     "not_finite",
     "observation_of",
     "observations_of",
     "restricted",
-    "within",
+    "rows_as_objects",
 ]
 
 
-def within(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Copy values of environments, but zero (or None) outside of a mask."""
-    result = np.zeros_like(values) if values.dtype != object else np.full_like(values, None)
-    result[mask] = values[mask]
-    return result
-
-
 def drawn_info(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
-    """The info of a reset: what was drawn or overridden, by name."""
-    values: dict[str, Any] = {}
-    for name, row in drawn.items():
-        values[name], values[f"_{name}"] = within(mask, row), mask.copy()
-    return {"drawn": values, "_drawn": mask.copy()}
+    """The info of a reset: what was drawn or overridden, by name; no caller changes the rows."""
+    mask = mask.copy()
+    return {"drawn": LateDict.of(coded, drawn, mask), "_drawn": mask}  # rarely read
+
+
+def final_infos(
+    observations: npt.NDArray[Any], infos: Mapping[str, Any], ended: MaskArray
+) -> dict[str, Any]:
+    """The infos of the mode ``SAME_STEP`` on the episodes that have ended."""
+    return {
+        "final_obs": observations,
+        "_final_obs": ended.copy(),
+        "final_info": infos,
+        "_final_info": ended.copy(),
+    }
 
 
 def restricted(infos: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
@@ -87,6 +90,8 @@ def not_finite(values: Any) -> MaskArray | None:
         return np.logical_or.reduce(found) if found else None
     if values.dtype.kind != "f":
         return None
+    if isfinite(np.vdot(values, values)):  # two thirds of the time of what follows
+        return None
     finite = np.isfinite(values)
     if np.count_nonzero(finite) == finite.size:  # a third of the time of finite.all()
         return None
@@ -101,6 +106,15 @@ def observation_of(observations: Any, index: int) -> Any:
     if isinstance(observations, tuple):
         return tuple(observation_of(value, index) for value in observations)
     return observations[index].copy()
+
+
+def rows_as_objects(rows: npt.NDArray[Any], mask: MaskArray) -> npt.NDArray[Any]:
+    """``observations_of`` for one array, in a quarter of the time."""
+    objects = np.empty(len(mask), object)
+    indices = np.flatnonzero(mask)
+    for index, row in zip(indices.tolist(), rows[indices], strict=True):
+        objects[index] = row
+    return objects
 
 
 def observations_of(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:

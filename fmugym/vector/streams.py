@@ -58,10 +58,18 @@ class EpisodeStreams:
         self._seed_others([index])
         return self._seeds[index]
 
-    def seed(self, seeds: Sequence[int | None], indices: IndexArray) -> None:
-        """Seed some of the environments anew; None leaves a stream as it is."""
+    def seed(self, seeds: Sequence[int | None] | None, indices: IndexArray) -> None:
+        """Seed some of the environments anew; None leaves a stream, or all, as it is."""
+        if seeds is None:
+            return
         chosen = ((index, seeds[index]) for index in indices.tolist())
         self._seed({index: seed for index, seed in chosen if seed is not None})
+
+    def require_seeds(self) -> None:
+        """Seed all that have no seed yet; native code may then draw from the streams."""
+        if not self._all_seeded:
+            self._seed_others(range(len(self._seeds)))
+            self._all_seeded = True
 
     def _seed_others(self, indices: Sequence[int]) -> None:
         """Seed those environments that have no seed yet from the system's entropy."""
@@ -96,9 +104,7 @@ class EpisodeStreams:
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
-        if not self._all_seeded:
-            self._seed_others(range(len(self._seeds)))
-            self._all_seeded = True
+        self.require_seeds()
         draws = self.native_draws(plan)
         values = np.empty((len(plan.drawn_names), len(indices)))
         if draws is not None:

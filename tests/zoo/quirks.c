@@ -19,7 +19,7 @@ enum { NUMBERS = 8, OVERRUN = 16 };
 
 struct Animal {
     double values[VARIABLES];
-    double x;
+    double x, first_gain;
     int resets;
     bool ready, hangs, stopped;
     char token[40], folder[PATH_MAX];
@@ -159,6 +159,7 @@ int zoo_exit(Animal *me) {
     const bool prepared = prepare(me);
 
     shared_x = me->x;
+    me->first_gain = me->resets == 0 ? me->values[GAIN] : me->first_gain;
     me->ready = true;
     if (!is(me, "reset keeps outputs")) {
         me->values[Y] = me->x;
@@ -173,8 +174,13 @@ int zoo_initialize(Animal *me) {
 /* The gain as it is found in each step. */
 static double find_gain(Animal *me) {
     char path[PATH_MAX + 20];
-    double gain = is(me, "global parameters") ? shared_gain : me->values[GAIN];
+    double gain = me->values[GAIN];
 
+    if (is(me, "global parameters")) {
+        gain = shared_gain;
+    } else if (is(me, "reset ignores parameters")) {
+        gain = me->first_gain;
+    }
     find_scratch(me, path, sizeof path);
     if (path[0] != '\0' && !is(me, "reset keeps files")) {
         read_number(path, &gain);

@@ -32,12 +32,15 @@ class Engine(ABC):
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
         has_moved: Whether the last step or reset got as far as the FMUs.
+        starts_at_ends: Whether the caller wants the next episode to start in the step that ends one
+            (the mode ``SAME_STEP``). An engine may leave that to ``reset``.
     """
 
     def __init__(self, num_envs: int) -> None:
         self.ended = np.zeros(num_envs, np.bool_)
         self.any_ended = False
         self.has_moved = False
+        self.starts_at_ends = False
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""
@@ -51,9 +54,15 @@ class Engine(ABC):
 
     @abstractmethod
     def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes of the environments in the mask; return the observations of all."""
+        """Start episodes of the environments in the mask; return the observations of all.
+
+        Args:
+            mask: Which environments; the engine may keep this array.
+            seeds: A seed or None for each environment, or None for no seeds.
+            options: As for a single environment.
+        """
 
     @abstractmethod
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:

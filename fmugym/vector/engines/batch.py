@@ -25,10 +25,11 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.step import conclude
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
+from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results
-from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of, within
+from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, column, take
 
@@ -181,7 +182,7 @@ class BatchEngine(Engine):
     # Episodes.
 
     def reset(
-        self, mask: MaskArray, seeds: Sequence[int | None], options: Mapping[str, Any]
+        self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
         self.has_moved = False
@@ -274,7 +275,9 @@ class BatchEngine(Engine):
             if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
                 row = variables[name] = results.variable(name, row, self._n)
         else:
-            row = self._parameters.setdefault(name, np.full(self._n, np.nan))
+            known = self._parameters.get(name)
+            row = np.full(self._n, np.nan) if known is None else known
+            self._parameters[name] = row
         return row
 
     # Steps.
@@ -322,7 +325,9 @@ class BatchEngine(Engine):
         if array.dtype != space.dtype:
             with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
                 array = array.astype(space.dtype)
-        return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
+        if array.ndim <= 2:
+            return np.ascontiguousarray(array.T)
+        return np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
@@ -445,7 +450,7 @@ class BatchEngine(Engine):
             return
         stopped, failed = self._stopped(statuses), self._failed(statuses)
         if stopped.any():
-            result.infos.update({"fmu_terminated": stopped, "_fmu_terminated": stopped.copy()})
+            result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
         reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
         for index in _indices(wrong_rewards, ~failed):
             reasons[index] = f"_reward_policy returned {result.rewards[index]}{self._when(index)}"
@@ -475,9 +480,8 @@ class BatchEngine(Engine):
             self._undo(result, faulty & ~failed, reasons)
         texts = np.full(self._n, None, dtype=object)
         texts[faulty] = list(reasons.values())
-        rates = within(faulty, fault_rates(self._pool.health()))
-        result.infos.update({"fault": texts, "_fault": faulty})
-        result.infos.update({"fault_rate": rates, "_fault_rate": faulty.copy()})
+        rates = fault_rates(self._pool.health())
+        result.infos.update(coded({"fault": texts, "fault_rate": rates}, faulty))
         result.rewards[faulty] = config.fault_reward
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"

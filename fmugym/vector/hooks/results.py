@@ -18,9 +18,10 @@ from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.results import given
-from fmugym.vector.infos import within
+from fmugym.vector.codec import coded
 
 __all__ = [
+    "environments_first",
     "flags",
     "info_arrays",
     "observations",
@@ -120,6 +121,9 @@ def _mismatch(hook: str, value: Any, wanted: str) -> ConfigError:
 
 def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
     """Turn the result of ``_get_observation`` into new arrays with environments first, not last."""
+    is_array = type(value) is np.ndarray and value.dtype == space.dtype
+    if is_array and value.shape == (*_shape_of(space), count):
+        return np.array(environments_first(value), order="C")
     hook = "_get_observation"
     given(value, hook)
     if isinstance(space, spaces.Dict):
@@ -134,7 +138,12 @@ def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
         if array.dtype.kind not in _NUMBERS or array.shape != (*_shape_of(space), count):
             raise _mismatch(hook, value, wanted)
         with np.errstate(over="ignore", invalid="ignore"):  # infinite is a fault, and found later
-            return np.array(np.moveaxis(array, -1, 0), space.dtype, order="C")
+            return np.array(environments_first(array), space.dtype, order="C")
+
+
+def environments_first(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """View an array with its last axis first."""
+    return array.T if array.ndim <= 2 else np.moveaxis(array, -1, 0)  # which takes 3 us
 
 
 def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:
@@ -171,23 +180,24 @@ def restore_variable(
 
 def info_arrays(info: Any, mask: MaskArray) -> dict[str, Any]:
     """Turn the result of ``_get_info``, environments last, into infos of those in a mask."""
+    return coded(_info_rows(info, len(mask)), mask)
+
+
+def _info_rows(info: Any, count: int) -> dict[str, Any]:
     given(info, "_get_info")
     named = check_mapping("what _get_info returned", info)
-    values = {name: _info_array(name, value, mask) for name, value in named.items()}
-    return values | {f"_{name}": mask.copy() for name in values}
+    return {name: _info_row(name, value, count) for name, value in named.items()}
 
 
-def _info_array(name: str, value: Any, mask: MaskArray) -> Any:
-    count = len(mask)
+def _info_row(name: str, value: Any, count: int) -> Any:
     wanted = f"as {name!r} one value, or an array with {count} elements in the last axis"
     with _expected("_get_info", value, wanted):
         if isinstance(value, Mapping):
-            return info_arrays(value, mask)
+            return _info_rows(value, count)
         array = np.asarray(value)
         if array.ndim and array.shape[-1] != count:
             raise _mismatch("_get_info", value, wanted)
-        rows = np.moveaxis(array, -1, 0) if array.ndim else _everywhere(value, array, count)
-        return within(mask, rows)
+        return environments_first(array) if array.ndim else _everywhere(value, array, count)
 
 
 def _everywhere(value: Any, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:

@@ -1,0 +1,63 @@
+#include "starts.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "initial_states.h"
+
+static float *observation_of(const Task *task, size_t index) {
+    return task->call->observations + index * task->pool->settings.num_observed;
+}
+
+/* A float32 may be infinite where the output is a finite float64. */
+static bool has_finite_observation(const Task *task, size_t index) {
+    const float *values = observation_of(task, index);
+    bool finite = true;
+
+    for (size_t i = 0; i < task->pool->settings.num_observed; i++) {
+        finite &= isfinite(values[i]) != 0;
+    }
+    return finite;
+}
+
+size_t starts_one(Task *task, size_t index, Scratch scratch) {
+    Pool *pool = task->pool;
+    const Call *call = task->call;
+    const Play *play = call->turn->play;
+
+    play_draw(call->turn, index);
+    const Status status = instance_reset(pool, &pool->instances[index], call, scratch);
+    const size_t troubled = note_status(task, index, status);
+
+    write_observation(pool, index, call->observations);
+    play_start_episode(call->turn, index);
+    play->step_counts[index] = 0;
+    play->ended[index] = 0;
+    return troubled > 0 || !has_finite_observation(task, index);
+}
+
+/* What ends by a fault stays as it is, so that the owner can say what the fault was. */
+static bool has_ended_well(const Task *task, size_t index) {
+    const Turn *turn = task->call->turn;
+
+    return turn->play->ended[index] && task->pool->settings.status[index] <= STATUS_WARNING &&
+           isfinite(turn->rewards[index]) && has_finite_observation(task, index);
+}
+
+size_t starts_after_ends(Task *task, size_t begin, size_t count, Scratch scratch,
+                         size_t *started) {
+    const Turn *turn = task->call->turn;
+    const size_t width = task->pool->settings.num_observed;
+    size_t troubled = 0;
+
+    for (size_t index = begin; index < begin + count; index++) {
+        turn->started[index] = has_ended_well(task, index);
+        if (turn->started[index]) {
+            memcpy(turn->last_observations + index * width, observation_of(task, index),
+                   width * sizeof(float));
+            troubled += starts_one(task, index, scratch);
+            ++*started;
+        }
+    }
+    return troubled;
+}

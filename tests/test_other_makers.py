@@ -1,0 +1,97 @@
+"""FMUs that programs of other makers build: every episode equals that of a fresh FMPy instance."""
+
+import functools
+
+import fresh
+import makers
+import numpy as np
+import pytest
+
+import fmugym
+
+LENGTHS = (3, 12, 12, 5)
+NUM_ENVS = 3
+WAYS = {"default": {}, "one": {"threads": 1}, "two": {"threads": 2}}
+WAYS["process"] = {"isolation": "process"}
+made = pytest.mark.parametrize("name", makers.MADE)
+
+
+class MadeEnv(fmugym.FMUEnv):
+    """Draws all parameters."""
+
+    def __init__(self, path, name, **options):
+        one = makers.MADE[name]
+        config = {
+            "model_input_names": list(one.inputs),
+            "model_output_names": one.outputs,
+            "model_parameters": {n: fmugym.Uniform(*b) for n, b in one.parameters.items()},
+            "bounds": {n: (-b, b) for n, b in one.inputs.items()},
+            "time_step": one.step,
+        }
+        super().__init__(path, config, **options)
+
+    def _is_done(self):
+        return self.state[0] > 1e9
+
+
+@pytest.fixture(scope="module")
+def make_fmu(tmp_path_factory):
+    return functools.cache(lambda name: makers.MADE[name].build(tmp_path_factory.mktemp("made")))
+
+
+@pytest.fixture(autouse=True)
+def trials(monkeypatch, tmp_path_factory):
+    """Trials as users have them; the cache serves all tests of a session."""
+    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "made verdicts"))
+
+
+def actions_of(name, length, index=0):
+    """Moving inputs of one environment, shape (steps, inputs)."""
+    swing = np.sin(0.9 * np.arange(length) + index)
+    columns = [np.rint(abs(swing) * reach) if isinstance(reach, int) else abs(swing) * reach
+               for reach in makers.MADE[name].inputs.values()]  # fmt: skip
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def expected(path, name, drawn, length, index=0):
+    one = makers.MADE[name]
+    rows = [dict(zip(one.inputs, row, strict=True)) for row in actions_of(name, length, index)]
+    return fresh.play(path, one.outputs, rows, one.step, drawn)
+
+
+@made
+@pytest.mark.parametrize("isolation", ["none", "process"])
+def test_single(make_fmu, name, isolation):
+    path = make_fmu(name)
+    env = MadeEnv(path, name, isolation=isolation)
+    env.reset(seed=7)
+    for length in LENGTHS:
+        _, info = env.reset()
+        rows = [list(env.state)]
+        for action in actions_of(name, length):
+            env.step(action)
+            rows.append(list(env.state))
+        assert rows == expected(path, name, info.get("drawn", {}), length)
+    env.close()
+
+
+@made
+@pytest.mark.parametrize("way", WAYS)
+def test_vector(make_fmu, name, way):
+    path = make_fmu(name)
+    envs = fmugym.FMUVectorEnv(
+        lambda: MadeEnv(path, name), NUM_ENVS, autoreset_mode="Disabled", **WAYS[way]
+    )
+    envs.reset(seed=7)
+    for length in LENGTHS:
+        _, infos = envs.reset()
+        rows = [np.array(envs.get_attr("state"))]
+        actions = [actions_of(name, length, index) for index in range(NUM_ENVS)]
+        for action in np.stack(actions, axis=1):
+            envs.step(action)
+            rows.append(np.array(envs.get_attr("state")))
+        for index, states in enumerate(np.swapaxes(rows, 0, 1).tolist()):
+            drawn = {n: values[index] for n, values in infos.get("drawn", {}).items()}
+            assert states == expected(path, name, drawn, length, index)
+    envs.close()
