@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from fmpy.fmi2 import FMU2Slave
+from gymnasium.vector import AutoresetMode
 from measure import MissingError, Run, Sample, Stopwatch, repeated
 
 import fmugym
@@ -125,11 +126,13 @@ def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, An
 
 
 def vector_run(env: Any) -> Run:
-    """Make a run of steps of a vector environment in the mode ``NEXT_STEP``.
+    """Make a run of steps of a vector environment in its autoreset mode.
 
-    A step that only resets an environment is not a transition and does not count. The clocks stand
-    still while counting.
+    A step that only resets an environment, as in ``NEXT_STEP``, is not a transition and does not
+    count. In ``DISABLED``, masked resets follow the steps. The clocks stand still while counting.
     """
+    mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+    block = _step_and_reset_block if mode is AutoresetMode.DISABLED else _step_block
     workers = [process.pid for process in getattr(env, "processes", ())]
     dtype = env.action_space.dtype
     chosen = list(actions(env.num_envs).astype(dtype))
@@ -140,9 +143,11 @@ def vector_run(env: Any) -> Run:
         nonlocal resetting
         watch, done = Stopwatch(workers), 0
         while watch.wall < seconds:
-            ends = _step_block(env, chosen, watch)
-            done += env.num_envs * STEPS - sum(ends[:-1]) - resetting
-            resetting = ends[-1]
+            ends = block(env, chosen, watch)
+            done += env.num_envs * STEPS
+            if mode is AutoresetMode.NEXT_STEP:
+                done -= sum(ends[:-1]) + resetting
+                resetting = ends[-1]
         return watch.sample(done)
 
     return run
@@ -159,6 +164,21 @@ def _step_block(
         flags.append((terminated, truncated))
     watch.stop()
     return [int(np.count_nonzero(one | other)) for one, other in flags]
+
+
+def _step_and_reset_block(
+    env: Any, chosen: list[npt.NDArray[np.integer[Any]]], watch: Stopwatch
+) -> list[int]:
+    """Step once per action, and reset the environments whose episodes have ended."""
+    step, reset = env.step, env.reset
+    watch.start()
+    for action in chosen:
+        _, _, terminated, truncated, _ = step(action)
+        ended = terminated | truncated
+        if np.count_nonzero(ended):
+            reset(options={"reset_mask": ended})
+    watch.stop()
+    return []
 
 
 def envpool_run(stack: ExitStack, num_envs: int, threads: int) -> Run:

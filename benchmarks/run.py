@@ -26,6 +26,7 @@ import heavy
 import isolation
 import loaded
 import memory
+import overlap
 import reset
 import single
 import tasks
@@ -40,6 +41,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "reset": reset.tables,
     "heavy": heavy.tables,
     "isolation": isolation.tables,
+    "overlap": overlap.tables,
     "memory": memory.tables,
     "loaded": loaded.tables,
 }

@@ -68,6 +68,9 @@ def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run
     for count, text in threads.items():
         yield f"fmugym, {text}", lambda n=count: _fmugym(stack, size, threads=n)
     *_, (most, text) = threads.items()
+    for mode in ("SAME_STEP", "DISABLED"):
+        options = {"autoreset_mode": mode.lower(), "threads": most}
+        yield f"fmugym, {mode}, {text}", lambda o=options: _fmugym(stack, size, **o)
     arrays = {"hooks": "array", "threads": most}
     yield f'fmugym, hooks="array", {text}', lambda: _fmugym(stack, size, **arrays)
     yield "fmugym, Python pool", lambda: _fmugym(stack, size, backend="python")

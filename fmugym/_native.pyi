@@ -11,11 +11,39 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 
-MOST_INSTRUCTIONS: Final[int]
-"""The most instructions of a program."""
+MOST_REGISTERS: Final[int]
+"""The most registers of a program."""
 
 def operations() -> tuple[str, ...]:
     """The operations of programs, in the order of their numbers."""
+
+def evaluate(
+    program: tuple[Any, ...],
+    count: int,
+    elements: int,
+    actions: Array,
+    previous_actions: Array,
+    results: tuple[Array, ...],
+    seen: tuple[Array, ...],
+    /,
+) -> bool:
+    """Run a program on count environments outside of a step.
+
+    Args:
+        program: See ``Program.with_rows``.
+        count: The number of environments.
+        elements: The number of elements of an action.
+        actions: The actions, flat, environments first.
+        previous_actions: Those of the step before.
+        results: Arrays for the results, shape (count,).
+        seen: Arrays for the observations, environments first.
+
+    Returns:
+        Whether an index was outside of its table.
+    """
+
+def is_free_loop(capsule: object, /) -> bool:
+    """Whether a loop of numpy, from ``_get_strided_loop``, can run without the GIL."""
 
 def distributions() -> tuple[str, ...]:
     """The kinds of distributions, in the order of their numbers."""
@@ -194,19 +222,25 @@ class Pool:
         *,
         start: Access,
         start_values: Array,
-        inputs: tuple[bytes, bytes, bytes],
-        judgement: tuple[bytes, bytes, bytes],
-        actions: tuple[int, int],
+        inputs: tuple[Any, ...],
+        judgement: tuple[Any, ...],
+        actions: dict[str, Any],
         draws: Draws,
         states: Array,
         episodes: Episodes,
+        kept: Array,
+        keeps_always: bool,
+        copies: tuple[tuple[Array, Array], ...],
+        variable_starts: tuple[tuple[Array, bytes], ...],
+        drawn_variables: tuple[tuple[Array, int], ...],
+        input_starts: tuple[tuple[int, float], ...],
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
     def play(
         self,
         actions: Array,
-        observations: Array,
+        observations: Array | tuple[Array, ...],
         rewards: Array,
         terminated: Array,
         truncated: Array,
@@ -218,8 +252,9 @@ class Pool:
         """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:
-            TypeError: If the actions are no int64.
-            ValueError: If there is a wrong number of them, or one is out of range.
+            TypeError: If the actions have another type or shape than was prepared.
+            ValueError: If one of them is out of range or NaN.
+            IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
     def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:

@@ -27,6 +27,7 @@ from fmugym.task.step import conclude
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
+_INTEGERS: Final = frozenset({int, np.int64})
 _WARNING: Final = int(Status.WARNING)
 _TERMINATED: Final = int(Status.TERMINATED)
 _ARGUMENTS: Final = ("fmu_path", "config", "log_level", "render_mode", "backend", "isolation")
@@ -165,15 +166,10 @@ class FMUEnv(Constructed):
         self.action = self.previous_action = self._no_action
         self.inputs = tuple(self.parameters.get(n, start) for n, start in self._start_inputs)
         self.done = self.after_end = False
-        self._read_outputs()
-        self.previous_state = self.state
+        self._values = tuple(self._output_row.tolist())
+        self.state = self.previous_state = self._values[: self._output_count]
         self._last_reward, self._return = None, 0.0
         self._was_reset, self._ended = True, False
-
-    def _read_outputs(self) -> None:
-        """Give hooks the pool's outputs as Python floats, which are faster than numpy's."""
-        self._values = values = tuple(self._output_row.tolist())
-        self.state = values if self._no_monitors else values[: self._output_count]
 
     def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
         self._in_hooks = True
@@ -238,22 +234,29 @@ class FMUEnv(Constructed):
 
     def _take_action(self, action: Any) -> None:
         elements = self._elements
-        if elements is not None:
-            if not is_element(action, elements):
-                raise ConfigError(f"action {shown(action)} is not in {self.action_space}")
-        elif has_nan(action):
-            raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
-        before = self.action, self.previous_action, self.previous_state
-        self.previous_action, self.action, self.previous_state = before[0], action, self.state
+        if elements is None or type(action) not in _INTEGERS or action not in elements:
+            self._require_usable(action)
+        before = self.previous_action, self.previous_state
+        self.previous_action, self.previous_state, self.action = self.action, self.state, action
         try:
-            self.inputs = self._input_writer.write(self._get_inputs(), action, self._input_row)
+            values, row = self._get_inputs(), self._input_row
+            self.inputs = self._input_writer.write(values, action, row)
         except BaseException as error:  # the FMU was not touched: a better action may follow
-            self.action, self.previous_action, self.previous_state = before
+            self.action = self.previous_action
+            self.previous_action, self.previous_state = before
             if self._blames_action(action, error):
                 raise ConfigError(
                     f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
                 ) from error
             raise
+
+    def _require_usable(self, action: Any) -> None:
+        elements = self._elements
+        if elements is not None:
+            if not is_element(action, elements):
+                raise ConfigError(f"action {shown(action)} is not in {self.action_space}")
+        elif has_nan(action):
+            raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
 
     def _blames_action(self, action: Any, error: BaseException) -> bool:
         """Whether ``_get_inputs`` failed because of an action outside of the action space."""
@@ -270,26 +273,23 @@ class FMUEnv(Constructed):
             stopped = status == _TERMINATED
             if status > _WARNING and not stopped:
                 return self._fault(pool.failure(0))
-        before = self._values, self.variables.copy() if self._own.update else None
-        self._read_outputs()
+        variables = self.variables.copy() if self._own.update else None
+        before = self._values
+        self._values = values = tuple(self._output_row.tolist())  # Python's floats are faster
+        self.state = values if self._no_monitors else values[: self._output_count]
         observed = self._observation_row.copy() if self._pool_observes else None
         cut_off = self.step_count >= self._step_limit
         result = conclude(self, self._form, stopped, cut_off, observed)
         observation, reward, terminated, truncated = result
-        if not (isfinite(reward) and self._is_shown(observation)):
-            return self._fault_of_hooks(reward, observation, before)
+        is_small = observed is not None and hypot(*values) <= FLOAT32_LIMIT
+        if not (isfinite(reward) and (is_small or self._is_finite(observation))):
+            return self._fault_of_hooks(reward, observation, (before, variables))
         info = self._info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True
         if terminated or truncated:
             self._ended = True
         return observation, reward, terminated, truncated, info
-
-    def _is_shown(self, observation: Any) -> bool:
-        """Whether an observation is finite."""
-        if self._pool_observes and hypot(*self.state) <= FLOAT32_LIMIT:
-            return True  # sooner known than by looking at the array
-        return self._is_finite(observation)
 
     def _info(self) -> dict[str, Any]:
         """Return the info of the hook and of the pool."""

@@ -29,6 +29,7 @@ __all__ = [
     "LicenceError",
     "SimulationError",
     "printable",
+    "reason",
     "shown",
     "unknown_argument",
     "unknown_name",
@@ -36,6 +37,9 @@ __all__ = [
 
 _LONGEST: Final = 120
 """Characters of a value that an error shows, at most."""
+
+_LONGEST_REASON: Final = 400
+"""Characters of another error that an error quotes, at most."""
 
 
 def printable(text: object) -> str:
@@ -109,6 +113,12 @@ def shown(value: object) -> str:
         text = " ".join(text.split())
     text = printable(text)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def reason(error: Exception) -> str:
+    """Return the text of an error of another library, which may quote any amount of a file."""
+    text = str(error)
+    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:

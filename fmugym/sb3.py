@@ -46,6 +46,7 @@ def make_sb3_env(
     *,
     seed: int | None = None,
     monitor: bool = True,
+    overlap: bool = False,
     **kwargs: Any,
 ) -> VecEnv:
     """Make N environments for Stable-Baselines3, as its own ``make_vec_env`` does.
@@ -56,6 +57,7 @@ def make_sb3_env(
         seed: Environment i is seeded with ``seed + i`` at the first reset.
         monitor: Whether to wrap them in a ``VecMonitor``, which writes returns and lengths to the
             log of the training.
+        overlap: As for ``FMUVecEnv``.
         kwargs: Arguments of ``FMUVectorEnv`` (``max_episode_steps``, ``hooks``, ``threads``, ...)
             and of the environment.
 
@@ -71,7 +73,7 @@ def make_sb3_env(
         vector_env = vectorized(env)(num_envs, **kwargs)
     else:
         raise ConfigError(f"env must be a registered id or a class, got {shown(env)}")
-    venv = FMUVecEnv(vector_env)
+    venv = FMUVecEnv(vector_env, overlap)
     if seed is not None:
         venv.seed(seed)
         venv.action_space.seed(seed)
@@ -100,6 +102,10 @@ class FMUVecEnv(VecEnv):
 
     Args:
         env: The vector environment, made with ``autoreset_mode="same_step"``.
+        overlap: Whether the FMUs step between ``step_async`` and ``step_wait``, while the caller
+            computes; otherwise they step in ``step_wait``. The algorithms of Stable-Baselines3 call
+            both at once, and handing a step to a thread takes some 50 us. So this is of use for
+            loops of your own.
 
     Attributes:
         vector_env: The vector environment, as given.
@@ -108,7 +114,7 @@ class FMUVecEnv(VecEnv):
         ConfigError: If ``env`` is something else, or has another autoreset mode.
     """
 
-    def __init__(self, env: FMUVectorEnv) -> None:
+    def __init__(self, env: FMUVectorEnv, overlap: bool = False) -> None:
         if not isinstance(env, FMUVectorEnv):
             raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
         mode = env.autoreset_mode
@@ -118,6 +124,7 @@ class FMUVecEnv(VecEnv):
                 "with autoreset_mode='same_step'"
             )
         self.vector_env = env
+        self._overlap = overlap
         self.spec = env.spec
         self._set_parameters: dict[str, list[Any]] = {}
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -152,8 +159,10 @@ class FMUVecEnv(VecEnv):
         return [(np.array([o == kind for o in self._options]), kind) for kind in kinds]
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Keep the actions for ``step_wait``."""
+        """Begin a step, or keep the actions for ``step_wait``; see ``overlap``."""
         self._actions = actions
+        if self._overlap:
+            self.vector_env.step_async(actions)
 
     def step_wait(self) -> StepReturn:
         """Step all environments; those whose episode ends start the next one.
@@ -163,7 +172,9 @@ class FMUVecEnv(VecEnv):
             observation is the first of the next episode, and the info has
             ``"terminal_observation"``.
         """
-        observations, rewards, terminated, truncated, infos = self.vector_env.step(self._actions)
+        env = self.vector_env
+        result = env.step_wait() if self._overlap else env.step(self._actions)
+        observations, rewards, terminated, truncated, infos = result
         dones = terminated | truncated
         listed = list(map(dict.copy, repeat(_NOTHING_ENDED, self.num_envs)))
         if dones.any():

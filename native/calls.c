@@ -54,6 +54,7 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
 
     ends->ended = (size_t)atomic_get(&task.ended);
     ends->started = (size_t)atomic_get(&task.started);
+    ends->outside = atomic_get(&task.outside) != 0;
     return troubled;
 }
 

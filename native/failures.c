@@ -30,7 +30,6 @@ void failure_drop(Instance *me) {
     }
 }
 
-/* Returns NULL if memory runs out. The status then has no reason. */
 Failure *failure_note(Instance *me, const char *doing, int status) {
     failure_drop(me);
     me->failure = calloc(1, sizeof *me->failure);
@@ -76,13 +75,11 @@ void health_count_fault(const Pool *pool, const Instance *me, Status status) {
     }
 }
 
-/* Instances count their own steps. This adds the new ones to the health counters. */
 void health_count_steps(const Pool *pool, Instance *me) {
     health_of(pool, me)[STEPS] += me->steps - me->counted;
     me->counted = me->steps;
 }
 
-/* Handles a bad status of a call: records the reason and which calls are still legal. */
 Status instance_fail(Pool *pool, Instance *me, const char *doing, Status status) {
     Failure *failure = failure_note(me, doing, status);
     if (failure != NULL) {
@@ -91,7 +88,6 @@ Status instance_fail(Pool *pool, Instance *me, const char *doing, Status status)
     return instance_judge(me, status);
 }
 
-/* Handles a call that was refused before it reached the FMU. */
 Status instance_refuse(Instance *me, const char *reason) {
     failure_note(me, reason, -1);
     return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;

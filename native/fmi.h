@@ -10,7 +10,7 @@
 #include "floats.h"
 #include "library.h"
 
-/* FMI's own codes and two additional ones. fmugym.fmi.instance.Status has the same values. */
+/* FMI's own codes and two more. Status in fmugym/fmi/status.py has the same values. */
 typedef enum {
     STATUS_OK = 0,
     STATUS_WARNING = 1,
@@ -21,8 +21,8 @@ typedef enum {
     STATUS_NOT_FINITE = 7  /* an output is NaN or infinite */
 } Status;
 
-/* The C types of values. module.c and fmugym/pool/native.py use the same numbers. FMI 1.0 and
- * 2.0 have only FLOAT64 (Real), INT32 (Integer) and BOOLEAN. */
+/* The C types of values. fmugym/pool/native.py uses the same numbers. FMI 1.0 and 2.0 have only
+ * FLOAT64 (Real), INT32 (Integer) and BOOLEAN. */
 typedef enum {
     TYPE_FLOAT64,
     TYPE_FLOAT32,
@@ -69,7 +69,7 @@ typedef struct {
 } Outcome;
 
 /* One step for each of several instances. The step sets the inputs before and gets the outputs
- * after. place gives the row of an instance in the inputs and outputs. */
+ * after. places gives the row of each instance in the inputs and outputs. */
 typedef struct {
     const uint32_t *input_references, *output_references;
     size_t number_of_inputs, number_of_outputs;
@@ -85,8 +85,8 @@ typedef struct {
     Outcome *outcomes;
 } Exchange;
 
-/* One FMI version. Every function returns one of FMI's own codes. PENDING and unknown codes
- * become ERROR. A function that the FMU does not export returns ERROR. */
+/* One FMI version. A Status that a function returns is one of FMI's own codes. PENDING and
+ * unknown codes become ERROR, and so does a call of a function that the FMU does not export. */
 typedef struct Fmi {
     size_t boolean_size;
 

@@ -220,6 +220,7 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     if (me->saved != NULL) {
         return status;
     }
-    matrix_gather(values, index_of(pool, me), start->count, scratch.values); /* restore failed */
+    /* the restore did not work, and it has overwritten the start values */
+    matrix_gather(values, index_of(pool, me), start->count, scratch.values);
     return restart(pool, me, call, again, scratch);
 }

@@ -209,8 +209,6 @@ Status instance_renew_if_due(Pool *pool, Instance *me) {
     return loud || pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
 }
 
-/* Returns an instance to the state just after instantiation. Replaces the instance if it refuses
- * a reset or can no longer be reset. */
 Status instance_return_to_start(Pool *pool, Instance *me) {
     if (me->phase == PHASE_INSTANTIATED) {
         return STATUS_OK;
@@ -230,7 +228,6 @@ Status instance_return_to_start(Pool *pool, Instance *me) {
 }
 
 Status instance_save(Pool *pool, Instance *me, void **state) {
-
     *state = NULL;
     const Status status = pool->settings.fmi->get_state(me->library, me->component, state);
     floats_restore_if_seen(&pool->floats);

@@ -1,5 +1,9 @@
 #include "play.h"
 
+#include <float.h>
+#include <math.h>
+#include <string.h>
+
 #include "platform.h"
 
 enum { DONE, TRUNCATED, REWARD };
@@ -14,9 +18,33 @@ WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t low
     return outside != 0;
 }
 
+#define ANY_NAN(Type, name)                                                                        \
+    WIDE static bool name(const Type *values, size_t count) {                                      \
+        size_t number = 0;                                                                         \
+        for (size_t i = 0; i < count; i++) {                                                       \
+            number += values[i] != values[i];                                                      \
+        }                                                                                          \
+        return number > 0;                                                                         \
+    }
+
+ANY_NAN(double, is_any_nan)
+ANY_NAN(float, is_any_nan32)
+
 bool play_has_bad_action(const Turn *turn) {
-    const Play *play = turn->play;
-    return is_any_outside(turn->actions, play->count, play->lowest_action, play->highest_action);
+    const Actions *a = &turn->play->actions;
+    const size_t count = turn->play->count * a->elements;
+    const void *actions = turn->actions;
+
+    switch (a->check) {
+    case ACTIONS_IN_RANGE:
+        return is_any_outside(actions, count, a->lowest, a->highest);
+    case ACTIONS_FLOAT64:
+        return is_any_nan(actions, count);
+    case ACTIONS_FLOAT32:
+        return is_any_nan32(actions, count);
+    default:
+        return false;
+    }
 }
 
 void play_foresee(const Play *play, size_t index) {
@@ -38,37 +66,110 @@ void play_draw(const Turn *turn, size_t index) {
 }
 
 static Source source_of(const Turn *turn) {
+    const Actions *a = &turn->play->actions;
     Source source = turn->play->source;
-    source.actions = turn->actions;
+
+    source.actions = a->current == NULL ? turn->actions : a->current;
+    source.previous_actions = a->previous;
+    source.action_size = a->size;
+    source.action_elements = a->elements;
+    source.ended = turn->play->ended;
+    source.seen = turn->seen;
     return source;
 }
 
-void play_open(const Turn *turn, PlayScratch *scratch) {
-    program_prepare(&turn->play->inputs, scratch->inputs);
-    program_prepare(&turn->play->judgement, scratch->judgement);
+void play_open(const Turn *turn, size_t count, PlayScratch *scratch) {
+    const bool has_short_runs = count % PROGRAM_WIDTH != 0;
+
+    program_prepare(&turn->play->inputs, has_short_runs, scratch->inputs);
+    program_prepare(&turn->play->judgement, has_short_runs, scratch->judgement);
+}
+
+static void take_actions(const Turn *turn, size_t begin, size_t count) {
+    const Actions *a = &turn->play->actions;
+    const size_t size = a->elements * a->size, offset = begin * size;
+
+    memcpy(a->previous + offset, a->current + offset, count * size);
+    memcpy(a->current + offset, turn->actions + offset, count * size);
+}
+
+void play_keep_outputs(const Play *play, size_t begin, size_t count) {
+    for (size_t i = 0; i < play->number_of_outputs; i++) {
+        const size_t place = i * play->count + begin;
+        memcpy(play->kept_rows + place, play->output_rows + place, count * sizeof(double));
+    }
 }
 
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
     const Play *play = turn->play;
-    const Source source = source_of(turn);
+    Notes notes = {.outside = false};
 
-    program_run(&play->inputs, &source, begin, count, scratch->inputs);
-    for (size_t i = 0; i < play->inputs.number_of_results; i++) {
-        const double *values = scratch->inputs[play->inputs.results[i]];
-        double *row = play->input_rows + i * play->count + begin;
-        for (size_t j = 0; j < count; j++) {
-            row[j] = values[j];
-        }
+    if (play->actions.current != NULL) {
+        take_actions(turn, begin, count);
+    }
+    const Source source = source_of(turn);
+    program_run(&play->inputs, &source, begin, count, scratch->inputs, &notes);
+    if (play->keeps_always) {
+        play_keep_outputs(play, begin, count);
     }
     for (size_t index = begin; index < begin + count; index++) {
         play->step_counts[index] = play->ended[index] ? 0 : play->step_counts[index] + 1;
     }
 }
 
+/* An episode that starts has no action yet. */
+static void forget_actions(const Actions *a, size_t index) {
+    const size_t size = a->elements * a->size;
+
+    if (a->current != NULL) {
+        memcpy(a->previous + index * size, a->none, size);
+        memcpy(a->current + index * size, a->none, size);
+    }
+}
+
+void play_start_episode(const Turn *turn, size_t index) {
+    const Play *play = turn->play;
+
+    forget_actions(&play->actions, index);
+    for (size_t i = 0; i < play->number_of_inputs; i++) {
+        const InputStart *start = &play->input_starts[i];
+        play->input_rows[i * play->count + index] =
+            start->row == NULL ? start->value : start->row[index];
+    }
+    for (size_t i = 0; i < play->number_of_variable_starts; i++) {
+        const VariableStart *start = &play->variable_starts[i];
+        memcpy(start->row.data + index * start->row.size, &start->bits, start->row.size);
+    }
+    for (size_t i = 0; i < play->number_of_drawn_variables; i++) {
+        const DrawnVariable *variable = &play->drawn_variables[i];
+        const double *value = turn->drawn + variable->draw * play->count + index;
+        memcpy(variable->row.data + index * sizeof *value, value, sizeof *value);
+    }
+    for (size_t i = 0; play->keeps_always && i < play->number_of_outputs; i++) {
+        const size_t place = i * play->count + index;
+        play->kept_rows[place] = play->output_rows[place];
+    }
+}
+
+static void start_episodes(const Turn *turn, size_t begin, size_t count) {
+    for (size_t index = begin; index < begin + count; index++) {
+        if (turn->play->ended[index]) {
+            play_start_episode(turn, index);
+        }
+    }
+}
+
+static void copy_rows(const Play *play, size_t begin, size_t count) {
+    for (size_t i = 0; i < play->number_of_copies; i++) {
+        const Row *from = &play->copies[i].from, *to = &play->copies[i].to;
+        memcpy(to->data + begin * to->size, from->data + begin * from->size, count * to->size);
+    }
+}
+
 /* Avoids branches, because the processor could not predict them. Handles the wide values first,
  * then the bytes. */
-WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const double *dones,
-                         const double *cuts, const double *rewards) {
+WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const uint8_t *dones,
+                         const uint8_t *cuts, const double *rewards, size_t *troubled) {
     const Play *play = turn->play;
     const int64_t *step_counts = play->step_counts + begin;
     const int64_t limit = play->limit;
@@ -76,20 +177,21 @@ WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const dou
     uint8_t *restrict terminated = turn->terminated + begin;
     uint8_t *restrict truncated = turn->truncated + begin;
     double *restrict given = turn->rewards + begin;
-    uint8_t done[PROGRAM_WIDTH], cut[PROGRAM_WIDTH], number = 0;
+    uint8_t cut[PROGRAM_WIDTH], number = 0;
+    int64_t bad = 0; /* as wide as the rewards, so that the compiler can vectorize */
 
-    for (size_t j = 0; j < PROGRAM_WIDTH; j++) {
-        done[j] = dones[j] != 0.0;
-        cut[j] = cuts[j] != 0.0;
-    }
     for (size_t j = 0; j < count; j++) {
-        cut[j] |= step_counts[j] >= limit;
+        cut[j] = cuts[j] | (step_counts[j] >= limit);
     }
     for (size_t j = 0; j < count; j++) {
         given[j] = ended[j] ? 0.0 : rewards[j];
     }
     for (size_t j = 0; j < count; j++) {
-        terminated[j] = done[j] & !ended[j];
+        bad += !(fabs(given[j]) <= DBL_MAX);
+    }
+    *troubled += (size_t)bad;
+    for (size_t j = 0; j < count; j++) {
+        terminated[j] = dones[j] & !ended[j];
         truncated[j] = cut[j] & !ended[j];
         ended[j] = terminated[j] | truncated[j];
         number += ended[j];
@@ -97,19 +199,30 @@ WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const dou
     return number;
 }
 
-size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
+void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
+                Verdict *verdict) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
+    const Register *registers = scratch->judgement;
+    Notes notes = {.outside = false};
 
-    program_run(&play->judgement, &source, begin, count, scratch->judgement);
-    return judge(turn, begin, count, scratch->judgement[results[DONE]],
-                 scratch->judgement[results[TRUNCATED]], scratch->judgement[results[REWARD]]);
+    start_episodes(turn, begin, count);
+    copy_rows(play, begin, count);
+    program_run(&play->judgement, &source, begin, count, scratch->judgement, &notes);
+    for (size_t j = 0; j < count; j++) {
+        verdict->troubled += notes.not_finite[j];
+    }
+    verdict->outside |= notes.outside;
+    verdict->ended += judge(turn, begin, count, registers[results[DONE]].flags,
+                            registers[results[TRUNCATED]].flags,
+                            registers[results[REWARD]].doubles, &verdict->troubled);
 }
 
 void play_skip(const Turn *turn, size_t index) {
     turn->rewards[index] = 0.0;
     turn->terminated[index] = turn->truncated[index] = 0;
+    program_clear_seen(&turn->play->judgement, turn->seen, index);
     if (turn->started != NULL) {
         turn->started[index] = 0;
     }

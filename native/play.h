@@ -10,15 +10,63 @@
 #include "draws.h"
 #include "program.h"
 
+/* What step() refuses: integers outside of a range, or floats that are NaN. */
+typedef enum { ACTIONS_ANY, ACTIONS_IN_RANGE, ACTIONS_FLOAT64, ACTIONS_FLOAT32 } ActionCheck;
+
+/* The actions of one environment follow each other in memory. */
+typedef struct {
+    size_t elements, size; /* of one environment; bytes of an element */
+    ActionCheck check;
+    int64_t lowest, highest;
+    char *current, *previous; /* those of this step and of the step before; NULL if not kept */
+    const char *none;         /* what counts as the action of an episode that starts */
+} Actions;
+
+/* What the hooks of a new episode read as an input. */
+typedef struct {
+    const double *row; /* NULL stands for the same value everywhere */
+    double value;
+} InputStart;
+
+/* A row of episode variables as it was before the step. */
+typedef struct {
+    Row from, to;
+} RowCopy;
+
+/* What an episode variable is in a new episode, if it is not drawn. */
+typedef struct {
+    Row row;
+    uint64_t bits; /* the value in its first bytes */
+} VariableStart;
+
+/* An episode variable that is drawn, and the number of its draw. */
+typedef struct {
+    Row row;
+    size_t draw;
+} DrawnVariable;
+
 /* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
     size_t count;
-    Program inputs;    /* results: the inputs */
-    Program judgement; /* results: done, truncated, reward */
-    Source source;     /* everything except the actions */
-    int64_t lowest_action, highest_action;
+    Program inputs;    /* stores the inputs */
+    Program judgement; /* stores the rest; its results are done, truncated, reward */
+    Source source;     /* everything that does not change from step to step */
+    Actions actions;
     double *input_rows;
+    const InputStart *input_starts;
+    size_t number_of_inputs;
+    const double *output_rows;
+    double *kept_rows; /* the outputs before the step */
+    size_t number_of_outputs;
+    bool keeps_always; /* whether they are kept in each step; otherwise only where needed */
+    const RowCopy *copies;
+    size_t number_of_copies;
+    const VariableStart *variable_starts;
+    size_t number_of_variable_starts;
+    const DrawnVariable *drawn_variables;
+    size_t number_of_drawn_variables;
     double *start_values; /* a row for each start variable */
+    size_t number_of_parameters;
     const Draws *draws;
     Stream *streams; /* the random stream of each environment */
     int64_t *step_counts;
@@ -29,30 +77,44 @@ typedef struct {
 /* One step of all environments, and where its results go. */
 typedef struct {
     const Play *play;
-    const int64_t *actions;
+    const char *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
+    char *const *seen; /* the arrays of the observations and infos that the judgement stores */
     float *last_observations; /* those of episodes that end, where the next ones start at once */
     uint8_t *started;         /* where they have started; NULL if they start in the next step */
     double *drawn; /* a row for each draw; only the values drawn in this step are written. Values
                     * that were given are read from it */
 } Turn;
 
-/* Whether an action is out of range. */
+/* Whether an action is out of range or NaN. */
 bool play_has_bad_action(const Turn *turn);
 
 /* Scratch memory of one thread. */
 typedef struct {
-    Registers inputs, judgement;
+    Register inputs[PROGRAM_REGISTERS], judgement[PROGRAM_REGISTERS];
 } PlayScratch;
 
-void play_open(const Turn *turn, PlayScratch *scratch);
+/* What became of a run. */
+typedef struct {
+    size_t ended;    /* episodes that have just ended */
+    size_t troubled; /* environments with numbers that are not finite */
+    bool outside;    /* whether a hook looked up an index outside of a table */
+} Verdict;
+
+void play_open(const Turn *turn, size_t count, PlayScratch *scratch);
 
 /* Both handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
- * are reset or stepped, the second afterwards. The second returns how many episodes have just
- * ended. */
+ * are reset or stepped, the second afterwards. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
-size_t play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
+void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
+                Verdict *verdict);
+
+/* Keeps the outputs of a run, before the new ones replace them. */
+void play_keep_outputs(const Play *play, size_t begin, size_t count);
+
+/* Gives the hooks of an episode that has just started what they read after a reset. */
+void play_start_episode(const Turn *turn, size_t index);
 
 /* For an environment that is neither reset nor stepped because memory ran out. */
 void play_skip(const Turn *turn, size_t index);

@@ -162,6 +162,7 @@ void pool_dispose(Pool *pool) {
     mutex_destroy(&pool->lock);
     mutex_destroy(&pool->own_making);
 }
+
 /* Fork. Only the forking thread exists in the child, so locks of other threads are free there. */
 
 #if !defined _WIN32

@@ -34,8 +34,7 @@ typedef struct {
     const char *const *categories; /* the log categories of errors and warnings */
     size_t number_of_categories;
     bool can_save;
-    bool restores; /* whether episodes begin by a restored state where the start values are the same
-                    */
+    bool restores; /* whether an episode with the last start values begins with a restored state */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
@@ -58,7 +57,7 @@ typedef struct {
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
 } Settings;
 
-/* The health counters of each instance. fmugym/pool/base.py lists their names in this order. */
+/* The health counters of each instance. fmugym/pool/health.py lists their names in this order. */
 enum {
     RESETS,
     STEPS, /* communication steps until the last reset */
@@ -237,6 +236,7 @@ void pool_recycle(Pool *pool);
 typedef struct {
     size_t ended;   /* how many have ended */
     size_t started; /* how many of these were followed by another one in the same step */
+    bool outside;   /* whether a hook looked up an index outside of a table */
 } Ends;
 
 /* The following functions return how many instances now have a status worse than a warning. */

@@ -9,79 +9,189 @@
 #include <stdint.h>
 
 enum {
-    PROGRAM_WIDTH = 32,   /* instances evaluated at the same time */
-    PROGRAM_LENGTH = 128, /* maximum number of instructions and of registers */
-    PROGRAM_RESULTS = 16  /* maximum number of results */
+    PROGRAM_WIDTH = 32,      /* instances evaluated at the same time */
+    PROGRAM_REGISTERS = 256, /* maximum number of registers */
+    PROGRAM_RESULTS = 3,     /* maximum number of results */
+    CALL_INPUTS = 3          /* maximum number of inputs of a loop of numpy */
 };
 
 /* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
- * that module compares the two. */
-typedef enum {
-    LOAD_OUTPUT,
-    LOAD_INPUT,
-    LOAD_ACTION,
-    LOAD_PARAMETER,
-    LOAD_STEP_COUNT,
-    LOAD_CONSTANT,
-    OP_ADD,
-    OP_SUBTRACT,
-    OP_MULTIPLY,
-    OP_DIVIDE,
-    OP_NEGATIVE,
-    OP_ABSOLUTE,
-    OP_SQUARE_ROOT,
-    OP_MINIMUM,
-    OP_MAXIMUM,
-    OP_LESS,
-    OP_LESS_EQUAL,
-    OP_GREATER,
-    OP_GREATER_EQUAL,
-    OP_EQUAL,
-    OP_NOT_EQUAL,
-    OP_AND,
-    OP_OR,
-    OP_NOT,
-    OP_WHERE,
-    NUMBER_OF_OPERATIONS
-} Operation;
+ * that module compares the two. The letters are those of numpy's types: d float64, f float32,
+ * q int64. Booleans are bytes, 0 or 1. */
+#define EACH_OPERATION(X)                                                                          \
+    X(LOAD_ROW, "load_row")                                                                        \
+    X(LOAD_ACTION, "load_action")                                                                  \
+    X(LOAD_PREVIOUS_ACTION, "load_previous_action")                                                \
+    X(LOAD_ACTIVE, "load_active")                                                                  \
+    X(LOAD_STOPPED, "load_stopped")                                                                \
+    X(STORE_ROW, "store_row")                                                                      \
+    X(STORE_SEEN, "store_seen")                                                                    \
+    X(CALL, "call")                                                                                \
+    X(CAST, "cast")                                                                                \
+    X(TAKE, "take")                                                                                \
+    X(INTERPOLATE, "interpolate")                                                                  \
+    X(ADD_D, "add d")                                                                              \
+    X(SUBTRACT_D, "subtract d")                                                                    \
+    X(MULTIPLY_D, "multiply d")                                                                    \
+    X(DIVIDE_D, "divide d")                                                                        \
+    X(SQUARE_D, "square d")                                                                        \
+    X(NEGATIVE_D, "negative d")                                                                    \
+    X(ABSOLUTE_D, "absolute d")                                                                    \
+    X(SQRT_D, "sqrt d")                                                                            \
+    X(MINIMUM_D, "minimum d")                                                                      \
+    X(MAXIMUM_D, "maximum d")                                                                      \
+    X(LESS_D, "less d")                                                                            \
+    X(LESS_EQUAL_D, "less_equal d")                                                                \
+    X(GREATER_D, "greater d")                                                                      \
+    X(GREATER_EQUAL_D, "greater_equal d")                                                          \
+    X(EQUAL_D, "equal d")                                                                          \
+    X(NOT_EQUAL_D, "not_equal d")                                                                  \
+    X(ADD_F, "add f")                                                                              \
+    X(SUBTRACT_F, "subtract f")                                                                    \
+    X(MULTIPLY_F, "multiply f")                                                                    \
+    X(DIVIDE_F, "divide f")                                                                        \
+    X(SQUARE_F, "square f")                                                                        \
+    X(NEGATIVE_F, "negative f")                                                                    \
+    X(ABSOLUTE_F, "absolute f")                                                                    \
+    X(SQRT_F, "sqrt f")                                                                            \
+    X(MINIMUM_F, "minimum f")                                                                      \
+    X(MAXIMUM_F, "maximum f")                                                                      \
+    X(ADD_Q, "add q")                                                                              \
+    X(SUBTRACT_Q, "subtract q")                                                                    \
+    X(MULTIPLY_Q, "multiply q")                                                                    \
+    X(NEGATIVE_Q, "negative q")                                                                    \
+    X(LESS_Q, "less q")                                                                            \
+    X(LESS_EQUAL_Q, "less_equal q")                                                                \
+    X(GREATER_Q, "greater q")                                                                      \
+    X(GREATER_EQUAL_Q, "greater_equal q")                                                          \
+    X(EQUAL_Q, "equal q")                                                                          \
+    X(NOT_EQUAL_Q, "not_equal q")                                                                  \
+    X(AND, "and")                                                                                  \
+    X(OR, "or")                                                                                    \
+    X(XOR, "xor")                                                                                  \
+    X(NOT, "not")                                                                                  \
+    X(WHERE_8, "where 8")                                                                          \
+    X(WHERE_4, "where 4")                                                                          \
+    X(WHERE_2, "where 2")                                                                          \
+    X(WHERE_1, "where 1")
+
+#define NUMBER_IT(operation, name) operation,
+typedef enum { EACH_OPERATION(NUMBER_IT) NUMBER_OF_OPERATIONS } Operation;
+#undef NUMBER_IT
 
 extern const char *const operation_names[NUMBER_OF_OPERATIONS];
 
-/* Instruction i writes register i. Booleans are 0 and 1. */
+/* TYPES in fmugym/vector/hooks/program.py lists them in the same order. A cast's extra is
+ * from * VALUE_TYPES + to. */
+#define EACH_TYPE(X)                                                                               \
+    X(double, 'd')                                                                                 \
+    X(float, 'f')                                                                                  \
+    X(int64_t, 'q')                                                                                \
+    X(int32_t, 'i')                                                                                \
+    X(int16_t, 'h')                                                                                \
+    X(int8_t, 'b')                                                                                 \
+    X(uint64_t, 'Q')                                                                               \
+    X(uint32_t, 'I')                                                                               \
+    X(uint16_t, 'H')                                                                               \
+    X(uint8_t, 'B')                                                                                \
+    X(Flag, '?')
+
+enum { VALUE_TYPES = 11, FLOAT64 = 0, FLOAT32 = 1, INT64 = 2, FLAG = 10 };
+
+/* What extra means depends on the operation: the row, the element of an action, the slot, the
+ * call, the table, the pair of types. */
 typedef struct {
-    uint16_t operation;
-    uint16_t operands[3];
+    uint16_t operation, extra, to, a, b, c;
 } Instruction;
 
+typedef union {
+    _Alignas(64) unsigned char bytes[8 * PROGRAM_WIDTH];
+    double doubles[PROGRAM_WIDTH];
+    float floats[PROGRAM_WIDTH];
+    int64_t integers[PROGRAM_WIDTH];
+    uint8_t flags[PROGRAM_WIDTH];
+} Register;
+
+/* A register that has the same value for all instances throughout. */
 typedef struct {
-    size_t length;
-    size_t number_of_constants;
-    size_t number_of_results;
-    Instruction code[PROGRAM_LENGTH];
-    double constants[PROGRAM_LENGTH];
+    uint64_t bits; /* the value in its first bytes */
+    uint16_t to, size;
+    uint32_t unused;
+} Constant;
+
+/* A loop of numpy: PyArrayMethod_StridedLoop. */
+typedef int Loop(void *context, char *const *data, const ptrdiff_t *dimensions,
+                 const ptrdiff_t *strides, void *auxiliary);
+
+typedef struct {
+    Loop *loop;
+    void *context, *auxiliary;
+    uint16_t inputs;                  /* number of inputs */
+    ptrdiff_t sizes[CALL_INPUTS + 1]; /* bytes of each input, then of the output */
+} Called;
+
+/* One value for each instance. */
+typedef struct {
+    char *data;
+    size_t size; /* bytes of a value */
+} Row;
+
+/* An element of an array that has the instances on its first axis. */
+typedef struct {
+    uint32_t array, element, elements; /* elements: of one instance */
+    uint32_t type;
+} Slot;
+
+/* Values to look up. For an interpolation: n coordinates, n values, and the values to the left
+ * and to the right of them. */
+typedef struct {
+    const char *data;
+    size_t length, size;
+} Table;
+
+/* The owner provides the memory that the pointers refer to. */
+typedef struct {
+    const Instruction *code;
+    const Constant *constants;
+    const Called *calls;
+    const Row *rows;
+    const Slot *slots;
+    const Table *tables;
+    size_t length, number_of_constants, number_of_calls, number_of_rows, number_of_slots,
+        number_of_tables, number_of_seen, registers, number_of_results;
     uint16_t results[PROGRAM_RESULTS];
 } Program;
 
-/* What programs load: rows with one value for each instance. */
+/* What changes from call to call. */
 typedef struct {
-    const double *outputs, *inputs, *parameters;
-    const int64_t *actions, *step_counts;
-    size_t count; /* length of a row */
-    size_t number_of_outputs, number_of_inputs, number_of_parameters;
+    const char *actions, *previous_actions;
+    size_t action_size, action_elements;
+    const uint8_t *ended;   /* NULL stands for none */
+    const int8_t *statuses; /* NULL stands for all OK */
+    char *const *seen;      /* the arrays that the slots refer to */
 } Source;
 
-typedef double Registers[PROGRAM_LENGTH][PROGRAM_WIDTH];
+/* What a run notes. */
+typedef struct {
+    uint8_t not_finite[PROGRAM_WIDTH]; /* which instances have stored such a value */
+    bool outside;                      /* whether an index was outside of its table */
+} Notes;
 
 /* Must be called once before the first run with these registers. Writes the constants, which
- * stay in place. Sets the unused rest to 0 if there are fewer instances than a register is wide. */
-void program_prepare(const Program *program, Registers registers);
+ * stay in place. If some runs are shorter than a register, sets all others to 0. */
+void program_prepare(const Program *program, bool has_short_runs, Register *registers);
 
-/* Whether every operand refers to something that exists. */
-bool program_is_sound(const Program *program, const Source *source);
+/* Whether every operand refers to something that exists. The program writes and reads count
+ * instances of rows that are long enough. */
+bool program_is_sound(const Program *program, size_t action_elements);
 
-/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Registers are
- * always computed in full width, because loops of a fixed length become vector instructions. */
+/* Sets what the program would store in the arrays of one instance to 0. */
+void program_clear_seen(const Program *program, char *const *seen, size_t index);
+
+/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Operations of its
+ * own are always computed in full width, because loops of a fixed length become vector
+ * instructions. */
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
-                 Registers registers);
+                 Register *registers, Notes *notes);
 
 #endif

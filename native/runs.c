@@ -1,5 +1,6 @@
 #include "runs.h"
 
+#include <float.h>
 #include <string.h>
 
 #include "initial_states.h"
@@ -37,7 +38,6 @@ size_t note_status(Task *task, size_t index, Status status) {
     return 1;
 }
 
-/* Resets or restores instances that need not be neighbours. */
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;
@@ -300,13 +300,32 @@ static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
     return troubled;
 }
 
+/* Handles outputs of which some are not finite, or too large for the observations of a float32.
+ * The latter are a fault of the episode, and the owner needs the outputs from before it. */
+static size_t take_not_small(Task *task, size_t begin, size_t count, double *outputs) {
+    const Turn *turn = task->call->turn;
+    const size_t width = task->pool->settings.outputs->count;
+    size_t troubled = 0;
+
+    if (!all_within(outputs, count * width, DBL_MAX)) {
+        troubled += take_not_finite(task, begin, count, outputs);
+    }
+    if (turn != NULL && task->call->observations != NULL) {
+        if (!turn->play->keeps_always) {
+            play_keep_outputs(turn->play, begin, count);
+        }
+        troubled += !all_within(outputs, count * width, FLOAT32_LIMIT);
+    }
+    return troubled;
+}
+
 static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
     gather_inputs(task, begin, count, scratch.inputs);
     scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
 
-    if (!all_finite(scratch.outputs, count * task->pool->settings.outputs->count)) {
-        troubled += take_not_finite(task, begin, count, scratch.outputs);
+    if (!all_within(scratch.outputs, count * task->pool->settings.outputs->count, FLOAT32_LIMIT)) {
+        troubled += take_not_small(task, begin, count, scratch.outputs);
     }
     keep_outputs(task, begin, count, scratch.outputs);
     if (task->call->observations != NULL) {
@@ -326,19 +345,23 @@ size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch) {
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
     const Turn *turn = task->call->turn;
     PlayScratch registers;
-    size_t troubled = 0, ended = 0, started = 0;
+    Verdict verdict = {.ended = 0};
+    size_t troubled = 0, started = 0;
 
-    play_open(turn, &registers);
+    play_open(turn, end - begin, &registers);
     for (size_t first = begin; first < end; first += RUN) {
         const size_t count = length_of_run(first, end);
         play_prepare(turn, first, count, &registers);
         troubled += do_run(task, first, count, scratch);
-        ended += play_judge(turn, first, count, &registers);
+        play_judge(turn, first, count, &registers, &verdict);
         if (turn->started != NULL) {
             troubled += starts_after_ends(task, first, count, scratch, &started);
         }
     }
-    atomic_add(&task->ended, ended);
+    atomic_add(&task->ended, verdict.ended);
     atomic_add(&task->started, started);
-    return troubled;
+    if (verdict.outside) {
+        atomic_add(&task->outside, 1);
+    }
+    return troubled + verdict.troubled;
 }

@@ -18,8 +18,6 @@ enum {
     MEASURE_EVERY = 16 /* with fewer instances, one call in this many is measured */
 };
 
-/* If even this little memory is missing, nothing else will work either. The caller's arrays are
- * still filled, with the previous values. */
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 

@@ -12,8 +12,8 @@ size_t schedule_run(Task *task, size_t count);
  * their number. */
 size_t schedule_choose(Pool *pool, Mask mask);
 
-/* Gives up on items because memory ran out. The caller's arrays are still filled, with the
- * previous values. */
+/* Gives up on items because memory ran out: if even this little is missing, nothing else will
+ * work either. The caller's arrays are still filled, with the previous values. */
 size_t task_give_up(Task *task, size_t begin, size_t end);
 
 #endif

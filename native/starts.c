@@ -30,6 +30,7 @@ size_t starts_one(Task *task, size_t index, Scratch scratch) {
     const size_t troubled = note_status(task, index, status);
 
     write_observation(pool, index, call->observations);
+    play_start_episode(call->turn, index);
     play->step_counts[index] = 0;
     play->ended[index] = 0;
     return troubled > 0 || !has_finite_observation(task, index);

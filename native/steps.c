@@ -94,13 +94,17 @@ Status instance_advance(Pool *pool, Instance *me) {
     return status;
 }
 
-WIDE bool all_finite(const double *values, size_t count) {
+WIDE bool all_within(const double *values, size_t count, double limit) {
     int64_t bad = 0; /* as wide as the values, so that the compiler can vectorize */
 
     for (size_t i = 0; i < count; i++) {
-        bad |= !(fabs(values[i]) <= DBL_MAX);
+        bad |= !(fabs(values[i]) <= limit);
     }
     return bad == 0;
+}
+
+bool all_finite(const double *values, size_t count) {
+    return all_within(values, count, DBL_MAX);
 }
 
 void instance_copy_outputs(const Pool *pool, const Instance *me, double *values) {

@@ -28,7 +28,8 @@ import numpy as np
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
-from fmugym.vector.hooks.program import OPERATIONS, Program
+from fmugym.vector.hooks.loops import loop_of
+from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
 THREADS = 6
 PATIENCE = 120.0
@@ -37,31 +38,51 @@ PATIENCE = 120.0
 counts = collections.Counter()
 
 
-def instruction(operation, *operands):
-    return [OPERATIONS.index(operation), *operands, *[0] * (3 - len(operands))]
+def code(*rows):
+    """Instructions: operation, extra, the register to write, operands."""
+    numbered = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in rows]
+    return np.array(numbered, np.uint16).tobytes()
 
 
-INPUTS = Program(
-    np.array(
-        [instruction("action"), instruction("constant"), instruction("multiply", 0, 1)], np.uint16
-    ),
-    np.array([3.0]),
-    np.array([2], np.uint16),
-)
-JUDGEMENT = Program(
-    np.array(
-        [
-            instruction("output", 0),
-            instruction("absolute", 0),
-            instruction("constant", 0),
-            instruction("greater", 1, 2),
-            instruction("constant", 1),
-        ],
-        np.uint16,
-    ),
-    np.array([0.2, 0.0]),
-    np.array([3, 4, 2], np.uint16),
-)
+def constants(*values):
+    """Registers that keep a value."""
+    rows = [(np.float64(value).view("u8"), register, 8, 0) for register, value in values]
+    return np.array(rows, CONSTANT).tobytes()
+
+
+def programs(pool, variables):
+    """Programs that use the numbers of the pool, those from before, and a loop of numpy."""
+    sine = loop_of(np.sin, (np.dtype("f8"),) * 2), 1, (8, 8, 0, 0)
+    push = code(
+        ("load_action", 0, 1),
+        ("cast", 2 * len(TYPES), 2, 1),
+        ("multiply d", 0, 3, 2, 0),
+        ("store_row", 0, 0, 3),
+    )
+    judge = code(
+        ("load_row", 0, 2),
+        ("call", 0, 3, 2),
+        ("absolute d", 0, 4, 3),
+        ("greater d", 0, 5, 4, 0),
+        ("load_previous_action", 0, 6),
+        ("store_row", 1, 0, 4),
+    )
+    rows = pool.outputs[0], variables[0]
+    return (
+        (push, constants((0, 3.0)), b"", (), (pool.inputs[0],), (), 4, 0, ()),
+        (judge, constants((0, 0.2), (1, 0.0)), b"", (sine,), rows, (), 7, 0, (5, 1, 4)),
+    )
+
+
+ACTIONS = {
+    "shape": (),
+    "letter": "q",
+    "size": 8,
+    "check": 1,
+    "lowest": 0,
+    "highest": 1,
+    "none": np.zeros(1, np.int64),
+}
 
 
 def draws(*rows):
@@ -141,13 +162,22 @@ class Subject:
         self.pool.step_or_reset(None, self.start, self.values, self.mask(), observations)
 
     def prepare_play(self):
+        variables, before = np.zeros((1, self.n)), np.zeros((1, self.n))
         self.pool.prepare_play(
             self.start,
-            (INPUTS, JUDGEMENT),
-            (0, 1),
+            programs(self.pool, variables),
+            ACTIONS | {"current": np.zeros(self.n, "i8"), "previous": np.zeros(self.n, "i8")},
             self.values.copy(),
             (DRAWS, self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)),
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
+            {
+                "kept": np.zeros_like(self.pool.outputs),
+                "keeps_always": True,
+                "copies": ((variables[0], before[0]),),
+                "drawn_variables": ((variables[0], 0),),
+                "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
+                "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
+            },
         )
 
     def draw(self):
@@ -170,7 +200,7 @@ class Subject:
             )
             counts["played"] += 1
 
-    def start(self):
+    def start_episodes(self):
         observations = np.empty((self.n, len(self.outputs)), np.float32)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
             self.pool._pool.start(self.mask(), observations, np.empty((1, self.n)))
@@ -207,7 +237,18 @@ class Subject:
 
 ACTIONS = (
     *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "draw"),
-    *("play", "play", "play", "start", "save", "restore", "forget", "failure", "read", "health"),
+    *(
+        "play",
+        "play",
+        "play",
+        "start_episodes",
+        "save",
+        "restore",
+        "forget",
+        "failure",
+        "read",
+        "health",
+    ),
     *("recycle", "costs", "close"),
 )
 

@@ -3,13 +3,14 @@
 import gc
 import pathlib
 import re
+import shutil
 import stat
 import zipfile
 
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_fmu, write_fmu
 
-from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError
+from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, bundled_fmu
 from fmugym.archive import safe_zip
 
 
@@ -297,3 +298,27 @@ class TestLibraries:
         path = edited_fmu(fmu_path, tmp_path, add={library_name(2): b"text"})
         monkeypatch.setattr(zipfile.ZipFile, "extractall", lambda *_: pytest.fail("extracted"))
         refused(path, "Probe.fmu: binaries/.* is not a shared library, expected one of")
+
+
+def test_a_file_that_is_replaced_after_it_was_opened(tmp_path):
+    """The model description would be that of one FMU, and the library that of another."""
+    path = tmp_path / "Replaced.fmu"
+    shutil.copy(bundled_fmu("Pendulum", "2.0"), path)
+    fmu = FMU(path)
+    shutil.copy(bundled_fmu("Pendulum", "3.0"), path)
+    with pytest.raises(FMULoadError, match=r"Replaced.fmu was changed after it was opened"):
+        fmu.extract()
+    assert FMU(path).extract().is_dir()
+
+
+def test_errors_quote_a_little_of_a_damaged_file(probe, tmp_path):
+    """zipfile quotes what it finds in the place of a name."""
+    path = tmp_path / "Probe.fmu"
+    content = bytearray(probe(2).read_bytes())
+    content[26:28] = (5000).to_bytes(2, "little")  # the length of the first name
+    path.write_bytes(content)
+    with pytest.raises(
+        FMULoadError, match=r"Probe.fmu is damaged: File name in directory"
+    ) as caught:
+        FMU(path)
+    assert len(str(caught.value)) < 1000

@@ -86,9 +86,9 @@ def test_the_table_of_operations_is_that_of_the_extension():
     "stale",
     [
         SimpleNamespace(),
-        SimpleNamespace(operations=lambda: program.OPERATIONS, MOST_INSTRUCTIONS=64),
-        SimpleNamespace(operations=lambda: program.OPERATIONS[:-1], MOST_INSTRUCTIONS=128),
-        SimpleNamespace(operations=lambda: program.OPERATIONS[::-1], MOST_INSTRUCTIONS=128),
+        SimpleNamespace(operations=lambda: program.OPERATIONS, MOST_REGISTERS=64),
+        SimpleNamespace(operations=lambda: program.OPERATIONS[:-1], MOST_REGISTERS=256),
+        SimpleNamespace(operations=lambda: program.OPERATIONS[::-1], MOST_REGISTERS=256),
     ],
 )
 def test_a_stale_extension_is_refused_with_the_cure(stale):

@@ -3,7 +3,6 @@
 import json
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.health import no_counts
-from fmugym.vector.hooks.program import OPERATIONS
+from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():
@@ -89,12 +88,49 @@ class TestArrays:
 # Programs
 
 
-def program(*rows, constants=(1.0,), results=(0,)):
-    return SimpleNamespace(
-        code=np.array(rows, np.uint16),
-        constants=np.array(constants),
-        results=np.array(results, np.uint16),
-    )
+def program(*rows, results=(), registers=4, seen=0, slots=(), tables=(), **changes):
+    """A program with rows of operation, extra, register to write, and three operands."""
+    parts = {
+        "code": np.array(rows, np.uint16).tobytes(),
+        "constants": b"",
+        "slots": np.array(list(slots), SLOT).tobytes(),
+        "calls": (),
+        "rows": (),
+        "tables": tables,
+        "registers": registers,
+        "seen": seen,
+        "results": results,
+    }
+    return tuple((parts | changes).values())
+
+
+def operation(name, *rest):
+    return [OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))]
+
+
+def actions_of(n):
+    return {
+        "shape": (),
+        "letter": "q",
+        "size": 8,
+        "check": 1,
+        "lowest": 0,
+        "highest": 1,
+        "current": None,
+        "previous": None,
+        "none": np.zeros(1, np.int64),
+    }
+
+
+def surroundings(pool):
+    return {
+        "kept": np.zeros_like(pool.outputs),
+        "keeps_always": False,
+        "copies": (),
+        "drawn_variables": (),
+        "variable_starts": (),
+        "input_starts": ((-1, 0.0),) * len(pool.inputs),
+    }
 
 
 def uniform_draws(*rows):
@@ -104,20 +140,20 @@ def uniform_draws(*rows):
     return _native.Draws(table.tobytes(), np.array([0.0, 1.0]).tobytes(), 0)
 
 
-def prepare(pool, inputs, judgement=None, rows=(0,)):
+def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):
     n = pool.num_instances
-    constant = [OPERATIONS.index("constant"), 0, 0, 0]
-    pool.prepare_play(
+    return pool.prepare_play(
         (pool.variable("theta_0"),),
-        (inputs, judgement or program(constant, results=(0, 0, 0))),
-        (0, 1),
+        (inputs, judgement or program(results=(0, 0, 0))),
+        actions_of(n) | changes.pop("actions", {}),
         np.zeros((1, n)),
-        (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
+        draws or (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
         (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
+        surroundings(pool) | changes,
     )
 
 
-ACTION = [OPERATIONS.index("action"), 0, 0, 0]
+ACTION = operation("load_action")
 
 
 class TestPrograms:
@@ -127,37 +163,97 @@ class TestPrograms:
     @pytest.mark.parametrize(
         "row",
         [
-            ("action", 1, 0, 0),
-            ("action", 0, 7, 0),
-            ("step_count", 3, 0, 0),
-            ("constant", 0, 0, 9),
-            ("output", 0, 60000, 0),
-            ("negative", 0, 60000, 0),
-            ("square_root", 0, 0, 60000),
-            ("add", 0, 0, 60000),
+            ("load_action", 1),
+            ("load_previous_action", 60000),
+            ("load_row", 0, 1),
+            ("store_row", 0, 0, 1),
+            ("store_seen", 0, 0, 1),
+            ("call", 0, 1),
+            ("cast", 121, 1),
+            ("take", 0, 1),
+            ("interpolate", 0, 1),
+            ("add d", 1, 1),
+            ("add d", 0, 4),
+            ("add d", 0, 1, 60000),
+            ("add d", 0, 1, 0, 60000),
+            ("where 8", 0, 1, 0, 0, 4),
+            ("negative d", 0, 1, 1),
         ],
         ids=str,
     )
     def test_operands_that_an_operation_does_not_have(self, cart_poles, row):
-        name, *operands = row
-        with pytest.raises(ValueError, match="a program does not fit the pool"):
-            prepare(cart_poles, program(ACTION, [OPERATIONS.index(name), *operands]))
+        with pytest.raises(ValueError, match="a program is not sound"):
+            prepare(cart_poles, program(ACTION, operation(*row)))
 
-    @pytest.mark.parametrize("part", ["code", "constants", "results"])
-    @pytest.mark.parametrize("extra", [1, 3])
-    def test_lengths_in_bytes(self, cart_poles, part, extra):
-        odd = program(ACTION)
-        setattr(odd, part, np.append(getattr(odd, part).view(np.uint8), np.zeros(extra, "u1")))
-        with pytest.raises(ValueError, match=f"the {part} of a program"):
-            prepare(cart_poles, odd)
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"code": b"1"},
+            {"constants": b"12345678901234567"},
+            {"slots": b"1"},
+            {"registers": 257},
+            {"registers": 0},
+            {"results": (4,)},
+            {"results": (-1,)},
+            {"results": (0, 0, 0, 0)},
+            {"seen": 65},
+            {"slots": np.array([(1, 0, 1, 0)], SLOT).tobytes(), "seen": 1},
+            {"slots": np.array([(0, 1, 1, 0)], SLOT).tobytes(), "seen": 1},
+            {"slots": np.array([(0, 0, 1, 11)], SLOT).tobytes(), "seen": 1},
+            {"constants": np.array([(0, 4, 8, 0)], CONSTANT).tobytes()},
+            {"constants": np.array([(0, 0, 9, 0)], CONSTANT).tobytes()},
+        ],
+        ids=str,
+    )
+    def test_parts_that_do_not_fit(self, cart_poles, changes):
+        with pytest.raises(ValueError, match="a program is not sound"):
+            prepare(cart_poles, program(ACTION, **changes))
 
-    @pytest.mark.parametrize("part", ["code", "constants", "results"])
-    def test_too_long_ones(self, cart_poles, part):
-        shape = (129, 4) if part == "code" else 129
-        long = program(ACTION)
-        setattr(long, part, np.zeros(shape, getattr(long, part).dtype))
-        with pytest.raises(ValueError, match=f"the {part} of a program"):
-            prepare(cart_poles, long)
+    @pytest.mark.parametrize(
+        ("table", "name"), [(np.zeros(0), "take"), (np.zeros(5), "interpolate")]
+    )
+    def test_tables_that_are_too_short(self, cart_poles, table, name):
+        code = ACTION, operation(name, 0, 1)
+        with pytest.raises(ValueError, match="a program is not sound"):
+            prepare(cart_poles, program(*code, tables=(table,)))
+
+    def test_rows_of_another_length(self, cart_poles):
+        with pytest.raises(ValueError, match="a row of a program must be a vector of"):
+            prepare(cart_poles, program(ACTION, rows=(np.zeros(1),)))
+
+    def test_loops_that_are_none(self, cart_poles):
+        with pytest.raises(ValueError, match="PyCapsule"):
+            prepare(cart_poles, program(ACTION, calls=((object(), 1, (8, 8, 0, 0)),)))
+
+    @pytest.mark.parametrize(
+        "actions",
+        [
+            {"shape": (3,)},
+            {"shape": (70000,)},
+            {"current": np.zeros(2, np.int64), "previous": np.zeros(2, np.int64)},
+            {"none": np.zeros(1, np.int8)},
+        ],
+        ids=str,
+    )
+    def test_actions_that_do_not_fit(self, cart_poles, actions):
+        with pytest.raises(ValueError, match="action"):
+            prepare(cart_poles, program(ACTION), actions=actions)
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"drawn_variables": ((np.zeros(6), 1),)},
+            {"drawn_variables": ((np.zeros(6, "f4"), 0),)},
+            {"copies": ((np.zeros(3, "f4"), np.zeros(3)),)},
+            {"variable_starts": ((np.zeros(3), b"1"),)},
+            {"input_starts": ()},
+            {"kept": np.zeros((1, 1))},
+        ],
+        ids=str,
+    )
+    def test_surroundings_that_do_not_fit(self, cart_poles, changes):
+        with pytest.raises(ValueError, match=r"must|differ|fit|float64"):
+            prepare(cart_poles, program(ACTION), **changes)
 
     @pytest.mark.parametrize("row", [1, 2**40])
     def test_rows_beyond_the_start_values(self, cart_poles, row):
@@ -168,17 +264,9 @@ class TestPrograms:
 
     def test_what_does_not_hold_draws(self, cart_poles):
         draws, states = uniform_draws(0), np.zeros((6, 6), np.uint64)
-        constant = program([OPERATIONS.index("constant"), 0, 0, 0], results=(0, 0, 0))
         for odd in ((draws, states[:, :5]), (draws, states.view(np.int64)), (b"", states)):
             with pytest.raises((TypeError, ValueError)):
-                cart_poles.prepare_play(
-                    (cart_poles.variable("theta_0"),),
-                    (program(ACTION), constant),
-                    (0, 1),
-                    np.zeros((1, 6)),
-                    odd,
-                    (np.zeros(6, np.int64), np.ones(6, np.bool_), 10),
-                )
+                prepare(cart_poles, program(ACTION), draws=odd)
 
 
 # Memory

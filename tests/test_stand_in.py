@@ -148,6 +148,18 @@ def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(
     assert (tmp_path / name).read_text() == "precious"
 
 
+def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
+    """By default to the working directory; the path in ``preload`` holds elsewhere, too."""
+    (name,) = FMU(fmu_path).missing_libraries
+    monkeypatch.chdir(tmp_path)
+    assert main(["stand-in", str(fmu_path)]) == 0
+    assert f'"preload": {[str(tmp_path / name)]}' in capsys.readouterr().out
+    assert main(["stand-in", str(fmu_path), "--folder", "a/b"]) == 0
+    assert (tmp_path / "a" / "b" / name).is_file()
+    with pytest.raises(ConfigError, match="cannot hold libraries"):
+        stand_in.build_stand_in(FMU(fmu_path), tmp_path / name / "inside")
+
+
 def test_without_a_compiler(fmu_path, tmp_path, monkeypatch):
     monkeypatch.setattr(stand_in, "_COMPILERS", ())
     monkeypatch.setattr(stand_in.importlib.util, "find_spec", lambda name: None)

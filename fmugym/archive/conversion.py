@@ -10,7 +10,7 @@ from typing import Any, Final
 from fmpy.validation import validate_model_description
 
 from fmugym.archive.description import Capabilities, ModelDescription, Variable
-from fmugym.errors import FMULoadError
+from fmugym.errors import FMULoadError, reason
 
 __all__ = ["convert"]
 
@@ -245,4 +245,4 @@ def _broken_rules(source: Any) -> tuple[str, ...]:
     try:
         return tuple(validate_model_description(source))
     except Exception as error:  # the validation itself stumbles over some invalid files
-        return (f"the model description could not be validated: {error}",)
+        return (f"the model description could not be validated: {reason(error)}",)

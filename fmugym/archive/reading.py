@@ -17,7 +17,7 @@ from lxml import etree
 from fmugym.archive.conversion import convert
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, over_limit
-from fmugym.errors import FMULoadError
+from fmugym.errors import FMULoadError, reason
 
 __all__ = ["read_model_description"]
 
@@ -69,7 +69,7 @@ def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDesc
         raise FMULoadError(f"{name}: {error}") from None
     except Exception as error:  # FMPy leaks a dozen types of exceptions for malformed files
         raise FMULoadError(
-            f"{name}: {_XML} cannot be understood: {type(error).__name__}: {error}"
+            f"{name}: {_XML} cannot be understood: {type(error).__name__}: {reason(error)}"
         ) from error
 
 
@@ -83,7 +83,9 @@ def _read_xml(archive: SafeZip, limit: int) -> bytes:
     try:
         return _as_utf_8(content)
     except (UnicodeError, LookupError) as error:
-        raise FMULoadError(f"{archive.path.name}: {_XML} is not valid XML: {error}") from None
+        raise FMULoadError(
+            f"{archive.path.name}: {_XML} is not valid XML: {reason(error)}"
+        ) from None
 
 
 def _hint(archive: SafeZip) -> str:
@@ -150,7 +152,7 @@ def _parse(name: str, content: bytes) -> Any:
     try:
         return etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        raise FMULoadError(f"{name}: {_XML} is not valid XML: {error}") from None
+        raise FMULoadError(f"{name}: {_XML} is not valid XML: {reason(error)}") from None
 
 
 def _check_root(name: str, root: Any, max_variables: int) -> None:

@@ -25,7 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final, cast
 
 from fmugym.checks import check_count
-from fmugym.errors import FMULoadError
+from fmugym.errors import FMULoadError, reason
 
 __all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
 
@@ -112,9 +112,12 @@ class SafeZip:
         try:
             if not path.is_file():
                 raise FMULoadError(f"there is no FMU at {path}")
+            self._version = _version_of(path)
             entries = _read_directory(path, limits)
         except _ZIP_ERRORS as error:
-            raise FMULoadError(f"{path.name} is not an FMU (a zip archive): {error}") from None
+            raise FMULoadError(
+                f"{path.name} is not an FMU (a zip archive): {reason(error)}"
+            ) from None
         _check_sizes(path, entries, limits)
         self._links: dict[str, zipfile.ZipInfo] = {}
         for entry in entries:
@@ -283,14 +286,24 @@ class SafeZip:
     @contextmanager
     def _opened(self) -> Iterator[zipfile.ZipFile]:
         try:
+            if _version_of(self.path) != self._version:  # the parts would not fit together
+                raise FMULoadError(
+                    f"{self.path.name} was changed after it was opened; open it again"
+                )
             with zipfile.ZipFile(self.path) as archive:
                 yield archive
         except OSError as error:
-            raise FMULoadError(f"{self.path.name} cannot be unpacked: {error}") from None
+            raise FMULoadError(f"{self.path.name} cannot be unpacked: {reason(error)}") from None
         except _ZIP_ERRORS as error:
             raise FMULoadError(
-                f"{self.path.name} is damaged: {error}; copy or export the FMU again"
+                f"{self.path.name} is damaged: {reason(error)}; copy or export the FMU again"
             ) from None
+
+
+def _version_of(path: Path) -> tuple[int, int]:
+    """What changes when somebody writes another file to a path."""
+    status = path.stat()
+    return status.st_mtime_ns, status.st_size
 
 
 def _read_directory(path: Path, limits: ArchiveLimits) -> Sequence[zipfile.ZipInfo]:

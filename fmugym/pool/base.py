@@ -170,10 +170,11 @@ class Pool(ABC):
         self,
         variables: tuple[Variable, ...],
         programs: Any,
-        actions: tuple[int, int],
+        actions: Any,
         start_values: FloatArray,
         draws: Any,
         episodes: Any,
+        surroundings: Any,
     ) -> Callable[..., tuple[int, int, int]]:
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
 

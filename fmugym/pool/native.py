@@ -18,9 +18,9 @@ import math
 import os
 import shutil
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final, ParamSpec, Protocol, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -416,11 +416,12 @@ class NativePool(AttendedPool):
     def prepare_play(
         self,
         variables: tuple[Variable, ...],
-        programs: tuple[PlayProgram, PlayProgram],
-        actions: tuple[int, int],
+        programs: tuple[tuple[Any, ...], tuple[Any, ...]],
+        actions: Mapping[str, Any],
         start_values: FloatArray,
         draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
+        surroundings: Mapping[str, Any],
     ) -> Callable[..., tuple[int, int, int]]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
 
@@ -429,32 +430,45 @@ class NativePool(AttendedPool):
         Args:
             variables: As for ``reset``.
             programs: From the actions to the inputs; from the outputs to done, truncated, reward.
-            actions: The lowest and the highest action.
+                See ``Program.with_rows``.
+            actions: How actions are checked and kept: the shape of one action; the letter of its
+                kind (d, q, Q or ?) and the bytes of an element; the check (0 none, 1 the range
+                from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
+                actions of this step and of the one before (or None), flat, environments first;
+                what counts as the action of a new episode.
             start_values: As the values of ``reset``; the pool writes the draws there.
             draws: The draws of an episode, and the random streams, shape (N, 6); see
                 ``EpisodeStreams``.
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
+            surroundings: ``kept``, for the outputs before the step; ``keeps_always``, whether
+                they are kept in each step, or only before outputs that no float32 can hold;
+                ``copies``, pairs of rows: episode variables and what they were before the step;
+                ``drawn_variables``, rows and the numbers of their draws; ``variable_starts``,
+                rows and the bytes of their constants; ``input_starts``, for each input the number
+                of a start value, or -1 and a constant.
 
         Returns:
-            A function of actions (int64), observations, rewards, terminated, truncated, drawn
-            values (draws, N), last observations and started (Booleans). It does a step and fills
-            all but the actions; of the drawn values, only those of episodes that start; ``given``
-            ones are read. If the last two are arrays, an episode that ends without a fault is
-            followed by the next in the same step; if they are None, in the next step. It returns
-            how many instances had trouble (a status worse than a warning, or a first observation
-            that is not finite), how many episodes have ended, and how many of these were followed.
+            A function of actions, observations (float32, or a tuple of the arrays that the second
+            program stores), rewards, terminated, truncated, drawn values (draws, N), last
+            observations and started (Booleans). It does a step and fills all but the actions; of
+            the drawn values, only those of episodes that start; ``given`` ones are read. If the
+            last two are arrays, which needs observations of float32, an episode that ends without
+            a fault is followed by the next in the same step; if they are None, in the next step.
+            It returns how many instances had trouble (a status worse than a warning, or numbers
+            that are not finite), how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(
             start=self._access(variables),
             start_values=start_values,
-            inputs=_program_bytes(programs[0]),
-            judgement=_program_bytes(programs[1]),
-            actions=actions,
+            inputs=programs[0],
+            judgement=programs[1],
+            actions=dict(actions),
             draws=draws[0],
             states=draws[1],
             episodes={"step_counts": count, "ended": ended, "limit": limit},
+            **surroundings,
         )
         return self._pool.play
 
@@ -472,29 +486,6 @@ class NativePool(AttendedPool):
     def uses_states(self) -> bool:
         """Whether resets restore saved initial states, as far as known so far."""
         return self._pool.uses_states()
-
-
-class PlayProgram(Protocol):
-    """See ``fmugym.vector.hooks.program.Program``."""
-
-    @property
-    def code(self) -> npt.NDArray[np.uint16]:
-        """The operation and the operands of each instruction."""
-        ...
-
-    @property
-    def constants(self) -> FloatArray:
-        """The constants that the instructions refer to."""
-        ...
-
-    @property
-    def results(self) -> npt.NDArray[np.uint16]:
-        """The registers of the results."""
-        ...
-
-
-def _program_bytes(program: PlayProgram) -> tuple[bytes, bytes, bytes]:
-    return program.code.tobytes(), program.constants.tobytes(), program.results.tobytes()
 
 
 class _Receiver:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from math import hypot, isfinite, isnan
 from typing import Any, Final
 
@@ -24,6 +24,9 @@ _OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, Arithm
 _FEW: Final = 64
 """Up to this many elements, Python's floats are faster than numpy."""
 
+_MANY: Final = 4096
+"""Up to this many elements make a set."""
+
 
 def no_action(space: spaces.Space[Any]) -> Any:
     """Return the action that hooks read before the first one; None for spaces without a zero."""
@@ -34,14 +37,15 @@ def no_action(space: spaces.Space[Any]) -> Any:
     return None
 
 
-def elements_of(space: spaces.Space[Any]) -> range | None:
+def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     """Return the elements of a ``Discrete``; None for other spaces."""
-    if isinstance(space, spaces.Discrete):
-        return range(int(space.start), int(space.start + space.n))
-    return None
+    if not isinstance(space, spaces.Discrete):
+        return None
+    elements = range(int(space.start), int(space.start + space.n))
+    return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
-def is_element(action: Any, elements: range) -> bool:
+def is_element(action: Any, elements: Collection[int]) -> bool:
     """Whether an action is one of the elements of a ``Discrete``."""
     if type(action) is int:
         return action in elements

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -85,7 +85,7 @@ class EpisodePlan:
         """The names of the parameters, in the order of ``constants``."""
         return list(self._parameters)
 
-    @property
+    @cached_property
     def drawn_names(self) -> list[str]:
         """The names of the drawn parameters and variables, in the order of the draws."""
         return [name for _, name, _ in self._random_parameters] + self._random_variables

@@ -54,10 +54,11 @@ class Form(Protocol):
 class Numbers:
     """The ``Form`` of a single environment."""
 
-    flag_type: type | None = bool
-    reward_type: type | None = float
+    __slots__ = ("flag_type", "reward_type", "update")
 
     def __init__(self, env: Hooks) -> None:
+        self.flag_type: type | None = bool
+        self.reward_type: type | None = float
         self.update: Callable[[], None] = env._update
 
     @staticmethod

@@ -58,14 +58,15 @@ def build_stand_in(fmu: FMU, folder: Path) -> tuple[StandIn, ...]:
 
     Args:
         fmu: The FMU; nothing of it is executed.
-        folder: Where to write the libraries, under the names that the FMU asks for.
+        folder: Where to write the libraries, under the names that the FMU asks for. It is made if
+            it does not exist.
 
     Returns:
         What was built; name the paths in ``preload``.
 
     Raises:
-        ConfigError: If the FMU lacks no such library, a file is already there, or there is no C
-            compiler.
+        ConfigError: If the FMU lacks no such library, a file is already there, the folder cannot be
+            used, or there is no C compiler.
         FMULoadError: If a library of the FMU is damaged, or the compiler fails.
     """
     names = replaceable(fmu)
@@ -73,10 +74,14 @@ def build_stand_in(fmu: FMU, folder: Path) -> tuple[StandIn, ...]:
         raise ConfigError(
             f"{fmu.path.name} lacks neither {' nor '.join(LIBRARIES)}; it needs no stand-in"
         )
-    paths = [folder / name for name in names]
+    paths = [folder.absolute() / name for name in names]  # a bare name would be searched for
     for path in paths:
         if path.exists():
             raise ConfigError(f"{path} exists already")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot hold libraries: {error}") from None
     return tuple(_build(fmu, path) for path in paths)
 
 

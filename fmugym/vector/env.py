@@ -35,6 +35,7 @@ from fmugym.vector.engines.per_env import PerEnvEngine
 from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
+from fmugym.vector.overlap import Background, PendingStepError
 
 __all__ = ["FMUVectorEnv"]
 
@@ -60,7 +61,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ``infos["final_obs"]`` and ``["final_info"]``) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
         hooks: The way of calling hooks. ``"auto"`` takes the fastest mode that gives correct
-            results. ``"compiled"`` has hooks that are plain arithmetic run by the native pool,
+            results. ``"compiled"`` has the native pool run hooks that can be traced,
             ``"array"`` calls them once for all environments, ``"per_env"`` one environment at a
             time; each is an error where it is not possible.
         pool_options: Passed to ``fmugym.trial.opening.make_pool``: ``backend``, ``threads``,
@@ -136,6 +137,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(env.action_space, count)
         self.observation_space = batch_space(env.observation_space, count)
         self._started = self._is_ready = False
+        self._background = Background()
         self._engine = self._make_engine(hooks, max_episode_steps)
         self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._pool.forget_health()  # that of the hook check
@@ -228,13 +230,62 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: Before the first reset, after ``close``, in mode ``DISABLED`` after an
                 end, and, with ``on_fault="raise"``, after a fault. Also after an exception that
                 came when the FMUs had stepped, until all environments are reset.
+            PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
+        self._require_ready("step")
+        return self._step(actions)
+
+    def step_async(self, actions: Any) -> None:
+        """Begin a step of all environments, which goes on while the caller computes.
+
+        The FMUs step in a thread of their own, without the interpreter's lock. Hooks that are not
+        compiled run in this thread, too. Until ``step_wait``, only ``close`` may be called.
+
+        Args:
+            actions: As for ``step``; a copy is made.
+
+        Raises:
+            SimulationError: As ``step``, if it cannot begin. All other errors are raised by
+                ``step_wait``.
+            PendingStepError: If a step is under way; a ``SimulationError``, too.
+        """
+        self._require_ready("step_async")
+        copied = actions.copy() if type(actions) is np.ndarray else copy.deepcopy(actions)
+        self._background.begin(self._step, copied)
+
+    def step_wait(self, timeout: float | None = None) -> StepResult:
+        """Wait for the step that ``step_async`` has begun.
+
+        Ctrl-C interrupts the waiting, not the step: ``step_wait`` may be called again.
+
+        Args:
+            timeout: The longest time to wait, in seconds; None for no limit.
+
+        Returns:
+            As ``step``.
+
+        Raises:
+            ConfigError: As ``step``.
+            SimulationError: As ``step``.
+            NoStepError: If no step is under way; a ``SimulationError``, too.
+            StepTimeoutError: If the step does not end in time; a ``SimulationError``, too. The step
+                goes on, and ``step_wait`` may be called again.
+        """
+        if self.closed:
+            raise SimulationError(f"step_wait was called on a closed {type(self).__name__}")
+        result: StepResult = self._background.finish(timeout)
+        return result
+
+    def _require_ready(self, method: str) -> None:
+        if not self._is_ready or self.closed or self._background.is_pending:
+            self._refuse_step(method)
         engine = self._engine
-        if not self._is_ready or self.closed:
-            self._refuse_step()
         if engine.any_ended and self.autoreset_mode is AutoresetMode.DISABLED:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
+
+    def _step(self, actions: Any) -> StepResult:
+        engine = self._engine
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
             if engine.any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -249,17 +300,22 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._pool.halt()
         self._is_ready = self._is_ready and not self._engine.has_moved
 
-    def _refuse_step(self) -> None:
-        self._open_pool("step")
+    def _refuse_step(self, method: str) -> None:
+        self._open_pool(method)
         if self._started:
             raise SimulationError(
-                "step was called after an exception that has ended all episodes; call reset first"
+                f"{method} was called after an exception that has ended all episodes; call reset "
+                "first"
             )
-        raise SimulationError("step was called before the first reset")
+        raise SimulationError(f"{method} was called before the first reset")
 
     def _open_pool(self, method: str) -> Pool:
         if self.closed:
             raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
+        if self._background.is_pending:
+            raise PendingStepError(
+                f"{method} was called while a step is under way; call step_wait first"
+            )
         return self._pool
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
@@ -414,8 +470,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return self._engine.call(name, indices, args, kwargs)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the pool."""
+        """Free the pool, after waiting for a step that is under way."""
         if hasattr(self, "_engine"):  # otherwise the constructor has failed, and closed everything
+            self._background.stop()
             try:
                 self._engine.close()
             finally:

@@ -7,12 +7,14 @@ vector environments. Outside of its mask an array holds zeros, or None where it 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.values import LateDict
 
 __all__ = [
     "copy_rows",
@@ -36,11 +38,16 @@ def within(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def drawn_info(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
-    """The info of a reset: what was drawn or overridden, by name."""
+    """The info of a reset: what was drawn or overridden, by name; no caller changes the rows."""
+    mask = mask.copy()
+    return {"drawn": LateDict.of(_drawn_rows, drawn, mask), "_drawn": mask}  # rarely read
+
+
+def _drawn_rows(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, row in drawn.items():
         values[name], values[f"_{name}"] = within(mask, row), mask.copy()
-    return {"drawn": values, "_drawn": mask.copy()}
+    return values
 
 
 def final_infos(
@@ -100,6 +107,8 @@ def not_finite(values: Any) -> MaskArray | None:
         found = [rows for rows in map(not_finite, values.values()) if rows is not None]
         return np.logical_or.reduce(found) if found else None
     if values.dtype.kind != "f":
+        return None
+    if isfinite(np.vdot(values, values)):  # two thirds of the time of what follows
         return None
     finite = np.isfinite(values)
     if np.count_nonzero(finite) == finite.size:  # a third of the time of finite.all()

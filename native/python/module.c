@@ -1,6 +1,6 @@
 /* The extension module fmugym._native. See fmugym/_native.pyi. */
 
-#include "python.h"
+#include "programs.h"
 
 #include "threads.h"
 
@@ -59,6 +59,8 @@ static PyObject *statistics(PyObject *module, PyObject *unused) {
 
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
+    {"evaluate", py_evaluate, METH_VARARGS, NULL},
+    {"is_free_loop", py_is_free_loop, METH_O, NULL},
     {"distributions", distributions, METH_NOARGS, NULL},
     {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
@@ -99,7 +101,7 @@ PyMODINIT_FUNC PyInit__native(void) {
         !add_type(module, &draws_type, &draws_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         !add_type(module, &snapshot_type, &snapshot_spec) ||
-        PyModule_AddIntConstant(module, "MOST_INSTRUCTIONS", PROGRAM_LENGTH) < 0) {
+        PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {
         Py_DECREF(module);
         return NULL;
     }

@@ -1,18 +1,40 @@
 /* The methods of the type Pool for playing: see play.h. */
 
+#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "python.h"
+#include "programs.h"
 
-enum { STARTS, STATES, COUNTS, ENDED, PLAY_BUFFERS };
+enum {
+    STARTS,
+    STATES,
+    COUNTS,
+    ENDED,
+    CURRENT,
+    PREVIOUS,
+    NO_ACTION,
+    KEPT,
+    PLAY_BUFFERS
+};
 
 static const char *const PLAYING = "fmugym._native.playing";
+
+enum { MOST_DIMENSIONS = 8 };
 
 /* The result of prepare_play. It never changes; the next call replaces it as a whole. */
 typedef struct {
     Play play;
+    PyProgram inputs, judgement;
     Py_buffer buffers[PLAY_BUFFERS];
+    Py_buffer *row_buffers; /* two for each copy, one for each variable and variable's start */
+    size_t number_of_row_buffers;
+    RowCopy *copies;
+    VariableStart *variable_starts;
+    DrawnVariable *drawn_variables;
+    InputStart *input_starts;
+    int action_letter, action_dimensions;
+    Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;
 } Playing;
@@ -21,6 +43,16 @@ static void playing_free(Playing *playing) {
     for (int i = 0; i < PLAY_BUFFERS; i++) {
         release_buffer(&playing->buffers[i]);
     }
+    for (size_t i = 0; i < playing->number_of_row_buffers; i++) {
+        release_buffer(&playing->row_buffers[i]);
+    }
+    free(playing->row_buffers);
+    free(playing->copies);
+    free(playing->variable_starts);
+    free(playing->drawn_variables);
+    free(playing->input_starts);
+    release_program(&playing->inputs);
+    release_program(&playing->judgement);
     Py_XDECREF(playing->start);
     Py_XDECREF(playing->draws);
     free(playing);
@@ -38,41 +70,6 @@ static void replace_reference(PyObject **place, PyObject *object) {
 }
 
 /* Preparing */
-
-/* Copies a part of a program. Returns its length, or -1 with an exception if it does not fit. */
-static Py_ssize_t take_part(const char *name, Py_buffer *bytes, size_t size, size_t most,
-                            void *place) {
-    const size_t length = (size_t)bytes->len / size;
-    const bool fits = (size_t)bytes->len % size == 0 && length <= most;
-
-    if (fits) {
-        memcpy(place, bytes->buf, (size_t)bytes->len);
-    } else {
-        PyErr_Format(PyExc_ValueError,
-                     "the %s of a program must be at most %zu times %zu bytes, not %zd", name, most,
-                     size, bytes->len);
-    }
-    PyBuffer_Release(bytes);
-    return fits ? (Py_ssize_t)length : -1;
-}
-
-static bool take_program(PyObject *parts, Program *program) {
-    Py_buffer code, constants, results;
-
-    if (!PyArg_ParseTuple(parts, "y*y*y*;a program is its code, constants and results", &code,
-                          &constants, &results)) {
-        return false;
-    }
-    const Py_ssize_t lengths[] = {
-        take_part("code", &code, sizeof(Instruction), PROGRAM_LENGTH, program->code),
-        take_part("constants", &constants, sizeof(double), PROGRAM_LENGTH, program->constants),
-        take_part("results", &results, sizeof(uint16_t), PROGRAM_RESULTS, program->results),
-    };
-    program->length = (size_t)lengths[0];
-    program->number_of_constants = (size_t)lengths[1];
-    program->number_of_results = (size_t)lengths[2];
-    return lengths[0] >= 0 && lengths[1] >= 0 && lengths[2] >= 0;
-}
 
 static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObject *values) {
     if (!is_access(self, start)) {
@@ -113,36 +110,229 @@ static bool take_episodes(PyPool *self, Playing *playing, PyObject *group) {
            take_vector(ended, &b[ENDED], WRITTEN, "ended", ITEM_BOOLEAN, n);
 }
 
+/* Returns the number of elements of an action, or -1 with an exception. */
+static Py_ssize_t take_action_shape(PyPool *self, Playing *playing, PyObject *shape) {
+    const Py_ssize_t dimensions = PyTuple_Size(shape);
+    Py_ssize_t elements = 1;
+
+    playing->action_dimensions = 1 + (int)dimensions;
+    playing->action_shape[0] = (Py_ssize_t)self->pool.settings.count;
+    for (Py_ssize_t i = 0; i < dimensions && i < MOST_DIMENSIONS; i++) {
+        const Py_ssize_t length = PyLong_AsSsize_t(PyTuple_GetItem(shape, i));
+        if (length < 0 || length > UINT16_MAX) {
+            elements = -1;
+            break;
+        }
+        playing->action_shape[1 + i] = length;
+        elements *= length;
+    }
+    if (elements < 0 || elements > UINT16_MAX || dimensions > MOST_DIMENSIONS) {
+        PyErr_SetString(PyExc_ValueError, "an action has too many elements");
+        return -1;
+    }
+    return elements;
+}
+
+/* Actions that are kept need memory for this step and for the one before. */
+static bool take_actions(PyPool *self, Playing *playing, PyObject *group) {
+    static char *names[] = {"shape",   "letter",  "size",     "check", "lowest",
+                            "highest", "current", "previous", "none",  NULL};
+    Actions *a = &playing->play.actions;
+    Py_buffer *b = playing->buffers;
+    PyObject *shape, *current, *previous, *none;
+    Py_ssize_t size;
+    long long lowest, highest;
+    int check;
+
+    if (!parse_group(group, "$O!CniLLOOO:actions", names, &PyTuple_Type, &shape,
+                     &playing->action_letter, &size, &check, &lowest, &highest, &current, &previous,
+                     &none)) {
+        return false;
+    }
+    const Py_ssize_t elements = take_action_shape(self, playing, shape);
+    if (elements < 0) {
+        return false;
+    }
+    const Py_ssize_t length = elements * (Py_ssize_t)self->pool.settings.count;
+    *a = (Actions){.elements = (size_t)elements,
+                   .size = (size_t)size,
+                   .check = (ActionCheck)check,
+                   .lowest = lowest,
+                   .highest = highest};
+    if (!take_numbers(none, &b[NO_ACTION], false, "no action", elements) ||
+        (current != Py_None &&
+         (!take_numbers(current, &b[CURRENT], true, "current actions", length) ||
+          !take_numbers(previous, &b[PREVIOUS], true, "previous actions", length)))) {
+        return false;
+    }
+    a->current = b[CURRENT].buf;
+    a->previous = b[PREVIOUS].buf;
+    a->none = b[NO_ACTION].buf;
+    if (b[NO_ACTION].itemsize != size ||
+        (a->current != NULL && (b[CURRENT].itemsize != size || b[PREVIOUS].itemsize != size))) {
+        PyErr_SetString(PyExc_ValueError, "actions differ in type");
+        return false;
+    }
+    return true;
+}
+
+static bool take_kept(PyPool *self, Playing *playing, PyObject *kept) {
+    const Settings *s = &self->pool.settings;
+
+    return take_matrix(kept, &playing->buffers[KEPT], WRITTEN, "kept", ITEM_FLOAT64,
+                       (Py_ssize_t)s->outputs->count, (Py_ssize_t)s->count);
+}
+
+/* Takes a row that the pool writes. There is room for its buffer. */
+static bool take_row(PyPool *self, Playing *playing, PyObject *object, Row *row) {
+    Py_buffer *buffer = &playing->row_buffers[playing->number_of_row_buffers++];
+
+    if (!take_numbers(object, buffer, true, "an episode variable",
+                      (Py_ssize_t)self->pool.settings.count)) {
+        return false;
+    }
+    *row = (Row){buffer->buf, (size_t)buffer->itemsize};
+    return true;
+}
+
+static bool take_copy(PyPool *self, Playing *playing, PyObject *pair, RowCopy *copy) {
+    PyObject *source, *target;
+
+    if (!PyArg_ParseTuple(pair, "OO;a copy is a row and the row to copy it to", &source, &target) ||
+        !take_row(self, playing, source, &copy->from) ||
+        !take_row(self, playing, target, &copy->to)) {
+        return false;
+    }
+    if (copy->from.size != copy->to.size) {
+        PyErr_SetString(PyExc_ValueError, "rows to copy differ in type");
+        return false;
+    }
+    return true;
+}
+
+static bool take_variable_start(PyPool *self, Playing *playing, PyObject *pair,
+                                VariableStart *start) {
+    PyObject *row;
+    const char *bytes;
+    Py_ssize_t size;
+
+    if (!PyArg_ParseTuple(pair, "Oy#;a variable and its start", &row, &bytes, &size) ||
+        !take_row(self, playing, row, &start->row)) {
+        return false;
+    }
+    if ((size_t)size != start->row.size) {
+        PyErr_SetString(PyExc_ValueError, "a variable and its start differ in type");
+        return false;
+    }
+    memcpy(&start->bits, bytes, (size_t)size);
+    return true;
+}
+
+static bool take_drawn_variable(PyPool *self, Playing *playing, PyObject *pair,
+                                DrawnVariable *variable) {
+    PyObject *row;
+    Py_ssize_t draw;
+
+    if (!PyArg_ParseTuple(pair, "On;a variable and its draw", &row, &draw) ||
+        !take_row(self, playing, row, &variable->row)) {
+        return false;
+    }
+    variable->draw = (size_t)draw;
+    if (variable->row.size != sizeof(double) || variable->draw >= playing->play.draws->count) {
+        PyErr_SetString(PyExc_ValueError, "a drawn variable is no float64, or has no draw");
+        return false;
+    }
+    return true;
+}
+
+static bool take_variables(PyPool *self, Playing *playing, PyObject *copies, PyObject *starts,
+                           PyObject *drawn) {
+    const size_t a = (size_t)PyTuple_Size(copies), b = (size_t)PyTuple_Size(starts),
+                 c = (size_t)PyTuple_Size(drawn);
+    Play *play = &playing->play;
+    bool good = true;
+
+    playing->row_buffers = calloc(2 * a + b + c + 1, sizeof *playing->row_buffers);
+    play->copies = playing->copies = calloc(a + 1, sizeof *playing->copies);
+    play->variable_starts = playing->variable_starts =
+        calloc(b + 1, sizeof *playing->variable_starts);
+    play->drawn_variables = playing->drawn_variables =
+        calloc(c + 1, sizeof *playing->drawn_variables);
+    if (playing->row_buffers == NULL || playing->copies == NULL ||
+        playing->variable_starts == NULL || playing->drawn_variables == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    play->number_of_copies = a;
+    play->number_of_variable_starts = b;
+    play->number_of_drawn_variables = c;
+    for (size_t i = 0; i < a && good; i++) {
+        good = take_copy(self, playing, PyTuple_GetItem(copies, (Py_ssize_t)i),
+                         &playing->copies[i]);
+    }
+    for (size_t i = 0; i < b && good; i++) {
+        good = take_variable_start(self, playing, PyTuple_GetItem(starts, (Py_ssize_t)i),
+                                   &playing->variable_starts[i]);
+    }
+    for (size_t i = 0; i < c && good; i++) {
+        good = take_drawn_variable(self, playing, PyTuple_GetItem(drawn, (Py_ssize_t)i),
+                                   &playing->drawn_variables[i]);
+    }
+    return good;
+}
+
+/* Each input starts with the value of a parameter or, if its number is negative, a constant. */
+static bool take_input_starts(PyPool *self, Playing *playing, PyObject *starts) {
+    const Py_ssize_t count = PyTuple_Size(starts);
+    const Py_ssize_t parameters = (Py_ssize_t)((PyAccess *)playing->start)->access.count;
+    const double *values = playing->buffers[STARTS].buf;
+
+    playing->input_starts = calloc((size_t)count + 1, sizeof *playing->input_starts);
+    if (playing->input_starts == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        InputStart *start = &playing->input_starts[i];
+        Py_ssize_t number;
+        if (!PyArg_ParseTuple(PyTuple_GetItem(starts, i), "nd;an input's start", &number,
+                              &start->value)) {
+            return false;
+        }
+        if (number >= 0 && number < parameters) {
+            start->row = values + number * (Py_ssize_t)self->pool.settings.count;
+        }
+    }
+    playing->play.input_starts = playing->input_starts;
+    playing->play.number_of_inputs = (size_t)count;
+    return true;
+}
+
 static void settle_play(PyPool *self, Playing *playing) {
     const Py_buffer *b = playing->buffers;
     const Settings *s = &self->pool.settings;
     Play *play = &playing->play;
 
     play->count = s->count;
+    play->inputs = playing->inputs.program;
+    play->judgement = playing->judgement.program;
     play->input_rows = self->buffers[INPUTS].buf;
+    play->output_rows = s->output_values;
+    play->kept_rows = b[KEPT].buf;
+    play->number_of_outputs = s->outputs->count;
     play->start_values = b[STARTS].buf;
+    play->number_of_parameters = ((PyAccess *)playing->start)->access.count;
     play->streams = b[STATES].buf;
     play->step_counts = b[COUNTS].buf;
     play->ended = b[ENDED].buf;
-    play->source = (Source){
-        .outputs = s->output_values,
-        .inputs = play->input_rows,
-        .parameters = play->start_values,
-        .step_counts = play->step_counts,
-        .count = s->count,
-        .number_of_outputs = s->outputs->count,
-        .number_of_inputs = s->inputs->count,
-        .number_of_parameters = ((PyAccess *)playing->start)->access.count,
-    };
+    play->source.statuses = s->status;
 }
 
-static bool is_sound(const Play *play) {
-    const bool sound =
-        play->judgement.length > 0 && program_is_sound(&play->inputs, &play->source) &&
-                 program_is_sound(&play->judgement, &play->source) &&
-                 play->inputs.number_of_results == play->source.number_of_inputs &&
-                 play->judgement.number_of_results == 3 &&
-        draws_fit(play->draws, play->source.number_of_parameters);
+static bool is_sound(const PyPool *self, const Play *play) {
+    const bool sound = play->inputs.number_of_seen == 0 &&
+                 play->judgement.number_of_results == PROGRAM_RESULTS &&
+                 play->number_of_inputs == self->pool.settings.inputs->count &&
+                 draws_fit(play->draws, play->number_of_parameters);
 
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a program does not fit the pool");
@@ -151,26 +341,34 @@ static bool is_sound(const Play *play) {
 }
 
 static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
-    static char *names[] = {"start",   "start_values", "inputs",   "judgement",
-                            "actions", "draws",        "states", "episodes", NULL};
-    PyObject *start, *values, *inputs, *judgement, *draws, *states, *episodes;
-    long long lowest, highest;
+    static char *names[] = {"start", "start_values", "inputs", "judgement",    "actions", "draws", "states",
+                            "episodes", "kept", "keeps_always", "copies", "variable_starts", "drawn_variables", "input_starts",
+                            NULL};
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
+    PyObject *start, *values, *inputs, *judgement, *actions, *draws, *states, *episodes, *kept, *copies;
+    PyObject *variable_starts, *drawn, *starts;
+    int keeps_always;
 
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "$OOO!O!(LL)OOO!:prepare_play", names, &start,
-                                     &values, &PyTuple_Type, &inputs, &PyTuple_Type, &judgement,
-                                     &lowest, &highest, &draws, &states, &PyDict_Type, &episodes)) {
+    if (!PyArg_ParseTupleAndKeywords(
+            args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &start, &values,
+            &PyTuple_Type, &inputs, &PyTuple_Type, &judgement, &PyDict_Type, &actions, &draws,
+            &states, &PyDict_Type, &episodes, &kept, &keeps_always, &PyTuple_Type, &copies,
+            &PyTuple_Type, &variable_starts, &PyTuple_Type, &drawn, &PyTuple_Type, &starts)) {
         return false;
     }
-    playing->play.lowest_action = lowest;
-    playing->play.highest_action = highest;
-    if (!take_starts(self, playing, start, values) ||
-        !take_program(inputs, &playing->play.inputs) ||
-        !take_program(judgement, &playing->play.judgement) || !take_draws(self, playing, draws, states) ||
-        !take_episodes(self, playing, episodes)) {
+    playing->play.keeps_always = keeps_always != 0;
+    if (!take_starts(self, playing, start, values) || !take_actions(self, playing, actions)) {
+        return false;
+    }
+    const size_t elements = playing->play.actions.elements;
+    if (!take_program(inputs, n, elements, &playing->inputs) ||
+        !take_program(judgement, n, elements, &playing->judgement) ||
+        !take_draws(self, playing, draws, states) || !take_episodes(self, playing, episodes) ||
+        !take_kept(self, playing, kept) || !take_variables(self, playing, copies, variable_starts, drawn) || !take_input_starts(self, playing, starts)) {
         return false;
     }
     settle_play(self, playing);
-    return is_sound(&playing->play);
+    return is_sound(self, &playing->play);
 }
 
 /* Always discards the previous preparation. A call that uses it keeps its own reference. */
@@ -210,6 +408,8 @@ enum {
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];
+    Py_buffer seen_buffers[MOST_SEEN];
+    char *seen[MOST_SEEN];
     Turn turn;
     Call call;
     bool bad_action;
@@ -228,19 +428,62 @@ static bool take_starts_at_ends(PyPool *self, PyObject *last, PyObject *started,
             take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n));
 }
 
-static bool take_arrays(PyPool *self, const Play *play, PyObject *const *args, PyTurn *t) {
+/* The observations are one array that the pool fills itself, or those that the program stores. */
+static bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t) {
     const Settings *s = &self->pool.settings;
-    const Py_ssize_t n = (Py_ssize_t)s->count;
+
+    if (playing->judgement.program.number_of_seen > 0 || PyTuple_Check(seen)) {
+        return take_seen(&playing->judgement, seen, t->seen_buffers, t->seen);
+    }
+    return take_matrix(seen, &t->buffers[SEEN], WRITTEN, "observations", ITEM_FLOAT32,
+                       (Py_ssize_t)s->count, (Py_ssize_t)s->num_observed);
+}
+
+/* Whether the items of a buffer are of the kind that a letter stands for: d for floats, q for
+ * integers, Q for those without sign, ? for Booleans. */
+static bool has_letter(const Py_buffer *buffer, int letter) {
+    const char *format = buffer->format == NULL ? "B" : buffer->format;
+    const char *const letters = letter == 'd'   ? "fd"
+                                : letter == 'q' ? "bhilq"
+                                : letter == 'Q' ? "BHILQ"
+                                                : "?";
+
+    if (*format == '@' || *format == '=') {
+        format++;
+    }
+    return format[0] != '\0' && format[1] == '\0' && strchr(letters, format[0]) != NULL;
+}
+
+/* Actions of another type or shape come back as an exception; the caller then converts them. */
+static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn *t) {
+    Py_buffer *b = &t->buffers[ACTIONS];
+
+    if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
+        return false;
+    }
+    bool fits = b->ndim == playing->action_dimensions && has_letter(b, playing->action_letter) &&
+                b->itemsize == (Py_ssize_t)playing->play.actions.size;
+    for (int i = 0; fits && i < b->ndim; i++) {
+        fits = b->shape[i] == playing->action_shape[i];
+    }
+    if (!fits || (uintptr_t)b->buf % (uintptr_t)b->itemsize != 0) {
+        PyErr_SetString(PyExc_TypeError, "the actions have another type or shape");
+        return false;
+    }
+    return true;
+}
+
+static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
     Py_buffer *b = t->buffers;
 
-    return take_vector(args[ACTIONS], &b[ACTIONS], IN_PLACE, "actions", ITEM_INT64, n) &&
-           take_matrix(args[SEEN], &b[SEEN], WRITTEN, "observations", ITEM_FLOAT32, n,
-                       (Py_ssize_t)s->num_observed) &&
+    return take_given_actions(playing, args[ACTIONS], t) &&
+           take_observations(self, playing, args[SEEN], t) &&
            take_vector(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, n) &&
            take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
            take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
            take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)play->draws->count, n) &&
+                       (Py_ssize_t)playing->play.draws->count, n) &&
            take_starts_at_ends(self, args[LAST], args[STARTED], t);
 }
 
@@ -254,6 +497,7 @@ static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .rewards = b[REWARDS].buf,
         .terminated = b[TERMINATED].buf,
         .truncated = b[TRUNCATED].buf,
+        .seen = t->seen,
         .drawn = b[DRAWN].buf,
         .last_observations = b[LAST].buf,
         .started = b[STARTED].buf,
@@ -286,6 +530,10 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
         PyErr_SetString(PyExc_ValueError, "an action is out of range");
         return NULL;
     }
+    if (t->ends.outside) {
+        PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
+        return NULL;
+    }
     return report_messages(self)
                ? Py_BuildValue("(nnn)", (Py_ssize_t)t->troubled, (Py_ssize_t)t->ends.ended,
                                (Py_ssize_t)t->ends.started)
@@ -294,15 +542,23 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
 
 static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
-    PyTurn t = {.bad_action = false};
+    const size_t seen = playing->judgement.program.number_of_seen;
+    PyTurn t;
     PyObject *result = NULL;
 
-    if (take_arrays(self, &playing->play, args, &t)) {
+    t.bad_action = false;
+    memset(t.buffers, 0, sizeof t.buffers);
+    memset(t.seen_buffers, 0, seen * sizeof *t.seen_buffers);
+
+    if (take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
         result = play_turn(self, &t);
     }
     for (int i = 0; i < TURN_BUFFERS; i++) {
         release_buffer(&t.buffers[i]);
+    }
+    for (size_t i = 0; i < seen; i++) {
+        release_buffer(&t.seen_buffers[i]);
     }
     return result;
 }
@@ -349,9 +605,10 @@ static bool take_start_arrays(PyPool *self, const Play *play, PyObject *const *a
 
 static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
-    PyTurn t = {.bad_action = false};
+    PyTurn t;
     bool done = false;
 
+    memset(&t, 0, sizeof t);
     if (take_start_arrays(self, &playing->play, args, &t)) {
         settle_turn(self, playing, &t);
         t.call.mask = (Mask){t.buffers[MASK].buf, t.buffers[MASK].strides[0]};

@@ -274,7 +274,9 @@ class BatchEngine(Engine):
             if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
                 row = variables[name] = results.variable(name, row, self._n)
         else:
-            row = self._parameters.setdefault(name, np.full(self._n, np.nan))
+            known = self._parameters.get(name)
+            row = np.full(self._n, np.nan) if known is None else known
+            self._parameters[name] = row
         return row
 
     # Steps.
@@ -322,7 +324,9 @@ class BatchEngine(Engine):
         if array.dtype != space.dtype:
             with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
                 array = array.astype(space.dtype)
-        return array if array.ndim == 1 else np.ascontiguousarray(np.moveaxis(array, 0, -1))
+        if array.ndim <= 2:
+            return np.ascontiguousarray(array.T)
+        return np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs

@@ -8,36 +8,40 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
-from fmugym.task.readings import Readings, reading
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.episode import EpisodePlan
+from fmugym.task.readings import Readings
 from fmugym.task.values import LateDict
-from fmugym.vector.contents import borrowed
+from fmugym.vector.actions import checked_actions
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.check import sample_states
-from fmugym.vector.hooks.program import Program, UntraceableError, evaluate, is_always_finite
-from fmugym.vector.hooks.trace import trace_hooks
-from fmugym.vector.infos import final_infos, not_finite, rows_as_objects
+from fmugym.vector.hooks.compare import require_same
+from fmugym.vector.hooks.program import Row, UntraceableError
+from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.infos import final_infos, rows_as_objects
 from fmugym.vector.streams import given_draws
-from fmugym.vector.views import copied
 
 __all__ = ["CompiledEngine", "find_programs"]
 
 logger = logging.getLogger(__name__)
 
 _FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
-_REWARD = 2
-"""The index of the reward among the results of the second program."""
+
+_SCALES = (1.0, -0.3, 10.0, 300.0, -1e5)
+"""The magnitudes of the states that programs are compared with hooks on."""
 
 _make_tuple: Any = tuple.__new__  # takes a third of the time of a NamedTuple's constructor
 
 
-def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program] | None:
+def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
     """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
 
     Args:
@@ -45,49 +49,28 @@ def find_programs(env: FMUEnv, required: bool = False) -> tuple[Program, Program
         required: Whether hooks that cannot be compiled are an error.
 
     Returns:
-        The program for the inputs and the program for done, truncated and reward; or None.
+        The programs, or None.
 
     Raises:
         ConfigError: If the programs are required, but the hooks cannot be compiled.
     """
     try:
         _require_playable(env)
-        programs = trace_hooks(env)
-        _require_same(env, sample_states(env), programs)
+        task = trace_hooks(env)
+        require_same(env, sample_states(env, _SCALES), task)
     except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
-        logger.debug("%s", text)
+        logger.info("%s. They run on arrays, which is slower", text)
         return None
-    return programs
+    return task
 
 
 def _require_playable(env: FMUEnv) -> None:
     """Refuse environments that the native pool cannot play, whatever their hooks are."""
     if not env._open_pool("a vector environment").can_play:
         raise UntraceableError("the pool is not the native one")
-
-
-def _require_same(env: FMUEnv, batch: Readings, programs: tuple[Program, Program]) -> None:
-    with np.errstate(all="ignore"), borrowed(env):
-        batch.inputs = inputs = np.array(evaluate(programs[0], batch))
-        done, truncated, reward = evaluate(programs[1], batch)
-        batch.done = done != 0.0
-        with reading(env, batch):
-            hooks = (env._is_done(), env._is_truncated(), env._reward_policy())
-            expected_inputs = env._get_inputs()
-    for value, expected in zip((done, truncated, reward), hooks, strict=True):
-        if not _equal(value, expected):
-            raise UntraceableError("the program gives other values than the hooks")
-    if not _equal(inputs, expected_inputs):
-        raise UntraceableError("the program gives other inputs than the hook")
-
-
-def _equal(value: FloatArray, expected: Any) -> bool:
-    """Whether values are the same to the last bit, NaN included."""
-    floats = np.asarray(expected, np.float64)
-    return np.array_equal(value, np.broadcast_to(floats, value.shape), equal_nan=True)
 
 
 class CompiledEngine(BatchEngine):
@@ -101,68 +84,173 @@ class CompiledEngine(BatchEngine):
         env: The prototype, made with a native pool of N instances.
         num_envs: N.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
-        programs: From ``find_programs``.
+        task: From ``find_programs``.
     """
 
     def __init__(
-        self,
-        env: FMUEnv,
-        num_envs: int,
-        max_episode_steps: int | None,
-        programs: tuple[Program, Program],
+        self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
         self._shape = num_envs, env._output_count
-        self._prepare(programs)
+        self._kept = np.zeros_like(self._pool.outputs)
+        shape = (num_envs, *(env.action_space.shape or ()))
+        dtype = env.action_space.dtype
+        self._actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
+        self._rows: dict[str, npt.NDArray[Any]] = {}
+        self._before: dict[str, npt.NDArray[Any]] = {}
+        self._prepare(task)
 
-    def _prepare(self, programs: tuple[Program, Program] | None) -> None:
+    def _prepare(self, task: TracedTask | None) -> None:
         """Give the pool everything it needs for a step, if it can draw the episodes."""
         plan, streams = self.env._plan, self._streams
-        self._programs = programs
+        self._task = task
         self._prepared = False
-        if programs is None:
+        if task is None or not _can_draw(task, plan):
             return
-        space: Any = self.env.action_space
-        self._may_overflow = not is_always_finite(programs[1], _REWARD)
         self._names = plan.drawn_names
         self._drawn_shape = len(self._names), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
+        self._keeps_actions = task.judgement.loads("load_action") or task.loads(
+            "load_previous_action"
+        )
+        self._make_rows(task)
+        self._layout = _Layout(task, self._n)
         self._play = self._pool.prepare_play(
             plan.model_variables,
-            programs,
-            (int(space.start), int(space.start + space.n - 1)),
+            (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
+            self._action_group(),
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
+            self._surroundings(task),
         )
         self._play_with_resets = self._pool.watched(self._play)
         self._start = self._pool.start_of_play()
         self._prepared = True
 
+    def _make_rows(self, task: TracedTask) -> None:
+        """Make the arrays that stay in place: variables, and what hooks read of the step before."""
+        variables = self.env.variables
+        self._rows, self._before = {}, {}
+        for name, dtype in task.variables.items():
+            self._rows[name] = np.ascontiguousarray(self._row(name), dtype).copy()
+            self._before[name] = self._rows[name].copy()
+            variables[name] = self._rows[name]
+        self._show()
+
+    def _show(self) -> None:
+        """Let hooks on arrays read what the pool keeps."""
+        env = self.env
+        if self._keeps_actions:
+            env.action, env.previous_action = (np.moveaxis(a, 0, -1) for a in self._actions)
+        self._kept[: env._output_count] = env.previous_state
+        env.previous_state = self._kept[: env._output_count]
+
+    def _take_over(self) -> None:
+        """Take over what a step on arrays has left in arrays of its own."""
+        env = self.env
+        for name, row in self._rows.items():
+            row[...] = env.variables[name]
+            env.variables[name] = row
+        if self._keeps_actions:
+            for own, theirs in zip(self._actions, (env.action, env.previous_action), strict=True):
+                own[...] = np.moveaxis(theirs, -1, 0)
+        self._show()
+
+    def _find(self, row: Row) -> Any:
+        """The array of a row that a program loads or stores."""
+        kind, *rest = row
+        index: Any = rest[-1]
+        name: Any = rest[0]
+        match kind:
+            case "output":
+                return self._pool.outputs[index]
+            case "kept":
+                return self._kept[index]
+            case "input":
+                return self._pool.inputs[index]
+            case "parameter":
+                return self._parameters[name]
+            case "step_count":
+                return self.env.step_count
+        arrays = self._rows if kind == "variable" else self._before
+        return arrays[name].reshape(-1, self._n)[index]
+
+    def _action_group(self) -> dict[str, Any]:
+        """How the pool checks and keeps actions."""
+        env, dtype = self.env, self._actions[0].dtype
+        space: Any = env.action_space
+        is_discrete = isinstance(space, spaces.Discrete)
+        check = 1 if is_discrete else 2 if dtype == np.float64 else 3 if dtype == np.float32 else 0
+        low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
+        flat = [actions.reshape(-1) for actions in self._actions]
+        return {
+            "shape": self._actions[0].shape[1:],
+            "letter": {"f": "d", "i": "q", "u": "Q", "b": "?"}[dtype.kind],
+            "size": dtype.itemsize,
+            "check": check,
+            "lowest": low,
+            "highest": high,
+            "current": flat[0] if self._keeps_actions else None,
+            "previous": flat[1] if self._keeps_actions else None,
+            "none": np.array(env._no_action, dtype).reshape(-1),
+        }
+
+    def _surroundings(self, task: TracedTask) -> dict[str, Any]:
+        """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
+        env, plan = self.env, self.env._plan
+        names = plan.parameter_names
+        flat = {name: row.reshape(-1, self._n) for name, row in self._rows.items()}
+        before = {name: row.reshape(-1, self._n) for name, row in self._before.items()}
+        constants = plan.constant_variables
+        keeps = not task.judgement.is_always_finite or bool(task.seen)
+        return {
+            "kept": self._kept,
+            "keeps_always": keeps or task.judgement.loads("kept"),
+            "copies": tuple(
+                pair for name in flat for pair in zip(flat[name], before[name], strict=True)
+            ),
+            "input_starts": tuple(
+                (names.index(name), start) if name in names else (-1, start)
+                for name, start in env._start_inputs
+            ),
+            "drawn_variables": tuple(
+                (flat[name][0], number)
+                for number, name in enumerate(plan.drawn_names)
+                if name in flat
+            ),
+            "variable_starts": tuple(
+                (row, np.array(value, row.dtype).tobytes())
+                for name, start in constants.items()
+                for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
+            ),
+        }
+
     def set_parameter(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_parameter``."""
         super().set_parameter(name, values)
-        self._prepare(self._programs)
+        self._prepare(self._task)
 
     def _assign(self, attributes: Mapping[str, tuple[Any, bool]]) -> None:
         """Compile the hooks anew, because the programs contain the old values of the attributes."""
         super()._assign(attributes)
+        task: TracedTask | None = None
         try:
             if self._columns:
                 raise UntraceableError("environments have attributes of their own")
-            programs = trace_hooks(self.env)
-            _require_same(self.env, copied(Readings.of(self.env)), programs)
+            task = trace_hooks(self.env)
+            require_same(self.env, Readings.of(self.env), task)
         except Exception as reason:  # as in find_programs
-            logger.debug("the hooks cannot be compiled any more: %s", reason)
-            programs = None
-        self._prepare(programs)
+            logger.info("the hooks cannot be compiled any more: %s", reason)
+            task = None
+        self._prepare(task)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        if options or self._any_foreign or not self._prepared:
+        if options or self._any_foreign or not self._prepared or self._layout.has_own:
             return super().reset(mask, seeds, options)
         self.has_moved = False
         if seeds is not None:
@@ -183,66 +271,155 @@ class CompiledEngine(BatchEngine):
             drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
         return drawn
 
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """See ``Engine.call``."""
+        returned = super().call(name, indices, arguments, keywords)
+        if self._prepared:
+            self._take_over()
+        return returned
+
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         if self._any_foreign or not self._prepared:
-            return super().step(actions, resetting)
+            return self._step_on_arrays(actions, resetting)
         self._longest = self._limit  # this path does not count steps
-        if self._may_overflow:
-            self._outputs_before = self._pool.outputs.copy()
-        observations = np.empty(self._shape, _FLOAT32)
+        layout = self._layout
+        seen: Any = layout.new_arrays() if layout.has_own else np.empty(self._shape, _FLOAT32)
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
-        arrays = observations, rewards, terminated, truncated
+        judged = rewards, terminated, truncated
         self.has_moved = False
         if resetting is not None and self._draws_ahead:
-            actions = self._checked(actions)  # a refused step draws nothing
+            actions = self._flat(actions)  # a refused step draws nothing
         drawn, last, started = self._draw_ahead(resetting), None, None
-        if self.starts_at_ends and not self._draws_ahead:
+        if self.starts_at_ends and not self._draws_ahead and not layout.has_own:
             last, started = np.empty(self._shape, _FLOAT32), np.empty(self._n, _BOOL)
         play = self._play if resetting is started is None else self._play_with_resets
+        self.has_moved = True
         try:
-            troubled, ended, begun = play(actions, *arrays, drawn, last, started)
+            troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
         except (TypeError, ValueError, BufferError) as error:
             require_refusal(error)
-            actions = np.require(self._checked(actions), np.int64, ["C", "A"])
-            troubled, ended, begun = play(actions, *arrays, drawn, last, started)
-        self.has_moved = True
+            self.has_moved = False
+            actions = self._flat(actions)
+            self.has_moved = True
+            troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
         self.any_ended = ended > begun
         infos: dict[str, Any] = {}
+        observations = seen
+        if layout.has_own:
+            observations, infos = layout.divided(seen, self._n)
         if resetting is not None:
-            infos = _start_infos(self._names, drawn, resetting)
+            infos |= _start_infos(self._names, drawn, resetting)
         elif begun:
             infos = LateDict.of(_infos_at_ends, self._names, drawn, last, started)
-        result: StepResult = _make_tuple(StepResult, (*arrays, infos))
-        if troubled or (self._may_overflow and not_finite(rewards) is not None):
-            self._mend(actions, result, resetting if started is None else started)
+        result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
+        if troubled:
+            self._mend(result, resetting if started is None else started)
         return result
 
-    def _mend(self, actions: Any, result: StepResult, starting: MaskArray | None) -> None:
-        """Handle FMUs that failed or asked to stop: they are rare, so numpy is fast enough.
+    def _flat(self, actions: Any) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, environments first.
+
+        Raises:
+            ConfigError: If they do not fit.
+        """
+        space: Any = self.env.action_space
+        with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
+            array = checked_actions(space, self._n, actions).astype(space.dtype, copy=False)
+        return np.require(array, requirements=["C", "A"])
+
+    def _step_on_arrays(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        result = super().step(actions, resetting)
+        if self._prepared:
+            self._take_over()
+        return result
+
+    def _mend(self, result: StepResult, starting: MaskArray | None) -> None:
+        """Handle failures and numbers that are not finite: rare, so numpy is fast enough.
 
         Args:
-            actions: Those of the step.
             result: Of the step; it is corrected.
             starting: Which environments have started an episode in this step.
         """
-        statuses = self._pool.statuses
+        env, statuses = self.env, self._pool.statuses
         if starting is not None:
             self._require_started(np.flatnonzero(starting), statuses)
-        if starting is not None and self.starts_at_ends:
             self._require_finite_start(result.observations, starting)
-        self._require_finite_inputs(starting)
-        stopped = self._stopped(statuses)
-        if stopped.any():
-            result.terminated[stopped] = True
-            self.env.action, self.env.done = self._checked(actions), result.terminated
-            rewards = results.rewards(self.env._reward_policy(), self._n)
-            result.rewards[stopped] = rewards[stopped]
-        self._handle_faults(result, statuses, True)
+        self._require_possible_inputs(starting)
+        env.done = result.terminated.copy()
+        self._outputs_before, self._variables_before = self._kept, self._before
+        env._in_hooks = True
+        try:
+            self._handle_faults(result, statuses, True)
+        finally:
+            env._in_hooks = False
         self.note_ends(result.terminated, result.truncated)
         if starting is not None:
             self.note_starts(starting)
+
+    def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
+        """Refuse inputs that are not finite, which they also are outside of their type's range."""
+        inputs = self._pool.inputs
+        if not self.env._input_writer.all_real and not np.isfinite(inputs).all():
+            wanted = np.array(inputs)
+            results.write_inputs(self.env._get_inputs(), wanted)
+            for index in self._stepping(resetting):
+                fmu_spaces.to_input_types(self.env._interface.inputs, wanted[:, index])
+        self._require_finite_inputs(resetting)
+
+
+def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
+    """Whether all variables that are drawn have kept the type of a draw."""
+    types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
+    return all(dtype == np.float64 for dtype in types)
+
+
+class _Layout:
+    """The arrays that a program stores, and the observations and infos that they make.
+
+    Args:
+        task: The programs.
+        num_envs: N.
+    """
+
+    def __init__(self, task: TracedTask, num_envs: int) -> None:
+        self.has_own = bool(task.seen)
+        self._shapes = [((num_envs, *array.shape), array.dtype) for array in task.seen]
+        self._paths = [array.path for array in task.seen]
+        self._is_plain = self._paths == [("observation",)]
+
+    def new_arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """New arrays for a step."""
+        return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
+
+    def divided(self, arrays: Any, num_envs: int) -> tuple[Any, dict[str, Any]]:
+        """The observations and the infos."""
+        if self._is_plain:
+            return arrays[0], {}
+        tree: dict[str, Any] = {"observation": {}, "info": {}}
+        for path, array in zip(self._paths, arrays, strict=True):
+            *parents, name = path
+            place = tree
+            for parent in parents:
+                place = place.setdefault(parent, {})
+            place[name] = array
+        return tree["observation"], _masked(tree["info"], num_envs)
+
+
+def _masked(infos: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Infos of all environments, with their masks."""
+    values = {
+        name: _masked(value, count) if type(value) is dict else value
+        for name, value in infos.items()
+    }
+    return values | {f"_{name}": np.ones(count, np.bool_) for name in values}
 
 
 def _infos_at_ends(

@@ -1,64 +1,46 @@
 """Programs: hooks in the form that the native pool runs.
 
-A program is a list of instructions on registers. The native pool runs it in the same pass as the
-FMU's step; ``evaluate`` runs it with numpy, so that the two can be compared.
+A program is a list of instructions on typed registers, each for 32 environments at a time. The
+native pool runs it in the same pass as the FMU's step. What IEEE 754 settles is computed by the
+pool itself, everything else by the inner loops of numpy's own functions.
 """
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.base import FloatArray
 from fmugym.pool.extension import has_native_pool
-from fmugym.task.readings import Readings
 
-__all__ = [
-    "MOST_INSTRUCTIONS",
-    "OPERATIONS",
-    "Program",
-    "UntraceableError",
-    "evaluate",
-    "is_always_finite",
-]
+__all__ = ["OPERATIONS", "TYPES", "Program", "UntraceableError", "evaluate", "letter_of"]
 
 OPERATIONS: Final = (
-    "output",
-    "input",
-    "action",
-    "parameter",
-    "step_count",
-    "constant",
-    "add",
-    "subtract",
-    "multiply",
-    "divide",
-    "negative",
-    "absolute",
-    "square_root",
-    "minimum",
-    "maximum",
-    "less",
-    "less_equal",
-    "greater",
-    "greater_equal",
-    "equal",
-    "not_equal",
-    "and",
-    "or",
-    "not",
-    "where",
+    *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
+    *("store_row", "store_seen", "call", "cast", "take", "interpolate"),
+    *("add d", "subtract d", "multiply d", "divide d", "square d", "negative d", "absolute d"),
+    *("sqrt d", "minimum d", "maximum d"),
+    *("less d", "less_equal d", "greater d", "greater_equal d", "equal d", "not_equal d"),
+    *("add f", "subtract f", "multiply f", "divide f", "square f", "negative f", "absolute f"),
+    *("sqrt f", "minimum f", "maximum f"),
+    *("add q", "subtract q", "multiply q", "negative q"),
+    *("less q", "less_equal q", "greater q", "greater_equal q", "equal q", "not_equal q"),
+    *("and", "or", "xor", "not", "where 8", "where 4", "where 2", "where 1"),
 )
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
-MOST_INSTRUCTIONS: Final = 128
-"""The native pool has this many registers."""
+TYPES: Final = "dfqihbQIHB?"
+"""The types of values: letters of numpy, in the order of ``EACH_TYPE`` of ``native/program.h``."""
+
+MOST_REGISTERS: Final = 256
+"""The native pool has this many registers for each program."""
+
+CONSTANT: Final = np.dtype([("bits", "u8"), ("to", "u2"), ("size", "u2"), ("unused", "u4")])
+SLOT: Final = np.dtype([("array", "u4"), ("element", "u4"), ("elements", "u4"), ("type", "u4")])
+"""The layouts of ``Constant`` and ``Slot`` in ``native/program.h``."""
 
 
 def require_same_table(native: Any) -> None:
@@ -71,7 +53,7 @@ def require_same_table(native: Any) -> None:
         ImportError: If they differ, because the extension was built from other sources.
     """
     operations: Any = getattr(native, "operations", tuple)()
-    if (operations, getattr(native, "MOST_INSTRUCTIONS", 0)) != (OPERATIONS, MOST_INSTRUCTIONS):
+    if (operations, getattr(native, "MOST_REGISTERS", 0)) != (OPERATIONS, MOST_REGISTERS):
         raise ImportError(
             "the C extension fmugym._native was built from other sources than the Python code of "
             "fmugym: its table of operations differs. Install fmugym again, in a working copy "
@@ -89,107 +71,96 @@ class UntraceableError(Exception):
     """A hook does what a program cannot do."""
 
 
+_LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
+"""On systems where two of numpy's types have the same layout, both are equal to one of these."""
+
+
+def letter_of(dtype: npt.DTypeLike) -> str:
+    """The letter of a type.
+
+    Raises:
+        UntraceableError: If programs have no values of this type.
+    """
+    letter = _LETTERS.get(np.dtype(dtype))
+    if letter is None:
+        raise UntraceableError(f"it computes with {np.dtype(dtype)}")
+    return letter
+
+
+Row = tuple[Hashable, ...]
+"""Names a row of values, one for each environment, such as ``("output", 0)``."""
+
+
 @dataclass(frozen=True)
 class Program:
-    """Instructions for the native pool. Instruction number i writes register i.
+    """Instructions for the native pool.
 
     Attributes:
-        code: The operation and three operands (registers, or the index of the value to load),
-            shape (n, 4).
-        constants: What the instructions of the operation ``constant`` refer to, shape (c,).
-        results: The registers of the results, shape (r,).
+        code: Operation, extra, the register to write, three operands; shape (n, 6). What extra
+            means depends on the operation; see ``native/program.h``.
+        constants: Registers that keep a value; of type ``CONSTANT``.
+        slots: Elements of observations that are stored; of type ``SLOT``.
+        calls: Loops of numpy: the capsule, the number of inputs, bytes of each input and of the
+            output.
+        rows: The rows that are loaded or stored.
+        tables: Values to look up.
+        registers: How many registers there are.
+        seen: How many arrays the slots refer to.
+        results: The registers of the results.
+        is_always_finite: Whether no result can be infinite or NaN.
     """
 
     code: npt.NDArray[np.uint16]
-    constants: npt.NDArray[np.float64]
-    results: npt.NDArray[np.uint16]
+    constants: npt.NDArray[Any]
+    slots: npt.NDArray[Any]
+    calls: tuple[tuple[Any, int, tuple[int, ...]], ...]
+    rows: tuple[Row, ...]
+    tables: tuple[npt.NDArray[Any], ...]
+    registers: int
+    seen: int
+    results: tuple[int, ...]
+    is_always_finite: bool
+
+    def loads(self, kind: str) -> bool:
+        """Whether the program loads or stores rows, or runs operations, of this kind."""
+        if kind in OPERATIONS:
+            return bool((self.code[:, 0] == OPERATIONS.index(kind)).any())
+        return any(row[0] == kind for row in self.rows)
+
+    def with_rows(self, find: Callable[[Row], npt.NDArray[Any]]) -> tuple[Any, ...]:
+        """The program as the native pool takes it, with the arrays of its rows."""
+        rows = tuple(map(find, self.rows))
+        parts = self.code.tobytes(), self.constants.tobytes(), self.slots.tobytes()
+        counts = self.registers, self.seen, self.results
+        return (*parts, self.calls, rows, self.tables, *counts)
 
 
-def is_always_finite(program: Program, result: int) -> bool:
-    """Whether a result can be neither infinite nor NaN, whatever the program loads.
-
-    The values that a program loads are finite: the pool does not step with other inputs, and an FMU
-    with other outputs has failed. So a bound of all magnitudes shows where arithmetic may overflow.
-    """
-    bounds: list[float] = []
-    for number, *operands in program.code.tolist():
-        operation = OPERATIONS[number]
-        if operation == "constant":
-            constant = abs(float(program.constants[operands[0]]))
-            bounds.append(constant if constant <= _LARGEST else math.inf)  # a NaN, too
-        elif operation in _BOUNDS:
-            a, b, c = (bounds[operand] if operand < len(bounds) else 0.0 for operand in operands)
-            bounds.append(_BOUNDS[operation](a, b, c))
-        else:
-            bounds.append(_LARGEST if operation in _LOADED else 1.0)
-    return bounds[int(program.results[result])] <= _LARGEST
-
-
-_LARGEST: Final = sys.float_info.max
-_LOADED: Final = frozenset({"output", "input", "action", "parameter", "step_count"})
-
-_BOUNDS: Final[Mapping[str, Callable[[float, float, float], float]]] = {
-    "add": lambda a, b, _: a + b,
-    "subtract": lambda a, b, _: a + b,
-    "multiply": lambda a, b, _: a * b,
-    "divide": lambda *_: math.inf,
-    "negative": lambda a, *_: a,
-    "absolute": lambda a, *_: a,
-    "square_root": lambda *_: math.inf,  # it is NaN for a negative number
-    "minimum": lambda a, b, _: max(a, b),
-    "maximum": lambda a, b, _: max(a, b),
-    "where": lambda _, b, c: max(b, c),
-}
-"""Bounds of the magnitudes of results; comparisons and logic give 0 or 1."""
-
-
-def evaluate(program: Program, batch: Readings) -> list[FloatArray]:
-    """Evaluate a program with numpy, to compare it with the hooks.
+def evaluate(
+    program: Program,
+    find: Callable[[Row], npt.NDArray[Any]],
+    actions: tuple[npt.NDArray[Any], npt.NDArray[Any]],
+    seen: tuple[npt.NDArray[Any], ...] = (),
+) -> list[npt.NDArray[Any]]:
+    """Run a program in C on M environments, outside of a step.
 
     Args:
         program: The program.
-        batch: What hooks read in a batch of M environments.
+        find: Returns the array of a row, shape (M,); the program may write to it.
+        actions: The actions and those before, environments first, shape (M, ...).
+        seen: The arrays to store observations in, environments first.
 
     Returns:
-        The results, each of shape (M,); Booleans are 0 and 1.
+        The results: done, truncated and reward, or nothing; each of shape (M,).
+
+    Raises:
+        IndexError: If an index is outside of its table.
     """
-    rows = {
-        "output": batch.values,
-        "input": batch.inputs,
-        "action": [batch.action.astype(np.float64)],
-        "parameter": list(batch.parameters.values()),
-        "step_count": [batch.step_count.astype(np.float64)],
-        "constant": [np.full(len(batch.step_count), c) for c in program.constants],
-    }
-    registers: list[FloatArray] = []
-    for number, *operands in program.code.tolist():
-        operation = OPERATIONS[number]
-        if operation in rows:
-            registers.append(np.asarray(rows[operation][operands[0]], np.float64))
-        else:
-            values = [registers[operand] for operand in operands]
-            registers.append(np.asarray(_EVALUATIONS[operation](*values), np.float64))
-    return [registers[number] for number in program.results.tolist()]
-
-
-_EVALUATIONS: Final[Mapping[str, Callable[..., Any]]] = {
-    "add": lambda a, b, _: a + b,
-    "subtract": lambda a, b, _: a - b,
-    "multiply": lambda a, b, _: a * b,
-    "divide": lambda a, b, _: a / b,
-    "negative": lambda a, *_: -a,
-    "absolute": lambda a, *_: np.abs(a),
-    "square_root": lambda a, *_: np.sqrt(a),
-    "minimum": lambda a, b, _: np.minimum(a, b),
-    "maximum": lambda a, b, _: np.maximum(a, b),
-    "less": lambda a, b, _: a < b,
-    "less_equal": lambda a, b, _: a <= b,
-    "greater": lambda a, b, _: a > b,
-    "greater_equal": lambda a, b, _: a >= b,
-    "equal": lambda a, b, _: a == b,
-    "not_equal": lambda a, b, _: a != b,
-    "and": lambda a, b, _: a * b,
-    "or": lambda a, b, _: np.maximum(a, b),
-    "not": lambda a, *_: 1.0 - a,
-    "where": lambda a, b, c: np.where(a != 0.0, b, c),
-}
+    count = len(actions[0])
+    types: tuple[Any, ...] = (np.bool_, np.bool_, np.float64)[: len(program.results)]
+    results: tuple[npt.NDArray[Any], ...] = tuple(np.zeros(count, t) for t in types)
+    first, second = (np.ascontiguousarray(part).reshape(-1) for part in actions)
+    elements = first.size // count
+    parts = program.with_rows(find)
+    if _native.evaluate(parts, count, elements, first, second, results, seen):
+        raise IndexError("a hook looks up an index outside of its table")
+    return list(results)

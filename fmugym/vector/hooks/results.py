@@ -21,6 +21,7 @@ from fmugym.task.results import given
 from fmugym.vector.infos import within
 
 __all__ = [
+    "environments_first",
     "flags",
     "info_arrays",
     "observations",
@@ -120,6 +121,9 @@ def _mismatch(hook: str, value: Any, wanted: str) -> ConfigError:
 
 def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
     """Turn the result of ``_get_observation`` into new arrays with environments first, not last."""
+    is_array = type(value) is np.ndarray and value.dtype == space.dtype
+    if is_array and value.shape == (*_shape_of(space), count):
+        return np.array(environments_first(value), order="C")
     hook = "_get_observation"
     given(value, hook)
     if isinstance(space, spaces.Dict):
@@ -134,7 +138,12 @@ def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
         if array.dtype.kind not in _NUMBERS or array.shape != (*_shape_of(space), count):
             raise _mismatch(hook, value, wanted)
         with np.errstate(over="ignore", invalid="ignore"):  # infinite is a fault, and found later
-            return np.array(np.moveaxis(array, -1, 0), space.dtype, order="C")
+            return np.array(environments_first(array), space.dtype, order="C")
+
+
+def environments_first(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """View an array with its last axis first."""
+    return array.T if array.ndim <= 2 else np.moveaxis(array, -1, 0)  # which takes 3 us
 
 
 def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:
@@ -186,7 +195,7 @@ def _info_array(name: str, value: Any, mask: MaskArray) -> Any:
         array = np.asarray(value)
         if array.ndim and array.shape[-1] != count:
             raise _mismatch("_get_info", value, wanted)
-        rows = np.moveaxis(array, -1, 0) if array.ndim else _everywhere(value, array, count)
+        rows = environments_first(array) if array.ndim else _everywhere(value, array, count)
         return within(mask, rows)
 
 

@@ -1,336 +1,434 @@
-"""Tracing: hooks that are plain arithmetic become programs for the native pool.
+"""Tracing: the hooks of a task become programs for the native pool.
 
-A hook is called with symbols instead of numbers. The symbols record what the hook computes with
-arithmetic, comparisons and a few functions of numpy. Only operations whose results are the same in
-C and in numpy to the last bit are recorded. A hook that does anything else (sines, powers,
-branches) cannot be traced, and is called on arrays.
+A hook is called with symbolic arrays instead of numbers; see ``symbols``. They record what the
+hook computes. A hook that does anything that cannot be recorded, such as a branch, cannot be
+traced, and is called on arrays.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.task.readings import Readings, reading
+from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.values import EpisodeVariables, NamedValues
-from fmugym.vector.contents import borrowed
-from fmugym.vector.hooks.program import (
-    MOST_INSTRUCTIONS,
-    OPERATIONS,
-    Program,
-    UntraceableError,
+from fmugym.vector.contents import Contents, borrowed
+from fmugym.vector.hooks.functions import numpy_of
+from fmugym.vector.hooks.graph import Graph
+from fmugym.vector.hooks.lowering import Store, compile_graph
+from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
+from fmugym.vector.hooks.symbols import (
+    LANES,
+    Symbols,
+    as_symbols,
+    lift,
+    loaded,
+    same_for_all,
+    spread,
 )
 
-__all__ = ["trace_hooks"]
+__all__ = ["SeenArray", "TracedTask", "trace_hooks"]
+
+_MOST_TABLE: Final = 4096
+"""The most elements of an attribute that hooks may look values up in."""
 
 
-class Symbol:
-    """Stands for a number that is not known yet, and records what is done with it.
+@dataclass(frozen=True)
+class SeenArray:
+    """An array of observations or infos that a program stores.
 
-    Args:
-        operation: One of ``OPERATIONS``.
-        operands: Symbols; or the index of the value to load; or the constant.
-        is_bool: Whether it stands for a Boolean.
+    Attributes:
+        path: The keys that lead to it: ``"observation"`` or ``"info"``, then names.
+        shape: The shape of one environment's part.
+        dtype: Its type.
     """
 
-    def __init__(self, operation: str, *operands: Any, is_bool: bool = False) -> None:
-        self.operation = operation
-        self.operands = operands
-        self.is_bool = is_bool
-
-    def __bool__(self) -> bool:
-        raise UntraceableError("it branches on a value")
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Symbol:
-        function = _UFUNCS.get(ufunc)
-        if function is None or method != "__call__" or kwargs:
-            raise UntraceableError(f"it uses numpy.{ufunc.__name__}")
-        return function(*map(_symbol, inputs))  # a scalar of numpy would call this method again
-
-    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Symbol:
-        if func is np.where and len(args) == 3 and not kwargs:
-            return _where(*args)
-        raise UntraceableError(f"it uses numpy.{func.__name__}")
-
-    def __add__(self, other: Any) -> Symbol:
-        return _arithmetic("add", self, other)
-
-    def __radd__(self, other: Any) -> Symbol:
-        return _arithmetic("add", other, self)
-
-    def __sub__(self, other: Any) -> Symbol:
-        return _arithmetic("subtract", self, other)
-
-    def __rsub__(self, other: Any) -> Symbol:
-        return _arithmetic("subtract", other, self)
-
-    def __mul__(self, other: Any) -> Symbol:
-        return _arithmetic("multiply", self, other)
-
-    def __rmul__(self, other: Any) -> Symbol:
-        return _arithmetic("multiply", other, self)
-
-    def __truediv__(self, other: Any) -> Symbol:
-        return _arithmetic("divide", self, other)
-
-    def __rtruediv__(self, other: Any) -> Symbol:
-        return _arithmetic("divide", other, self)
-
-    def __neg__(self) -> Symbol:
-        return _arithmetic("negative", self)
-
-    def __abs__(self) -> Symbol:
-        return _arithmetic("absolute", self)
-
-    def __lt__(self, other: Any) -> Symbol:
-        return _comparison("less", self, other)
-
-    def __le__(self, other: Any) -> Symbol:
-        return _comparison("less_equal", self, other)
-
-    def __gt__(self, other: Any) -> Symbol:
-        return _comparison("greater", self, other)
-
-    def __ge__(self, other: Any) -> Symbol:
-        return _comparison("greater_equal", self, other)
-
-    def __eq__(self, other: object) -> Symbol:  # type: ignore[override]
-        return _comparison("equal", self, other)
-
-    def __ne__(self, other: object) -> Symbol:  # type: ignore[override]
-        return _comparison("not_equal", self, other)
-
-    __hash__ = object.__hash__
-
-    def __and__(self, other: Any) -> Symbol:
-        return _logic("and", self, other)
-
-    __rand__ = __and__
-
-    def __or__(self, other: Any) -> Symbol:
-        return _logic("or", self, other)
-
-    __ror__ = __or__
-
-    def __invert__(self) -> Symbol:
-        return _logic("not", self)
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
 
 
-def _symbol(value: Any) -> Symbol:
-    """Make a symbol of a constant; only plain numbers can be traced."""
-    if (
-        isinstance(value, np.ndarray) and value.ndim == 0
-    ):  # numpy wraps scalars and symbols like this
-        value = value.item()
-    if isinstance(value, Symbol):
-        return value
-    if isinstance(value, bool | np.bool_):
-        return Symbol("constant", float(value), is_bool=True)
-    if isinstance(value, int | float | np.float64 | np.integer):
-        return Symbol("constant", float(value))
-    raise UntraceableError(f"it computes with {type(value).__name__}")
+@dataclass(frozen=True)
+class TracedTask:
+    """The programs of a task.
+
+    Attributes:
+        inputs: From the action to the inputs.
+        judgement: From the outputs to done, truncated and reward; it stores the episode variables,
+            the observation if it is not the default one, and the info.
+        seen: The arrays that the second program stores.
+        variables: The types of the episode variables by name.
+        updated: The names of the variables that ``_update`` writes.
+    """
+
+    inputs: Program
+    judgement: Program
+    seen: tuple[SeenArray, ...]
+    variables: Mapping[str, np.dtype[Any]]
+    updated: tuple[str, ...]
+
+    def loads(self, kind: str) -> bool:
+        """Whether one of the programs loads values of this kind."""
+        return self.inputs.loads(kind) or self.judgement.loads(kind)
 
 
-def _arithmetic(operation: str, *operands: Any) -> Symbol:
-    symbols = [_symbol(operand) for operand in operands]
-    if all(symbol.is_bool for symbol in symbols):
-        raise UntraceableError("it does arithmetic with Booleans alone")
-    return Symbol(operation, *symbols)
-
-
-def _comparison(operation: str, first: Any, second: Any) -> Symbol:
-    return Symbol(operation, _symbol(first), _symbol(second), is_bool=True)
-
-
-def _logic(operation: str, *operands: Any) -> Symbol:
-    symbols = [_symbol(operand) for operand in operands]
-    if not all(symbol.is_bool for symbol in symbols):
-        raise UntraceableError("it does bit arithmetic with numbers")
-    return Symbol(operation, *symbols, is_bool=True)
-
-
-def _where(condition: Any, first: Any, second: Any) -> Symbol:
-    chosen = _symbol(condition), _symbol(first), _symbol(second)
-    if not chosen[0].is_bool or chosen[1].is_bool is not chosen[2].is_bool:
-        raise UntraceableError("it chooses between values of different types")
-    return Symbol("where", *chosen, is_bool=chosen[1].is_bool)
-
-
-_UFUNCS: Final[Mapping[Any, Callable[..., Symbol]]] = {
-    np.add: operator.add,
-    np.subtract: operator.sub,
-    np.multiply: operator.mul,
-    np.true_divide: operator.truediv,
-    np.negative: operator.neg,
-    np.absolute: operator.abs,
-    np.fabs: operator.abs,
-    np.sqrt: lambda value: _arithmetic("square_root", value),
-    np.square: lambda value: _arithmetic("multiply", value, value),
-    np.minimum: lambda first, second: _arithmetic("minimum", first, second),
-    np.maximum: lambda first, second: _arithmetic("maximum", first, second),
-    np.less: operator.lt,
-    np.less_equal: operator.le,
-    np.greater: operator.gt,
-    np.greater_equal: operator.ge,
-    np.equal: operator.eq,
-    np.not_equal: operator.ne,
-    np.logical_and: operator.and_,
-    np.logical_or: operator.or_,
-    np.logical_not: operator.invert,
-    np.bitwise_and: operator.and_,
-    np.bitwise_or: operator.or_,
-    np.invert: operator.invert,
-}
-
-
-def trace_hooks(env: FMUEnv) -> tuple[Program, Program]:
+def trace_hooks(env: FMUEnv) -> TracedTask:
     """Trace the hooks of an environment.
 
     Args:
-        env: A prototype with a ``Discrete`` action space and the default observation.
-
-    Returns:
-        The program from the action to the inputs, and the program from the outputs to done,
-        truncated and reward.
+        env: A prototype whose actions make an array.
 
     Raises:
-        UntraceableError: If the hooks do what a program cannot do; the text names it.
+        UntraceableError: If the hooks do what a program cannot do; the text names the hook, the
+            line and what it does.
     """
-    _require_simple(env)
-    with borrowed(env) as contents, reading(env, _symbolic(env)):
+    if env._pool_tells:
+        raise UntraceableError("the pool tells infos of its own")
+    with borrowed(env), reading(env, Readings.of(env)):
+        return _Tracer(env).task()
+
+
+class _Tracer:
+    """Calls the hooks of one environment with symbols.
+
+    Args:
+        env: The prototype.
+    """
+
+    def __init__(self, env: FMUEnv) -> None:
+        self._env = env
+        self._graph = Graph()
+        self._contents = Contents(env)
+        self._tables = dict(_tables(env))
+        self._variables: dict[str, np.dtype[Any]] = {
+            name: np.dtype(np.float64) for name in env.variables
+        }
+
+    def task(self) -> TracedTask:
+        """Trace all hooks, again if ``_update`` gives variables other types.
+
+        From the second step on, hooks on arrays read a variable in the type that was assigned.
+        """
+        for _ in range(3):
+            before = dict(self._variables)
+            task = self._traced()
+            if self._variables == before:
+                return task
+        raise UntraceableError("_update gives a variable another type in each step")
+
+    def _traced(self) -> TracedTask:
+        inputs = self._trace_inputs()
+        self._begin(judging=True)
+        stores, updated = self._trace_update()
+        done = self._flag("_is_done")
+        stopped = self._graph.load("stopped", None, np.bool_, None)
+        results = [self._or(done, stopped)]
+        self._env.done = self._whole(results[0], np.dtype(np.bool_))
+        results.append(self._flag("_is_truncated"))
+        results.append(self._reward())
+        seen, more = self._trace_seen()
+        judgement = compile_graph(self._graph, stores + more, results, len(seen))
+        return TracedTask(inputs, judgement, tuple(seen), dict(self._variables), updated)
+
+    def _begin(self, judging: bool) -> None:
+        self._graph = Graph()
+        for name, table in self._tables.items():
+            vars(self._env)[name] = lift(self._graph, table)
+        symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
+        self._contents = Contents(self._env)
+
+    def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
+        """Call a hook, and make nodes of what it returns."""
         try:
-            programs = _traced(env)
-        except UntraceableError:
-            raise
+            with numpy_of(self._graph), np.errstate(all="ignore"):
+                value = getattr(self._env, name)()
+            changed = self._contents.changed()
+            if changed is not None:
+                raise UntraceableError(f"it changes self.{changed}")
+            return of(value)
         except Exception as error:  # hooks do with numbers what symbols cannot do
-            raise UntraceableError(f"it fails on symbols: {error}") from error
-        changed = contents.changed()
-    if changed is not None:
-        raise UntraceableError(f"a hook changes self.{changed}")
-    return programs
+            raise UntraceableError(_placed(self._env, name, error)) from error
+
+    def _nodes(self, value: Any, shape: tuple[int, ...] | None, dtype: Any) -> npt.NDArray[Any]:
+        """The nodes of a result, the environments last; one value stands for all environments."""
+        symbols = as_symbols(self._graph, value)
+        if symbols.shape[-1:] != (LANES,) and symbols.size == 1 and shape == ():
+            symbols = symbols.like(np.repeat(symbols.cells.reshape(1), LANES))
+        elif shape == () and symbols.ndim > 1 and symbols.size == LANES:
+            symbols = symbols.like(symbols.cells.reshape(LANES))
+        if shape is not None and symbols.shape != (*shape, LANES):
+            raise UntraceableError(f"a result has the shape {symbols.shape}, environments last")
+        return same_for_all(symbols if dtype is None else symbols.cast(dtype))
+
+    def _whole(self, node: int, dtype: np.dtype[Any]) -> Symbols:
+        return spread(self._graph, np.array(node), dtype)
+
+    def _or(self, node: int, other: Any) -> int:
+        flag = np.dtype(np.bool_)
+        first = self._whole(node, flag).cells[0]
+        return self._graph.apply(np.logical_or, (first, other), flag).node
+
+    # Inputs.
+
+    def _trace_inputs(self) -> Program:
+        self._begin(judging=False)
+        nodes = self._call("_get_inputs", self._input_nodes)
+        stores = [Store(int(node), ("input", index)) for index, node in enumerate(nodes)]
+        return compile_graph(self._graph, stores, [], 0)
+
+    def _input_nodes(self, value: Any) -> list[int]:
+        variables = self._env._interface.inputs
+        is_list = isinstance(value, list | tuple)
+        if not is_list:
+            array = as_symbols(self._graph, value)
+            value = array if array.ndim >= (2 if len(variables) == 1 else 1) else [array]
+        if len(value) != len(variables):
+            raise UntraceableError("the number of inputs is not that of the config")
+        nodes = [self._nodes(row, (), np.float64) for row in value]
+        return [
+            self._of_input_type(variable, int(node))
+            for variable, node in zip(variables, nodes, strict=True)
+        ]
+
+    def _of_input_type(self, variable: Any, node: int) -> int:
+        """Round a value to its input's type, as ``to_input_types`` does.
+
+        A value that is outside of the type's range becomes NaN, which no pool steps with.
+        """
+        if variable.type in {"Real", "Float64"}:
+            return node
+        value: Any = self._whole(node, np.dtype(np.float64))
+        if variable.kind == "boolean":
+            rounded: Any = np.where(value >= 0.5, 1.0, 0.0)
+            rounded = np.where(np.isfinite(value), rounded, value)
+        elif variable.kind in {"integer", "enumeration"}:
+            rounded = _rounded(variable, value)
+        else:
+            limit = float(np.finfo(np.float32).max)
+            rounded = np.where(np.absolute(value) <= limit, value, np.nan)
+        return int(same_for_all(rounded))
+
+    # What follows the FMU's step.
+
+    def _trace_update(self) -> tuple[list[Store], tuple[str, ...]]:
+        """Trace ``_update``; environments that have not stepped keep their variables."""
+        if not self._env._own.update:
+            return [], ()
+        before = dict(self._env.variables)
+        self._call("_update", lambda value: None)
+        active = self._graph.load("active", None, np.bool_, None)
+        stores, updated = [], []
+        for name, old in before.items():
+            new = self._env.variables[name]
+            if new is old:
+                continue
+            kept = self._kept_where_idle(name, new, old, active)
+            self._env.variables[name] = kept
+            updated.append(name)
+            nodes = same_for_all(kept).reshape(-1)
+            stores += [Store(int(n), ("variable", name, i)) for i, n in enumerate(nodes)]
+        return stores, tuple(updated)
+
+    def _kept_where_idle(self, name: str, new: Any, old: Symbols, active: Any) -> Symbols:
+        symbols = as_symbols(self._graph, new)
+        if symbols.shape != old.shape:
+            if symbols.size != 1:
+                raise UntraceableError(f"_update changes the shape of {name!r}")
+            symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
+        self._variables[name] = symbols.dtype
+        symbols = symbols.cast(old.dtype)
+        choose = self._graph.choose
+        cells: Any = np.empty(old.shape, object)
+        for place in np.ndindex(old.shape):
+            assigned: Any = symbols.cells[place]
+            present: Any = old.cells[place]
+            cells[place] = choose(active, assigned, present)
+        return Symbols(self._graph, cells, old.dtype, writeable=False)
+
+    def _flag(self, name: str) -> int:
+        return int(self._call(name, self._flag_node))
+
+    def _flag_node(self, value: Any) -> Any:
+        symbols = as_symbols(self._graph, value)
+        if symbols.dtype != np.bool_:
+            constants = [self._graph.value(cell) for cell in symbols.cells.reshape(-1)]
+            if any(constant not in (0, 1) or constant is None for constant in constants):
+                raise UntraceableError("a flag is no Boolean")
+        return self._nodes(symbols, (), np.bool_)
+
+    def _reward(self) -> int:
+        return int(self._call("_reward_policy", lambda value: self._nodes(value, (), np.float64)))
+
+    def _trace_seen(self) -> tuple[list[SeenArray], list[Store]]:
+        """Trace the observation unless the pool makes it, and the info if there is one."""
+        seen: list[SeenArray] = []
+        stores: list[Store] = []
+        env = self._env
+        if not env._pool_observes or env._has_info:
+            space = env.observation_space
+
+            def observe(value: Any) -> None:
+                self._see(("observation",), value, space, seen, stores)
+
+            self._call("_get_observation", observe)
+        if env._has_info:
+            self._call("_get_info", lambda value: self._see_info(("info",), value, seen, stores))
+        return seen, stores
+
+    def _see(
+        self,
+        path: tuple[str, ...],
+        value: Any,
+        space: Any,
+        seen: list[SeenArray],
+        stores: list[Store],
+    ) -> None:
+        if isinstance(space, spaces.Dict):
+            if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():
+                raise UntraceableError("the observation has other keys than its space")
+            for name in space.spaces:
+                self._see((*path, name), value[name], space[name], seen, stores)
+            return
+        nodes = self._nodes_of_seen(value, space.shape or (), space.dtype)
+        self._note_seen(path, nodes, np.dtype(space.dtype), seen, stores)
+
+    def _nodes_of_seen(self, value: Any, shape: tuple[int, ...], dtype: Any) -> npt.NDArray[Any]:
+        symbols = as_symbols(self._graph, value)
+        if symbols.shape != (*shape, LANES):
+            raise UntraceableError(f"the observation has the shape {symbols.shape}")
+        return self._nodes(symbols, shape, dtype)
+
+    def _see_info(
+        self, path: tuple[str, ...], value: Any, seen: list[SeenArray], stores: list[Store]
+    ) -> None:
+        for name, part in dict(value).items():
+            if isinstance(part, Mapping):
+                self._see_info((*path, name), part, seen, stores)
+                continue
+            symbols = as_symbols(self._graph, part)
+            if symbols.ndim == 0:
+                symbols = symbols.like(np.broadcast_to(symbols.cells, (LANES,)))
+            self._note_seen((*path, name), same_for_all(symbols), symbols.dtype, seen, stores)
+
+    def _note_seen(
+        self,
+        path: tuple[str, ...],
+        nodes: npt.NDArray[Any],
+        dtype: np.dtype[Any],
+        seen: list[SeenArray],
+        stores: list[Store],
+    ) -> None:
+        letter_of(dtype)
+        flat = nodes.reshape(-1)
+        stores += [
+            Store(int(n), None, (len(seen), place, flat.size)) for place, n in enumerate(flat)
+        ]
+        seen.append(SeenArray(path, nodes.shape, dtype))
 
 
-def _traced(symbolic: FMUEnv) -> tuple[Program, Program]:
-    inputs = _values(symbolic._get_inputs(), len(symbolic._interface.inputs))
-    symbolic.inputs = tuple(inputs)
-    done = _flag(symbolic._is_done())
-    symbolic.done = done
-    truncated = _flag(symbolic._is_truncated())
-    reward = _symbol(symbolic._reward_policy())
-    return _compile(inputs), _compile([done, truncated, reward])
+def _rounded(variable: Any, value: Any) -> Any:
+    """The nearest integer, or the nearest item of an Enumeration; NaN outside of the range."""
+    low, high = variable.integer_limits
+    largest = 2.0**53
+    rounded: Any = np.rint(value)
+    items = sorted(item for _, item in variable.items)
+    if items:
+        low, high = items[0], items[-1]
+        rounded = _nearest(items, rounded)
+    within = (rounded >= float(max(low, -largest))) & (rounded <= float(min(high, largest)))
+    return np.where(within, rounded, np.where(np.isfinite(value), np.nan, value))
 
 
-def _require_simple(env: FMUEnv) -> None:
-    space = env.observation_space
-    is_flat = isinstance(space, spaces.Box) and space.dtype == np.float32
-    obstacles = {
-        "the actions are no single integers": not isinstance(env.action_space, spaces.Discrete),
-        "the observation is not the default one": env._own.get_observation or not is_flat,
-        "it has a hook _update": env._own.update,
-        "its steps have an info": env._has_info,
-        "it is a goal task": env._own.goal_reward,
-        "it has episode variables": env.config.episode_variables,
-        "it has inputs that are not Real": not env._input_writer.all_real,
-    }
-    for obstacle, is_there in obstacles.items():
-        if is_there:
-            raise UntraceableError(obstacle)
+def _nearest(items: list[int], value: Any) -> Any:
+    """The nearest of rising items; of two that are as near, the smaller one."""
+    if items == list(range(items[0], items[-1] + 1)):
+        return value
+    inside = (value >= items[0]) & (value <= items[-1])
+    nearest: Any = np.where(inside, float(items[0]), value)
+    for before, item in pairwise(items):
+        nearest = np.where(inside & (value - before > item - value), float(item), nearest)
+    return nearest
 
 
-def _symbolic(env: FMUEnv) -> Readings:
-    """Make readings in which symbols stand for what programs can load; the rest is missing."""
-    names = list(env._interface.parameters)
-    values = tuple(Symbol("output", index) for index in range(len(env.out)))
+def _placed(env: FMUEnv, name: str, error: Exception) -> str:
+    """Say where a hook does what cannot be traced."""
+    what = str(error) if isinstance(error, UntraceableError) else f"it fails on symbols: {error}"
+    code = getattr(getattr(type(env), name), "__code__", None)
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f.lineno for f in frames if code is not None and f.filename == code.co_filename]
+    where = f", line {lines[-1]}" if lines else ""
+    return f"{name}{where}: {what}"
+
+
+def _names(shape: tuple[int, ...], *head: Any) -> npt.NDArray[Any]:
+    """The rows of an array: a name for each element."""
+    names = np.empty(shape, object)
+    for index, place in enumerate(np.ndindex(shape)):
+        names[place] = (*head, index)
+    return names
+
+
+def symbolic_readings(
+    env: FMUEnv, graph: Graph, variables: Mapping[str, np.dtype[Any]], judging: bool
+) -> Readings:
+    """Make readings in which symbols stand for what programs load.
+
+    Args:
+        env: The prototype.
+        graph: Records the operations.
+        variables: The types of the episode variables.
+        judging: Whether the FMU has stepped.
+    """
+
+    def rows(shape: tuple[int, ...], *head: Any, dtype: Any = np.float64) -> Any:
+        return loaded(graph, "row", _names(shape, *head), dtype)
+
+    values = rows((len(env.out),), "output")
+    state = values[: env._output_count]
+    names = EpisodeVariables(env.config.episode_variables)
+    for name, dtype in variables.items():
+        shape = np.shape(env.config.episode_variables[name])
+        names[name] = rows(shape, "before" if judging else "variable", name, dtype=dtype)
+    missing = np.array("it reads self.done before there is one", object)
     return Readings(
         values=values,
         out=NamedValues("output", list(env.out), lambda: values),
-        state=values[: env._output_count],
-        previous_state=_Missing(),
-        inputs=tuple(Symbol("input", index) for index in range(len(env._start_inputs))),
-        action=Symbol("action", 0),
-        previous_action=_Missing(),
-        step_count=Symbol("step_count", 0),
-        done=False,
-        after_end=False,
+        state=state,
+        previous_state=rows((len(env.out),), "kept")[: env._output_count] if judging else state,
+        inputs=rows((len(env._interface.inputs),), "input"),
+        action=_symbolic_action(env, graph, "action"),
+        previous_action=_symbolic_action(env, graph, "previous_action"),
+        step_count=rows((), "step_count", dtype=np.int64),
+        done=loaded(graph, "missing", missing, np.bool_),
+        after_end=lift(graph, np.zeros(LANES, np.bool_)),
         parameters=MappingProxyType(
-            {name: Symbol("parameter", index) for index, name in enumerate(names)}
+            {name: rows((), "parameter", name) for name in env._interface.parameters}
         ),
-        variables=EpisodeVariables({}),
+        variables=names,
     )
 
 
-class _Missing:
-    """Stands for values that programs cannot load."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise UntraceableError("it looks at the step before")
-
-    def __iter__(self) -> Any:
-        raise UntraceableError("it looks at the step before")
-
-    def __getitem__(self, index: Any) -> Any:
-        raise UntraceableError("it looks at the step before")
+def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
+    space: Any = env.action_space
+    names = np.empty(space.shape or (), object)
+    for index, place in enumerate(np.ndindex(names.shape)):
+        names[place] = index
+    return loaded(graph, kind, names, space.dtype)
 
 
-def _values(values: Any, count: int) -> list[Symbol]:
-    rows = list(values) if isinstance(values, list | tuple) else [values]
-    if len(rows) != count:
-        raise UntraceableError("the number of inputs is not that of the config")
-    return [_symbol(row) for row in rows]
-
-
-def _flag(value: Any) -> Symbol:
-    symbol = _symbol(value)
-    if not symbol.is_bool:
-        raise UntraceableError("a flag is no Boolean")
-    return symbol
-
-
-def _compile(results: Sequence[Symbol]) -> Program:
-    """Number the symbols in the order of evaluation, equal ones once."""
-    instructions: dict[tuple[int, ...], int] = {}
-    constants: dict[str, int] = {}
-    registers: dict[int, int] = {}
-    for symbol in _in_order(results):
-        operands = [
-            registers[id(o)] if isinstance(o, Symbol) else _place(o, constants)
-            for o in symbol.operands
-        ]
-        instruction = (OPERATIONS.index(symbol.operation), *operands, *[0] * (3 - len(operands)))
-        registers[id(symbol)] = instructions.setdefault(instruction, len(instructions))
-    if len(instructions) > MOST_INSTRUCTIONS:
-        raise UntraceableError(f"it has more than {MOST_INSTRUCTIONS} operations")
-    return Program(
-        np.array(list(instructions), np.uint16),
-        np.array([float.fromhex(text) for text in constants]),
-        np.array([registers[id(symbol)] for symbol in results], np.uint16),
-    )
-
-
-def _in_order(results: Sequence[Symbol]) -> list[Symbol]:
-    """All symbols that the results need, each after its operands."""
-    order: list[Symbol] = []
-    seen: set[int] = set()
-    waiting = [(symbol, False) for symbol in reversed(results)]
-    while waiting:
-        symbol, has_operands = waiting.pop()
-        if has_operands:
-            order.append(symbol)
-        elif id(symbol) not in seen:
-            seen.add(id(symbol))
-            waiting.append((symbol, True))
-            waiting.extend((o, False) for o in symbol.operands if isinstance(o, Symbol))
-    return order
-
-
-def _place(operand: float, constants: dict[str, int]) -> int:
-    """Return an index as it is, but a constant's place; 0.0 and -0.0 are two constants."""
-    if isinstance(operand, float):
-        return constants.setdefault(operand.hex(), len(constants))
-    return int(operand)
+def _tables(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """The arrays among the attributes that hooks may index with values."""
+    for name, value in vars(env).items():
+        is_table = type(value) is np.ndarray and value.dtype.kind in "biuf"
+        is_table = is_table and value.dtype.itemsize <= 8 and 0 < value.size <= _MOST_TABLE
+        if is_table and not name.startswith("_") and name not in READINGS:
+            yield name, value

@@ -1,0 +1,150 @@
+"""The comparison of programs with the hooks that they were made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.readings import Readings, reading
+from fmugym.vector.contents import borrowed
+from fmugym.vector.hooks import results
+from fmugym.vector.hooks.program import Row, UntraceableError, evaluate
+from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.views import copied
+
+__all__ = ["require_same"]
+
+
+def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
+    """Run programs in C and hooks on arrays, and compare all results to the last bit.
+
+    Args:
+        env: The environment with the hooks.
+        batch: What the hooks read: arrays of M environments, which are not changed.
+        task: The programs.
+
+    Raises:
+        UntraceableError: If a result differs. NaNs are equal, zeros of different sign are not.
+    """
+    own = copied(batch)
+    with np.errstate(all="ignore"), borrowed(env), reading(env, own):
+        comparison = _Comparison(env, task)
+        comparison.compare_inputs()
+        comparison.compare_judgement()
+
+
+class _Comparison:
+    def __init__(self, env: FMUEnv, task: TracedTask) -> None:
+        self._env, self._task = env, task
+        self._count = len(env.step_count)
+        self._stored: dict[Row, npt.NDArray[Any]] = {}
+        for name, dtype in task.variables.items():
+            row = results.variable(name, env.variables[name], self._count)
+            env.variables[name] = row.astype(dtype)
+        self._before = {name: row.copy() for name, row in env.variables.items()}
+        self._actions = (
+            np.ascontiguousarray(np.moveaxis(env.action, -1, 0)),
+            np.ascontiguousarray(np.moveaxis(env.previous_action, -1, 0)),
+        )
+
+    def _find(self, row: Row) -> npt.NDArray[Any]:
+        """The values of a row; the program stores in arrays of its own."""
+        if row not in self._stored:
+            self._stored[row] = np.ascontiguousarray(self._values(row)).copy()
+        return self._stored[row]
+
+    def _values(self, row: Row) -> Any:
+        env = self._env
+        kind, *rest = row
+        index: Any = rest[-1]
+        name: Any = rest[0]
+        match kind:
+            case "output":
+                return env._values[index]
+            case "kept":
+                return env.previous_state[index]
+            case "input":
+                return env.inputs[index]
+            case "parameter":
+                return np.asarray(env.parameters[name], np.float64)
+            case "step_count":
+                return env.step_count
+        return self._before[name].reshape(-1, self._count)[index]
+
+    def compare_inputs(self) -> None:
+        """Compare the inputs, and keep them for the hooks that follow."""
+        env = self._env
+        before, env.previous_state = env.previous_state, env.state.copy()
+        evaluate(self._task.inputs, self._find, self._actions)
+        expected = np.array(env.inputs)
+        results.write_inputs(env._get_inputs(), expected)
+        for index in range(self._count):
+            expected[:, index] = self._typed(expected[:, index])
+        for index, row in enumerate(expected):
+            _require_equal("inputs", self._find(("input", index)), row)
+        env.inputs, env.previous_state = expected, before
+        self._stored.clear()
+
+    def _typed(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        result = values.copy()
+        for index, variable in enumerate(self._env._interface.inputs):
+            one = values[index : index + 1]
+            try:
+                result[index] = fmu_spaces.to_input_types([variable], one)[0]
+            except ConfigError:
+                result[index] = np.nan
+        return result
+
+    def compare_judgement(self) -> None:
+        """Compare what follows the step of the FMU."""
+        env, count = self._env, self._count
+        seen = tuple(np.zeros((count, *a.shape), a.dtype) for a in self._task.seen)
+        judged = evaluate(self._task.judgement, self._find, self._actions, seen)
+        if env._own.update:
+            env._update()
+        self._compare_variables()
+        env.done = results.flags("_is_done", env._is_done(), count)
+        _require_equal("_is_done", judged[0], env.done)
+        truncated = results.flags("_is_truncated", env._is_truncated(), count)
+        _require_equal("_is_truncated", judged[1], truncated)
+        rewards = results.rewards(env._reward_policy(), count)
+        _require_equal("_reward_policy", judged[2], rewards)
+        self._compare_seen(seen)
+
+    def _compare_variables(self) -> None:
+        for name in self._task.updated:
+            value = results.variable(name, self._env.variables[name], self._count)
+            expected = np.broadcast_to(value, self._before[name].shape).reshape(-1, self._count)
+            for index, row in enumerate(expected):
+                _require_equal("_update", self._find(("variable", name, index)), row)
+
+    def _compare_seen(self, seen: tuple[npt.NDArray[Any], ...]) -> None:
+        env, count = self._env, self._count
+        tree: dict[str, Any] = {}
+        if any(array.path[0] == "observation" for array in self._task.seen):
+            observation = env._get_observation()
+            tree["observation"] = results.observations(observation, env.observation_space, count)
+        if env._has_info:
+            tree["info"] = results.info_arrays(env._get_info(), np.ones(count, np.bool_))
+        for array, description in zip(seen, self._task.seen, strict=True):
+            expected: Any = tree
+            for name in description.path:
+                expected = expected[name]
+            hook = "_get_observation" if description.path[0] == "observation" else "_get_info"
+            _require_equal(hook, array, expected)
+            if array.dtype != expected.dtype:
+                raise UntraceableError(f"the program of {hook} gives another type")
+
+
+def _require_equal(hook: str, value: npt.NDArray[Any], expected: npt.NDArray[Any]) -> None:
+    same = np.array_equal(value, expected, equal_nan=value.dtype.kind == "f")
+    if same and value.dtype.kind == "f":
+        numbers = ~np.isnan(value)
+        same = np.array_equal(np.signbit(value)[numbers], np.signbit(expected)[numbers])
+    if not same:
+        raise UntraceableError(f"the program gives other values than {hook}")

@@ -1,0 +1,239 @@
+"""From the graph of what hooks compute to instructions for the native pool."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Hashable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from fmugym.vector.hooks.graph import Graph, Node
+from fmugym.vector.hooks.loops import loop_of
+from fmugym.vector.hooks.program import (
+    CONSTANT,
+    MOST_REGISTERS,
+    OPERATIONS,
+    SLOT,
+    TYPES,
+    Program,
+    Row,
+    UntraceableError,
+    letter_of,
+)
+
+__all__ = ["Store", "compile_graph"]
+
+_MOST_INSTRUCTIONS: Final = 20_000
+
+_OF_FLAGS: Final[dict[Any, str]] = {
+    np.logical_and: "and",
+    np.bitwise_and: "and",
+    np.logical_or: "or",
+    np.bitwise_or: "or",
+    np.logical_xor: "xor",
+    np.bitwise_xor: "xor",
+    np.not_equal: "xor",
+    np.logical_not: "not",
+    np.invert: "not",
+}
+"""Functions of Booleans that the pool computes itself."""
+
+_NAMES: Final[dict[Any, str]] = {np.fabs: "absolute"}
+"""Other names of functions that the pool computes itself."""
+
+
+class Store(NamedTuple):
+    """A value to store: in a row, or as the element of an array of observations.
+
+    Attributes:
+        node: Its number.
+        row: The row; None for an element.
+        slot: The number of the array, the element, and the number of elements of an environment.
+    """
+
+    node: int
+    row: Row | None
+    slot: tuple[int, int, int] = (0, 0, 0)
+
+
+def compile_graph(
+    graph: Graph, stores: Sequence[Store], results: Sequence[int], seen: int
+) -> Program:
+    """Number the operations in the order of evaluation, and place their values in registers.
+
+    Args:
+        graph: The operations.
+        stores: What to store, in this order.
+        results: The nodes of the results.
+        seen: The number of arrays of observations.
+
+    Raises:
+        UntraceableError: If there are too many operations, or the pool does not have one of them.
+    """
+    compiler = _Compiler(graph)
+    for store in stores:
+        compiler.evaluate(store.node)
+        compiler.store(store)
+    for node in results:
+        compiler.evaluate(node)
+    return compiler.program(results, seen)
+
+
+class _Step(NamedTuple):
+    """An instruction before values have registers: operands are nodes."""
+
+    operation: str
+    extra: int
+    node: int | None
+    operands: tuple[int, ...]
+
+
+class _Compiler:
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        self._steps: list[_Step] = []
+        self._known: set[int] = set()
+        self._constants: list[int] = []
+        self._rows: dict[Row, int] = {}
+        self._calls: dict[Hashable, int] = {}
+        self._tables: dict[Hashable, int] = {}
+        self._slots: list[tuple[int, int, int, int]] = []
+
+    def evaluate(self, node: int) -> None:
+        """Add the instructions that a value needs."""
+        waiting = [(node, False)]
+        while waiting:
+            number, has_operands = waiting.pop()
+            if has_operands:
+                self._add(number, self._graph.nodes[number])
+            elif number not in self._known:
+                self._known.add(number)
+                operands = self._graph.nodes[number].operands
+                waiting.append((number, True))
+                waiting.extend((operand, False) for operand in reversed(operands))
+
+    def _add(self, number: int, node: Node) -> None:
+        if node.kind == "constant":
+            self._constants.append(number)
+            return
+        if node.kind == "missing":
+            raise UntraceableError(str(node.what))
+        operation, extra = self._operation(node)
+        self._steps.append(_Step(operation, extra, number, node.operands))
+        if len(self._steps) > _MOST_INSTRUCTIONS:
+            raise UntraceableError(f"it has more than {_MOST_INSTRUCTIONS} operations")
+
+    def store(self, store: Store) -> None:
+        """Add the instruction that stores a value."""
+        if store.row is not None:
+            extra = self._place(self._rows, store.row)
+            self._steps.append(_Step("store_row", extra, None, (store.node,)))
+            return
+        letter = letter_of(self._graph.nodes[store.node].dtype)
+        self._slots.append((*store.slot, TYPES.index(letter)))
+        self._steps.append(_Step("store_seen", len(self._slots) - 1, None, (store.node,)))
+
+    def _place(self, places: dict[Any, int], key: Any) -> int:
+        return places.setdefault(key, len(places))
+
+    def _operation(self, node: Node) -> tuple[str, int]:
+        """The operation and its extra."""
+        what: Any = node.what
+        match node.kind:
+            case "row":
+                return "load_row", self._place(self._rows, what)
+            case "action" | "previous_action":
+                return f"load_{node.kind}", what
+            case "active" | "stopped":
+                return f"load_{node.kind}", 0
+            case "take" | "interpolate":
+                return node.kind, self._place(self._tables, what)
+            case "where":
+                return f"where {node.dtype.itemsize}", 0
+            case "cast":
+                source, target = self._letters(node)[0], letter_of(node.dtype)
+                return "cast", TYPES.index(source) * len(TYPES) + TYPES.index(target)
+        return self._function(node, what)
+
+    def _letters(self, node: Node) -> list[str]:
+        return [letter_of(self._graph.nodes[operand].dtype) for operand in node.operands]
+
+    def _function(self, node: Node, ufunc: np.ufunc) -> tuple[str, int]:
+        letters = self._letters(node)
+        if set(letters) == {"?"} and ufunc in _OF_FLAGS:
+            return _OF_FLAGS[ufunc], 0
+        name = f"{_NAMES.get(ufunc, ufunc.__name__)} {letters[0]}"
+        if len(set(letters)) == 1 and name in OPERATIONS:
+            return name, 0
+        if len(letters) > 3:
+            raise UntraceableError(f"numpy.{ufunc.__name__} has more than three arguments")
+        types = (*(self._graph.nodes[operand].dtype for operand in node.operands), node.dtype)
+        loop_of(ufunc, types)
+        constant = tuple(self._graph.nodes[operand].kind == "constant" for operand in node.operands)
+        return "call", self._place(self._calls, (ufunc, types, constant))
+
+    def program(self, results: Sequence[int], seen: int) -> Program:
+        """Place all values in registers."""
+        registers = self._registers(results)
+        code = np.zeros((len(self._steps), 6), np.uint16)
+        for line, step in zip(code, self._steps, strict=True):
+            line[:2] = OPERATIONS.index(step.operation), step.extra
+            line[2] = 0 if step.node is None else registers[step.node]
+            operands = [registers[operand] for operand in step.operands]
+            line[3 : 3 + len(operands)] = operands
+        return Program(
+            code,
+            self._constants_in(registers),
+            np.array(self._slots, SLOT),
+            tuple(_call(*call) for call in self._calls),  # type: ignore[misc]
+            tuple(self._rows),
+            tuple(self._graph.tables[key] for key in self._tables),
+            max(registers.values(), default=-1) + 1,
+            seen,
+            tuple(registers[node] for node in results),
+            all(map(self._graph.is_always_finite, results)),
+        )
+
+    def _registers(self, results: Sequence[int]) -> dict[int, int]:
+        """Give each value a register until its last use; constants keep theirs."""
+        last = {operand: i for i, step in enumerate(self._steps) for operand in step.operands}
+        last.update(dict.fromkeys(results, len(self._steps)))
+        registers = {node: index for index, node in enumerate(self._constants)}
+        free: list[int] = []
+        count = len(registers)
+        for index, step in enumerate(self._steps):
+            if step.node is not None:
+                if not free:
+                    free, count = [count], count + 1
+                registers[step.node] = free.pop()
+                if step.node not in last:  # nobody reads it
+                    free.append(registers[step.node])
+            for operand in set(step.operands):
+                if last[operand] == index and operand not in self._constants:
+                    free.append(registers[operand])
+        if count > MOST_REGISTERS:
+            raise UntraceableError(f"it needs more than {MOST_REGISTERS} values at a time")
+        return registers
+
+    def _constants_in(self, registers: dict[int, int]) -> Any:
+        constants = np.zeros(len(self._constants), CONSTANT)
+        for place, number in zip(constants, self._constants, strict=True):
+            bits: Any = self._graph.nodes[number].what
+            place["bits"] = int.from_bytes(bits.ljust(8, b"\0"), "little")
+            place["to"], place["size"] = registers[number], len(bits)
+        if sys.byteorder == "little":
+            return constants
+        raise UntraceableError("this processor stores numbers in another order")
+
+
+def _call(
+    ufunc: np.ufunc, types: tuple[np.dtype[Any], ...], constant: tuple[bool, ...]
+) -> tuple[Any, int, tuple[int, ...]]:
+    """A loop and its strides. Constants have none, as numbers in hooks on arrays.
+
+    Loops may do something else then: ``numpy.power`` squares if the exponent is 2.
+    """
+    inputs = [0 if same else t.itemsize for t, same in zip(types, constant, strict=False)]
+    padded = [*inputs, types[-1].itemsize, 0, 0, 0][:4]
+    return loop_of(ufunc, types), len(inputs), tuple(padded)

@@ -1,0 +1,329 @@
+"""Symbolic arrays: hooks compute with them, and a graph records what they compute.
+
+A symbolic array is an array of numpy whose elements are cells of a graph. The environments lie on
+an axis of ``LANES`` places, as those of a batch do. numpy's operators and functions arrive at
+``__array_ufunc__`` and ``__array_function__``. The memory of the array itself has a shape that
+fits nothing, so that code that does not ask these methods fails instead of reading it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.vector.hooks.graph import Cell, Graph
+from fmugym.vector.hooks.program import UntraceableError, letter_of
+
+__all__ = [
+    "LANES",
+    "Symbols",
+    "as_symbols",
+    "each",
+    "handlers",
+    "has_symbols",
+    "lift",
+    "loaded",
+    "same_for_all",
+    "spread",
+]
+
+LANES: Final = 5
+"""How many environments a trace has. Two would show whether they are mixed."""
+
+NOWHERE: Final = 1_000_003
+"""A length that no array has."""
+
+_MOST_ELEMENTS: Final = 20_000
+
+_KEPT: Final = frozenset(
+    {"__array_finalize__", "__array_priority__", "__class__", "__new__", "__init__", "__dir__"}
+    | {"__doc__", "__getattribute__", "__setattr__", "__delattr__", "__hash__", "__repr__"}
+    | {"__str__", "__init_subclass__", "__subclasshook__", "__sizeof__", "__class_getitem__"}
+    | {"__format__", "__array_wrap__", "__array_interface__", "__array_struct__", "__getstate__"}
+    | {"__abs__", "__add__", "__and__", "__divmod__", "__eq__", "__floordiv__", "__ge__"}
+    | {"__gt__", "__iadd__", "__iand__", "__ifloordiv__", "__imod__", "__imul__", "__invert__"}
+    | {"__ior__", "__ipow__", "__isub__", "__itruediv__", "__ixor__", "__le__", "__lshift__"}
+    | {"__lt__", "__mod__", "__mul__", "__ne__", "__neg__", "__or__", "__pos__", "__pow__"}
+    | {"__radd__", "__rand__", "__rdivmod__", "__rfloordiv__", "__rlshift__", "__rmod__"}
+    | {"__rmul__", "__ror__", "__rpow__", "__rrshift__", "__rshift__", "__rsub__", "__rtruediv__"}
+    | {"__rxor__", "__sub__", "__truediv__", "__xor__", "__matmul__", "__rmatmul__", "dtype"}
+    | {"sum", "prod", "min", "max", "any", "all", "clip", "mean", "var", "std", "astype", "cumsum"}
+    | {"cumprod", "conj", "conjugate", "itemsize"}
+)
+"""What of ``numpy.ndarray`` works here, because it ends in one of the three methods of numpy."""
+
+
+handlers: Final[dict[str, Callable[..., Any]]] = {}
+"""What does the work of numpy's functions, by the kind of request; from the module functions."""
+
+
+_memory_shape: Any = vars(np.ndarray)["shape"].__get__
+
+
+class Symbols(np.ndarray[Any, Any]):
+    """An array of values that are not known yet.
+
+    Args:
+        graph: Records the operations.
+        cells: The elements, an array of objects.
+        dtype: Their type.
+        writeable: Whether hooks may assign to elements.
+    """
+
+    _cells: npt.NDArray[Any] | None
+    _graph: Graph
+    _writeable: bool
+
+    def __new__(
+        cls, graph: Graph, cells: npt.NDArray[Any], dtype: npt.DTypeLike, writeable: bool = True
+    ) -> Symbols:
+        """Make an array whose own memory is not used."""
+        if cells.size > _MOST_ELEMENTS:
+            raise UntraceableError("it computes with a large array")
+        symbols = super().__new__(cls, (0, NOWHERE), dtype)
+        symbols._graph, symbols._cells, symbols._writeable = graph, cells, writeable
+        return symbols
+
+    def __array_finalize__(self, parent: Any) -> None:
+        """Take over the values if numpy makes a copy, perhaps of another type."""
+        self._cells = None
+        if not isinstance(parent, Symbols) or parent._cells is None:
+            return
+        if _memory_shape(self) != (0, NOWHERE):
+            return
+        self._graph, self._writeable = parent._graph, True
+        self._cells = each(lambda cell: self._graph.cast(cell, self.dtype), parent._cells)
+
+    @property
+    def cells(self) -> npt.NDArray[Any]:
+        """The elements, an array of objects."""
+        if self._cells is None:
+            raise UntraceableError("it rearranges an array in a way that cannot be followed")
+        return self._cells
+
+    @property
+    def graph(self) -> Graph:
+        """The graph that records the operations."""
+        return self._graph
+
+    def cast(self, dtype: npt.DTypeLike) -> Symbols:
+        """The values in another type."""
+        wanted = np.dtype(dtype)
+        return self.like(each(lambda cell: self._graph.cast(cell, wanted), self.cells), wanted)
+
+    def like(self, cells: Any, dtype: npt.DTypeLike | None = None) -> Symbols:
+        """An array with other cells of the same graph."""
+        array = cells
+        if not isinstance(cells, np.ndarray):
+            array = np.empty((), object)
+            array[()] = cells
+        return Symbols(self._graph, array, self.dtype if dtype is None else dtype, self._writeable)
+
+    # What numpy asks.
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **keywords: Any) -> Any:
+        return handlers["ufunc"](self._graph, ufunc, method, inputs, keywords)
+
+    def __array_function__(self, function: Any, types: Any, args: Any, keywords: Any) -> Any:
+        return handlers["function"](function, args, keywords)
+
+    # What an array has; more is below.
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, key: Any) -> Any:
+        if has_symbols(key):
+            return handlers["index"](self, key)
+        return self.like(self.cells[key])
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if not self._writeable:
+            raise UntraceableError("it changes an array in place that it may only read")
+        new = as_symbols(self._graph, value).cast(self.dtype)
+        if not has_symbols(key):
+            self.cells[key] = new.cells if new.ndim else new.cells[()]
+            return
+        if new.size != 1 or not isinstance(key, Symbols) or key.dtype != np.bool_:
+            raise UntraceableError("it assigns to elements that a value selects")
+        chosen: Any = np.where(key, new.reshape(()), self)
+        self.cells[...] = chosen.cells
+
+    def _copy(self, *_: Any, **__: Any) -> Symbols:
+        return Symbols(self._graph, self.cells.copy(), self.dtype)
+
+    def _take(self, indices: Any, axis: Any = None, **_: Any) -> Any:
+        return np.take(self, indices, axis)
+
+    def _round(self, decimals: int = 0, out: Any = None) -> Any:
+        if self.dtype.kind in "iub" or out is not None:
+            raise UntraceableError("it rounds integers")
+        if decimals == 0:
+            return np.rint(self)
+        factor = 10.0 ** abs(decimals)
+        if decimals < 0:
+            return np.rint(self / factor) * factor
+        return np.rint(self * factor) / factor
+
+    def _item(self, *_: Any) -> Any:
+        raise UntraceableError("it turns a value into a number of Python")
+
+    def __bool__(self) -> bool:
+        raise UntraceableError("it branches on a value")
+
+    def __deepcopy__(self, memo: Any) -> Symbols:
+        return self._copy()
+
+    __float__ = __int__ = __index__ = __complex__ = _item
+    __hash__ = None
+
+
+def _refusing(name: str) -> Any:
+    def refuse(self: Any, *_: Any, **__: Any) -> Any:
+        raise UntraceableError(f"it uses the attribute {name} of an array")
+
+    return refuse
+
+
+def _of_cells(name: str) -> property:
+    return property(lambda self: getattr(self.cells, name))
+
+
+def _moving(name: str) -> Callable[..., Symbols]:
+    return lambda self, *args, **keywords: self.like(getattr(self.cells, name)(*args, **keywords))
+
+
+_METHODS: Final[Mapping[str, Any]] = {
+    **{name: _of_cells(name) for name in ("shape", "ndim", "size")},
+    **{name: _moving(name) for name in ("reshape", "ravel", "flatten", "transpose", "repeat")},
+    **{name: _moving(name) for name in ("swapaxes", "squeeze")},
+    "T": property(lambda self: self.like(self.cells.T)),
+    "real": property(lambda self: self),
+    "copy": Symbols._copy,
+    "__copy__": Symbols._copy,
+    "take": Symbols._take,
+    "round": Symbols._round,
+    "item": Symbols._item,
+    "tolist": Symbols._item,
+}
+"""Methods and properties of arrays that only move elements, or that symbols have of their own."""
+
+for _name in dir(np.ndarray):
+    if _name in _METHODS:
+        setattr(Symbols, _name, _METHODS[_name])
+    elif _name not in _KEPT and _name not in vars(Symbols):
+        is_method = callable(getattr(np.ndarray, _name))
+        setattr(Symbols, _name, _refusing(_name) if is_method else property(_refusing(_name)))
+
+
+def each(function: Callable[..., Cell], *cells: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Apply a function element by element to arrays of cells, which are broadcast."""
+    arrays = np.broadcast_arrays(*cells) if len(cells) > 1 else cells
+    result = np.empty(arrays[0].shape, object)
+    flat = result.reshape(-1)
+    for index, elements in enumerate(zip(*(a.reshape(-1) for a in arrays), strict=True)):
+        flat[index] = function(*elements)
+    return result
+
+
+def has_symbols(value: Any) -> bool:
+    """Whether a value is symbols, or a list that holds some."""
+    if isinstance(value, list | tuple):
+        return any(map(has_symbols, value))
+    return isinstance(value, Symbols)
+
+
+def as_symbols(graph: Graph, value: Any) -> Symbols:
+    """Make symbols of numbers, arrays of numbers, and lists of them.
+
+    Raises:
+        UntraceableError: If it is anything else.
+    """
+    if isinstance(value, Symbols):
+        return value
+    if isinstance(value, list | tuple) and has_symbols(value):
+        parts = [as_symbols(graph, part) for part in value]
+        if len({part.shape for part in parts}) > 1:
+            raise UntraceableError("it makes an array of parts of different shapes")
+        dtype = parts[0].dtype
+        for part in parts[1:]:
+            dtype = np.promote_types(dtype, part.dtype)
+        cells = [part.cast(dtype).cells for part in parts]
+        return Symbols(graph, np.stack(cells), dtype)
+    return lift(graph, np.asarray(value))
+
+
+def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
+    """Make symbols of the constants in an array."""
+    if isinstance(array, Symbols):
+        return array
+    if NOWHERE in array.shape:
+        raise UntraceableError(
+            "it gives values to a function of numpy that cannot be followed. To index a table, use "
+            "numpy.take(table, index)"
+        )
+    if array.dtype.kind not in "biuf":
+        raise UntraceableError(f"it computes with {array.dtype}")
+    letter_of(array.dtype)
+    if array.size > _MOST_ELEMENTS:
+        raise UntraceableError("it computes with a large array")
+    cells = np.empty(array.shape, object)
+    flat = cells.reshape(-1)
+    for index, value in enumerate(array.reshape(-1)):
+        flat[index] = graph.constant(value, array.dtype)
+    return Symbols(graph, cells, array.dtype)
+
+
+def loaded(graph: Graph, kind: str, names: npt.NDArray[Any], dtype: npt.DTypeLike) -> Symbols:
+    """Symbols for values that a program loads, the environments on the last axis.
+
+    Args:
+        graph: Records the operations.
+        kind: The kind of node.
+        names: What each element is, an array of objects.
+        dtype: Their type.
+    """
+    cells = np.empty((*names.shape, LANES), object)
+    for place in np.ndindex(names.shape):
+        for lane in range(LANES):
+            what: Any = names[place]
+            cells[(*place, lane)] = graph.load(kind, what, dtype, lane)
+    return Symbols(graph, cells, dtype, writeable=False)
+
+
+def spread(graph: Graph, nodes: npt.NDArray[Any], dtype: np.dtype[Any]) -> Symbols:
+    """Symbols of nodes, the environments on the last axis."""
+    cells = np.empty((*nodes.shape, LANES), object)
+    for place in np.ndindex(nodes.shape):
+        for lane in range(LANES):
+            cells[(*place, lane)] = Cell(int(nodes[place]), lane)
+    return Symbols(graph, cells, dtype)
+
+
+def same_for_all(symbols: Symbols) -> npt.NDArray[Any]:
+    """The nodes of an array that has the environments on its last axis.
+
+    Returns:
+        Their numbers, an array of the shape without that axis.
+
+    Raises:
+        UntraceableError: If environments differ in more than their values.
+    """
+    cells = symbols.cells
+    if cells.shape[-1:] != (LANES,):
+        raise UntraceableError(f"a result has the shape {cells.shape}, environments last")
+    nodes = np.empty(cells.shape[:-1], np.int64)
+    for place in np.ndindex(nodes.shape):
+        row = cells[place]
+        if len({cell.node for cell in row}) > 1 or any(
+            cell.lane not in (None, lane) for lane, cell in enumerate(row)
+        ):
+            raise UntraceableError("it treats environments differently")
+        nodes[place] = row[0].node
+    return nodes

@@ -1,0 +1,38 @@
+/* Programs as Python hands them over: see fmugym/vector/hooks/program.py. */
+
+#ifndef FMUGYM_PROGRAMS_H
+#define FMUGYM_PROGRAMS_H
+
+#include "python.h"
+
+enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
+
+/* A program, and references to everything that it uses. */
+typedef struct {
+    Program program;
+    PyObject *parts;
+    Py_buffer *buffers;
+    size_t number_of_buffers;
+    Called *calls;
+    Row *rows;
+    Table *tables;
+    Py_ssize_t seen_bytes[MOST_SEEN]; /* the size of each array of observations */
+} PyProgram;
+
+/* Takes a program for count instances. Returns false with an exception if it is not sound; it
+ * must be released in any case. */
+bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *program);
+void release_program(PyProgram *program);
+
+/* Takes the arrays that a program stores observations in. There is room for MOST_SEEN. */
+bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen);
+
+/* Takes a vector with any type of numbers. */
+bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char *name,
+                  Py_ssize_t length);
+
+/* Functions of the module */
+PyObject *py_evaluate(PyObject *module, PyObject *args);
+PyObject *py_is_free_loop(PyObject *module, PyObject *capsule);
+
+#endif
