@@ -19,6 +19,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
+from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks import results
@@ -410,16 +411,7 @@ class _Layout:
             for parent in parents:
                 place = place.setdefault(parent, {})
             place[name] = array
-        return tree["observation"], _masked(tree["info"], num_envs)
-
-
-def _masked(infos: Mapping[str, Any], count: int) -> dict[str, Any]:
-    """Infos of all environments, with their masks."""
-    values = {
-        name: _masked(value, count) if type(value) is dict else value
-        for name, value in infos.items()
-    }
-    return values | {f"_{name}": np.ones(count, np.bool_) for name in values}
+        return tree["observation"], with_masks(tree["info"], np.ones(num_envs, np.bool_))
 
 
 def _infos_at_ends(
@@ -434,5 +426,4 @@ def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[s
 
 
 def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    named = dict(zip(names, np.where(mask, drawn, 0.0), strict=True))
-    return named | {f"_{name}": mask.copy() for name in named}
+    return coded(dict(zip(names, drawn, strict=True)), mask)
