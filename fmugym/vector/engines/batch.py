@@ -255,7 +255,8 @@ class BatchEngine(Engine):
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
             self._note_foreign(indices, not default)
-        self._place(plan.constant_variables, plan.constant_variables.values(), indices)
+        starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
+        self._place(plan.constant_variables, starts, indices)
         constant = plan.constant_parameters.keys() - plan.told.keys()
         given = {name: self._given[name][indices] for name in self._given if name in constant}
         self._place(given, given.values(), indices)
