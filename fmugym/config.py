@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import (
@@ -67,8 +70,9 @@ class EnvConfig:
             ``time_step``, with the inputs at their start values.
         monitor_names: Variables that are read along with the outputs; they are in ``out`` but not
             in ``state``.
-        episode_variables: Values of the task itself by name (targets, integrals): numbers, or
-            distributions drawn at each reset. ``_update`` may write them.
+        episode_variables: Values of the task itself by name (targets, integrals, histories):
+            numbers, arrays of numbers, or distributions drawn at each reset. ``_update`` may write
+            them; it assigns new arrays.
         bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
         fault_retries: How often a step that the FMU discards is repeated, as 2, 4, 8 ... smaller
@@ -240,12 +244,26 @@ def _listed(value: Any) -> list[Any] | None:
 
 
 def _variable(name: str, value: Any) -> Any:
-    """Return an episode variable as a float or a distribution of floats."""
+    """Return an episode variable as a float, a distribution of floats or an array of floats."""
     what = f"episode variable {name!r}"
+    if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
+        return _variable_array(what, value)
     value = as_distribution(what, value)
     if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
         raise ConfigError(f"{what} must be a number, got {shown(value)}")
     return value if is_distribution(value) else check_number(what, value)
+
+
+def _variable_array(what: str, value: Any) -> npt.NDArray[np.float64]:
+    """Return an array that cannot be changed, because all episodes start with it."""
+    try:
+        array = np.array(value, np.float64)
+    except Exception:  # lists that make no array, or objects that are no numbers
+        raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}") from None
+    if not array.size or not np.isfinite(array).all():
+        raise ConfigError(f"{what} must be an array of finite numbers, got {shown(value)}")
+    array.setflags(write=False)
+    return array
 
 
 def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:

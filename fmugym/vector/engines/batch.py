@@ -255,7 +255,9 @@ class BatchEngine(Engine):
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
             self._note_foreign(indices, not default)
-        self._place(plan.constant_variables, plan.constant_variables.values(), indices)
+        if plan.constant_variables:
+            starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
+            self._place(plan.constant_variables, starts, indices)
         if self._given:
             self._place_given(indices, plan)
         if default:
