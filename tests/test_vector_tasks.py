@@ -322,3 +322,32 @@ def test_faults_of_hooks_that_are_left():
         envs.close()
     assert results[0] == results[1]
     assert "_reward_policy returned inf" in results[0][2][1]
+
+
+@each_mode
+def test_failures_of_the_fmu_are_those_on_arrays(mode):
+    """Variables, actions and states of the step before stay what they are on arrays."""
+
+    class Failing(Tracking):
+        def _get_inputs(self):
+            return [np.where(self.action[0] > 0.8, np.float64(1e308), 0.01 * self.previous_action[1])]
+
+        def _get_info(self):
+            return {"integral": self.variables["integral"], "before": self.previous_state[0]}
+
+    assert require_same(Failing, num_envs=50, steps=30, mode=mode) > 50
+
+
+def test_results_do_not_depend_on_threads():
+    one, other = (
+        FMUVectorEnv(Tracking, 3000, hooks=hooks, threads=threads)
+        for hooks, threads in (("compiled", 2), ("array", 1))
+    )
+    np.testing.assert_array_equal(one.reset(seed=0)[0], other.reset(seed=0)[0])
+    one.action_space.seed(0)
+    for _ in range(12):
+        actions = one.action_space.sample()
+        for a, b in zip(one.step(actions)[:4], other.step(actions)[:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+    one.close()
+    other.close()
