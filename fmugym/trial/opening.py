@@ -110,6 +110,7 @@ def _open(
             native=plan.native,
             workers=plan.workers,
             threads=plan.threads,
+            own_files=plan.own_files,
             call_timeout=call_timeout,
         )
         pool.attend(Attendant.of(fmu.path.name, spec, log))
@@ -146,6 +147,7 @@ class _Plan:
     isolation: str | None = None
     workers: int | None = None
     one_initialization: bool = False
+    own_files: bool = False
 
     @property
     def method(self) -> ResetMethod:
@@ -190,7 +192,8 @@ class _Plan:
             plan, what = self, "isolation='none' keeps them in one process all the same"
         elif neighbours is not Neighbours.ONE_THREAD:
             workers = self.workers or num_instances
-            plan, what = replace(self, isolation="process", workers=workers), "each gets a process"
+            plan = replace(self, isolation="process", workers=workers, own_files=True)
+            what = "each gets a process with a copy of the FMU's files"
         asked_for = self.isolation == "process"
         level = logging.INFO if asked_for else logging.WARNING
         log.log(level, "the instances of %s disturb each other: %s", fmu.path.name, what)

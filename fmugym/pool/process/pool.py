@@ -57,6 +57,8 @@ class ProcessPool(AttendedPool):
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
+        own_files: Whether each worker has a copy of the FMU's files, which is also its working
+            directory.
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
@@ -80,6 +82,7 @@ class ProcessPool(AttendedPool):
         native: bool = True,
         workers: int | None = None,
         threads: int | None = None,
+        own_files: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
     ) -> None:
         self.num_instances = num_instances
@@ -99,7 +102,8 @@ class ProcessPool(AttendedPool):
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
-        setups = _share_out(replace(setup, native=native, threads=threads), self.workers)
+        setup = replace(setup, native=native, threads=threads, own_files=own_files)
+        setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
 
