@@ -15,6 +15,7 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import (
     check_count,
+    check_flag,
     check_mapping,
     check_number,
     check_option,
@@ -82,6 +83,8 @@ class EnvConfig:
             freed and made anew. None for no limit.
         reset_method: How episodes begin: ``"restore"``, ``"reset"``, ``"instance"``, ``"library"``
             or ``"process"``; by default the fastest one that a trial has found to be right.
+        rehearsals: Whether a spare instance plays an episode again now and then, to see whether
+            episodes still begin as they should.
         archive_limits: How large an FMU may be, an ``ArchiveLimits`` or a dict of its arguments; by
             default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's; a relative path is relative to the
@@ -124,6 +127,7 @@ class EnvConfig:
     fault_reward: float = 0.0
     leak_limit: int | None = DEFAULT_LEAK_LIMIT
     reset_method: str | None = None
+    rehearsals: bool = True
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
@@ -169,6 +173,7 @@ class EnvConfig:
         self._set("on_fault", check_option("on_fault policy", self.on_fault, ON_FAULT))
         if self.isolation is not None:
             self._set("isolation", check_option("isolation", self.isolation, ISOLATIONS))
+        self._set("rehearsals", check_flag("rehearsals", self.rehearsals))
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))
             self._set("reset_method", check_option("reset method", self.reset_method, methods))
