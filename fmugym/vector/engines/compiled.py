@@ -337,8 +337,7 @@ class CompiledEngine(BatchEngine):
     ) -> StepResult:
         """Add what the pool does not do itself; that is nothing for most tasks."""
         if self._layout.has_own:
-            observations, infos = self._layout.divided(result.observations, self._n)
-            result = result._replace(observations=observations, infos=infos | result.infos)
+            result = self._layout.completed(result)
         if self._left:
             result = self._with_hooks_left(result, resetting)
         if troubled or self._left:
@@ -456,10 +455,11 @@ class _Layout:
         """New arrays for a step."""
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
 
-    def divided(self, arrays: Any, num_envs: int) -> tuple[Any, dict[str, Any]]:
-        """The observations and the infos."""
+    def completed(self, result: StepResult) -> StepResult:
+        """The result with observations and infos made of the arrays of a step."""
+        arrays, infos = result.observations, result.infos
         if self._is_plain:
-            return arrays[0], {}
+            return _with(result, arrays[0], infos)
         tree: dict[str, Any] = {"observation": {}, "info": {}}
         for path, array in zip(self._paths, arrays, strict=True):
             *parents, name = path
@@ -467,7 +467,15 @@ class _Layout:
             for parent in parents:
                 place = place.setdefault(parent, {})
             place[name] = array
-        return tree["observation"], with_masks(tree["info"], np.ones(num_envs, np.bool_))
+        if tree["info"]:
+            infos = with_masks(tree["info"], np.ones(len(result.rewards), np.bool_)) | infos
+        return _with(result, tree["observation"], infos)
+
+
+def _with(result: StepResult, observations: Any, infos: dict[str, Any]) -> StepResult:
+    judged = result.rewards, result.terminated, result.truncated
+    replaced: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
+    return replaced
 
 
 def _infos_at_ends(
