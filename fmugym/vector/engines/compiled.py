@@ -26,7 +26,7 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
-from fmugym.vector.infos import final_infos, rows_as_objects
+from fmugym.vector.infos import final_infos, observations_of, restricted, rows_as_objects
 from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -250,19 +250,32 @@ class CompiledEngine(BatchEngine):
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        if options or self._any_foreign or not self._prepared or self._layout.has_own:
+        if options or self._any_foreign or not self._prepared:
             return super().reset(mask, seeds, options)
         self.has_moved = False
         if seeds is not None:
             self._streams.seed(seeds, np.flatnonzero(mask))
         self._streams.require_seeds()
-        observations, drawn = np.empty(self._shape, _FLOAT32), self._draw_ahead(mask)
+        seen, drawn = self._new_seen(), self._draw_ahead(mask)
         self.has_moved = True
-        if self._start(mask, observations, drawn):
+        troubled = self._start(mask, seen, drawn)
+        observations, infos = self._divided(seen)
+        if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
             self._require_finite_start(observations, mask)
         self.any_ended = bool(np.count_nonzero(self.ended))
-        return observations, _start_infos(self._names, drawn, mask)
+        infos = restricted(infos, mask) if infos else infos
+        return observations, infos | _start_infos(self._names, drawn, mask)
+
+    def _new_seen(self) -> Any:
+        """New arrays for what hooks or the pool make of a step: observations and infos."""
+        layout = self._layout
+        return layout.new_arrays() if layout.has_own else np.empty(self._shape, _FLOAT32)
+
+    def _divided(self, seen: Any) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos in these arrays."""
+        layout = self._layout
+        return layout.divided(seen, self._n) if layout.has_own else (seen, {})
 
     def _draw_ahead(self, mask: MaskArray | None) -> FloatArray:
         """Make the array of drawn values; those of episodes that only Python can draw are in it."""
@@ -289,8 +302,7 @@ class CompiledEngine(BatchEngine):
         if self._any_foreign or not self._prepared:
             return self._step_on_arrays(actions, resetting)
         self._longest = self._limit  # this path does not count steps
-        layout = self._layout
-        seen: Any = layout.new_arrays() if layout.has_own else np.empty(self._shape, _FLOAT32)
+        seen = self._new_seen()
         rewards = np.empty(self._n)
         terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         judged = rewards, terminated, truncated
@@ -298,8 +310,8 @@ class CompiledEngine(BatchEngine):
         if resetting is not None and self._draws_ahead:
             actions = self._flat(actions)  # a refused step draws nothing
         drawn, last, started = self._draw_ahead(resetting), None, None
-        if self.starts_at_ends and not self._draws_ahead and not layout.has_own:
-            last, started = np.empty(self._shape, _FLOAT32), np.empty(self._n, _BOOL)
+        if self.starts_at_ends and not self._draws_ahead:
+            last, started = self._new_seen(), np.empty(self._n, _BOOL)
         play = self._play if resetting is started is None else self._play_with_resets
         self.has_moved = True
         try:
@@ -311,18 +323,25 @@ class CompiledEngine(BatchEngine):
             self.has_moved = True
             troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
         self.any_ended = ended > begun
-        infos: dict[str, Any] = {}
-        observations = seen
-        if layout.has_own:
-            observations, infos = layout.divided(seen, self._n)
+        observations, infos = self._divided(seen)
         if resetting is not None:
             infos |= _start_infos(self._names, drawn, resetting)
         elif begun:
-            infos = LateDict.of(_infos_at_ends, self._names, drawn, last, started)
+            infos = LateDict.of(self._infos_at_ends, infos, drawn, last, started)
         result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
         if troubled:
             self._mend(result, resetting if started is None else started)
         return result
+
+    def _infos_at_ends(
+        self, infos: dict[str, Any], drawn: FloatArray, last: Any, started: MaskArray
+    ) -> dict[str, Any]:
+        """The infos of a step in which episodes have followed others."""
+        observations, last_infos = self._divided(last)
+        is_array = isinstance(observations, np.ndarray)
+        objects = (rows_as_objects if is_array else observations_of)(observations, started)
+        final = final_infos(objects, restricted(last_infos, started), started)
+        return infos | _start_infos(self._names, drawn, started) | final
 
     def _flat(self, actions: Any) -> npt.NDArray[Any]:
         """The actions as the pool takes them, environments first.
@@ -420,13 +439,6 @@ def _masked(infos: Mapping[str, Any], count: int) -> dict[str, Any]:
         for name, value in infos.items()
     }
     return values | {f"_{name}": np.ones(count, np.bool_) for name in values}
-
-
-def _infos_at_ends(
-    names: list[str], drawn: FloatArray, last: npt.NDArray[Any], started: MaskArray
-) -> dict[str, Any]:
-    infos = _start_infos(names, drawn, started)
-    return infos | final_infos(rows_as_objects(last, started), {}, started)
 
 
 def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
