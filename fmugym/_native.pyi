@@ -158,6 +158,10 @@ class Arrays(TypedDict):
     observations: Array
     health: Array
 
+Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
+"""An episode: types and references of the start variables, start values, first outputs, and rows of
+inputs, of outputs and of statuses."""
+
 class Episodes(TypedDict):
     """See ``NativePool.prepare_play``."""
 
@@ -190,6 +194,7 @@ class Pool:
         count: int,
         threads: int,
         callback: Callable[[int, int, str, str], object],
+        listener: Callable[[Recording], object] | None,
     ) -> Pool: ...
     def step_own(self) -> int:
         """Step all with the pool's own inputs; writes the pool's own observations.
@@ -284,6 +289,17 @@ class Pool:
 
     def count_steps(self) -> None:
         """Let ``health`` have all steps until now, which it otherwise gets at resets."""
+
+    def record(self, resets: int, steps: int, /) -> None:
+        """Record an episode of the first instance, and pass it to ``listener``.
+
+        Args:
+            resets: How many more resets of this instance come first.
+            steps: How many steps it has to do in all before.
+        """
+
+    def begin_by(self, restores: bool, rebuilds: bool, /) -> None:
+        """Change how episodes begin; states that were not restored before cannot be restored."""
 
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""

@@ -8,10 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import (
     check_count,
+    check_flag,
     check_mapping,
     check_number,
     check_option,
@@ -67,8 +71,9 @@ class EnvConfig:
             ``time_step``, with the inputs at their start values.
         monitor_names: Variables that are read along with the outputs; they are in ``out`` but not
             in ``state``.
-        episode_variables: Values of the task itself by name (targets, integrals): numbers, or
-            distributions drawn at each reset. ``_update`` may write them.
+        episode_variables: Values of the task itself by name (targets, integrals, histories):
+            numbers, arrays of numbers, or distributions drawn at each reset. ``_update`` may write
+            them; it assigns new arrays.
         bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
         fault_retries: How often a step that the FMU discards is repeated, as 2, 4, 8 ... smaller
@@ -78,6 +83,8 @@ class EnvConfig:
             freed and made anew. None for no limit.
         reset_method: How episodes begin: ``"restore"``, ``"reset"``, ``"instance"``, ``"library"``
             or ``"process"``; by default the fastest one that a trial has found to be right.
+        rehearsals: Whether a spare instance plays an episode again now and then, to see whether
+            episodes still begin as they should.
         archive_limits: How large an FMU may be, an ``ArchiveLimits`` or a dict of its arguments; by
             default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's; a relative path is relative to the
@@ -120,6 +127,7 @@ class EnvConfig:
     fault_reward: float = 0.0
     leak_limit: int | None = DEFAULT_LEAK_LIMIT
     reset_method: str | None = None
+    rehearsals: bool = True
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
@@ -165,6 +173,7 @@ class EnvConfig:
         self._set("on_fault", check_option("on_fault policy", self.on_fault, ON_FAULT))
         if self.isolation is not None:
             self._set("isolation", check_option("isolation", self.isolation, ISOLATIONS))
+        self._set("rehearsals", check_flag("rehearsals", self.rehearsals))
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))
             self._set("reset_method", check_option("reset method", self.reset_method, methods))
@@ -240,12 +249,26 @@ def _listed(value: Any) -> list[Any] | None:
 
 
 def _variable(name: str, value: Any) -> Any:
-    """Return an episode variable as a float or a distribution of floats."""
+    """Return an episode variable as a float, a distribution of floats or an array of floats."""
     what = f"episode variable {name!r}"
+    if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
+        return _variable_array(what, value)
     value = as_distribution(what, value)
     if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
         raise ConfigError(f"{what} must be a number, got {shown(value)}")
     return value if is_distribution(value) else check_number(what, value)
+
+
+def _variable_array(what: str, value: Any) -> npt.NDArray[np.float64]:
+    """Return an array that cannot be changed, because all episodes start with it."""
+    try:
+        array = np.array(value, np.float64)
+    except Exception:  # lists that make no array, or objects that are no numbers
+        raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}") from None
+    if not array.size or not np.isfinite(array).all():
+        raise ConfigError(f"{what} must be an array of finite numbers, got {shown(value)}")
+    array.setflags(write=False)
+    return array
 
 
 def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:

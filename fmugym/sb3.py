@@ -22,6 +22,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv, vectorized
+from fmugym.vector.codec import handed_out
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -145,7 +146,7 @@ class FMUVecEnv(VecEnv):
         for mask, options in groups:
             options = {**options, "reset_mask": mask}
             observations, infos = self.vector_env.reset(seed=self._seeds, options=options)
-            _hand_out(infos, self.reset_infos)
+            handed_out(infos, self.reset_infos)
         self._reset_seeds()
         self._reset_options()
         return observations
@@ -180,7 +181,7 @@ class FMUVecEnv(VecEnv):
         if dones.any():
             self._end_episodes(dones, truncated & ~terminated, infos, listed)
         elif infos:
-            _hand_out(infos, listed)
+            handed_out(infos, listed)
         return observations, rewards.astype(np.float32), dones, listed
 
     def _end_episodes(
@@ -192,13 +193,13 @@ class FMUVecEnv(VecEnv):
     ) -> None:
         """Separate the infos of the last step from those of the reset that followed it."""
         last, last_infos = infos.pop("final_obs"), infos.pop("final_info")
-        _hand_out(last_infos, listed)
+        handed_out(last_infos, listed)
         others = list(listed)
         for index in np.flatnonzero(dones).tolist():
             listed[index]["TimeLimit.truncated"] = bool(cut_short[index])
             listed[index]["terminal_observation"] = last[index]
             others[index] = self.reset_infos[index] = {}
-        _hand_out(infos, others)
+        handed_out(infos, others)
 
     def close(self) -> None:
         """Free the FMU instances."""
@@ -276,29 +277,3 @@ class FMUVecEnv(VecEnv):
             warnings.warn(f"no pictures in the render mode {self.render_mode}", stacklevel=2)
             return [None] * self.num_envs
         return self.env_method("render")
-
-
-def _hand_out(infos: Mapping[str, Any], into: Any) -> None:
-    """Distribute the infos of a vector environment, arrays with masks, to dicts.
-
-    Args:
-        infos: The infos; the mask of ``name`` is ``_name``.
-        into: The dict of each environment, by number.
-    """
-    for name, values in infos.items():
-        mask = infos.get(f"_{name}")
-        if mask is None:  # it is a mask itself
-            continue
-        indices = np.flatnonzero(mask).tolist()
-        for index, value in zip(indices, _parts(values, indices), strict=True):
-            into[index][name] = value
-
-
-def _parts(values: Any, indices: list[int]) -> list[Any]:
-    """Each environment's part; numbers become Python's, as in single environments."""
-    if isinstance(values, Mapping):
-        parts: dict[int, Any] = {index: {} for index in indices}
-        _hand_out(values, parts)
-        return list(parts.values())
-    chosen = values[indices]
-    return chosen.tolist() if chosen.ndim == 1 else list(chosen)

@@ -122,6 +122,11 @@ ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
     return failed;
 }
 
+void pool_begin_by(Pool *pool, bool restores, bool rebuilds) {
+    pool->settings.restores = pool->settings.restores && restores;
+    pool->settings.rebuilds = rebuilds;
+}
+
 void pool_recycle(Pool *pool) {
     for (size_t i = 0; i < pool->settings.count; i++) {
         pool->instances[i].due = true;

@@ -11,6 +11,9 @@
 #include <windows.h>
 #else
 #include <dlfcn.h>
+#include <fcntl.h>
+#include <pthread.h>
+#include <unistd.h>
 #endif
 
 #if defined _WIN32
@@ -39,13 +42,41 @@ static Function find(void *handle, const char *name) {
 
 #else
 
-static void *open_handle(const char *path, char *error, size_t size) {
-    void *handle = dlopen(path, RTLD_NOW | RTLD_LOCAL);
+/* Returns a descriptor of the old working directory; -1 if nothing was changed. */
+static int enter_folder_of(const char *path) {
+    const char *end = strrchr(path, '/');
+    char *folder = end == NULL ? NULL : strndup(path, (size_t)(end - path));
+    int here = folder == NULL ? -1 : open(".", O_RDONLY | O_CLOEXEC);
 
+    if (here >= 0 && chdir(folder) != 0) {
+        close(here);
+        here = -1;
+    }
+    free(folder);
+    return here;
+}
+
+static void leave_folder(int here) {
+    if (here >= 0) {
+        const int failed = fchdir(here); /* the old directory cannot be refused: it was in use */
+        (void)failed;
+        close(here);
+    }
+}
+
+/* Some libraries read files of their own folder when they are loaded. */
+static void *open_handle(const char *path, char *error, size_t size) {
+    static pthread_mutex_t loading = PTHREAD_MUTEX_INITIALIZER;
+
+    pthread_mutex_lock(&loading);
+    const int here = enter_folder_of(path);
+    void *handle = dlopen(path, RTLD_NOW | RTLD_LOCAL);
     if (handle == NULL) {
         const char *reason = dlerror();
         snprintf(error, size, "%s", reason == NULL ? "dlopen failed" : reason);
     }
+    leave_folder(here);
+    pthread_mutex_unlock(&loading);
     return handle;
 }
 

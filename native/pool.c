@@ -154,6 +154,7 @@ void pool_close(Pool *pool) {
     free(pool->first_outputs);
     free(pool->names);
     free(pool->chosen);
+    tape_free(&pool->tape);
     unlink_pool(pool);
 }
 

@@ -15,6 +15,7 @@
 #include "pace.h"
 #include "platform.h"
 #include "play.h"
+#include "tape.h"
 
 typedef struct {
     uint32_t reference;
@@ -163,6 +164,7 @@ typedef struct Pool {
     Snapshot *snapshots;
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
+    Tape tape;
     Atomic states_too_large;
     Atomic deaf;     /* whether the FMU has refused the categories of its own */
     Atomic heard;    /* how often an instance was asked to log everything */
@@ -231,6 +233,9 @@ void pool_count_steps(Pool *pool);
 
 /* Marks each instance for replacement by a new one at its next reset. */
 void pool_recycle(Pool *pool);
+
+/* Changes how episodes begin from now on. */
+void pool_begin_by(Pool *pool, bool restores, bool rebuilds);
 
 /* What became of the episodes in a step that plays. */
 typedef struct {

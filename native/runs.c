@@ -21,6 +21,9 @@ static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
     const size_t index = index_of(task->pool, me);
 
     health_count_steps(task->pool, me);
+    if (index == 0) {
+        tape_drop(&task->pool->tape);
+    }
     const Status status = instance_restore(task->pool, me, task->snapshot->states[index]);
     if (status > STATUS_WARNING) {
         return status;
@@ -300,6 +303,11 @@ static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
     return troubled;
 }
 
+static void record_step(Pool *pool, Scratch scratch) {
+    tape_add(&pool->tape, scratch.inputs, scratch.outputs, pool->settings.status[0],
+             pool->instances[0].steps);
+}
+
 /* Handles outputs of which some are not finite, or too large for the observations of a float32.
  * The latter are a fault of the episode, and the owner needs the outputs from before it. */
 static size_t take_not_small(Task *task, size_t begin, size_t count, double *outputs) {
@@ -328,6 +336,9 @@ static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
         troubled += take_not_small(task, begin, count, scratch.outputs);
     }
     keep_outputs(task, begin, count, scratch.outputs);
+    if (begin == 0 && task->pool->tape.state == TAPE_RECORDING) {
+        record_step(task->pool, scratch);
+    }
     if (task->call->observations != NULL) {
         write_observations(task, begin, count, scratch.outputs);
     }

@@ -1,6 +1,7 @@
 """Episodes as FMPy plays them: each on a fresh instance of a fresh copy of the library."""
 
 import contextlib
+import os
 import shutil
 import tempfile
 import zipfile
@@ -31,6 +32,7 @@ class FreshInstance:
     """
 
     def __init__(self, path, start_values=None, *, start_time=0.0, tolerance=None):
+        self._directory = os.getcwd()
         self._folder = extract(path)
         self.description = fmpy.read_model_description(self._folder, validate=False)
         self._variables = {v.name: v for v in self.description.modelVariables}
@@ -57,6 +59,7 @@ class FreshInstance:
                 self._fmu.terminate()
             self._fmu.freeInstance()  # and its library
             self._fmu = None
+        os.chdir(self._directory)  # which the FMU may have changed
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _instantiate(self):

@@ -74,7 +74,7 @@ def programs(pool, variables):
     )
 
 
-ACTIONS = {
+DISCRETE = {
     "shape": (),
     "letter": "q",
     "size": 8,
@@ -166,7 +166,7 @@ class Subject:
         self.pool.prepare_play(
             self.start,
             programs(self.pool, variables),
-            ACTIONS | {"current": np.zeros(self.n, "i8"), "previous": np.zeros(self.n, "i8")},
+            DISCRETE | {"current": np.zeros(self.n, "i8"), "previous": np.zeros(self.n, "i8")},
             self.values.copy(),
             (DRAWS, self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)),
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),

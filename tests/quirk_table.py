@@ -31,6 +31,7 @@ NEEDS = {
     "one initialization at a time": "are initialized one at a time",
     "one thread": "are stepped by one thread",
     "libraries": "get a copy of the library each",
+    "processes": "get a process with a copy of the FMU's files each",
 }
 
 
@@ -93,6 +94,10 @@ QUIRKS = (
     keeps("parameters", "restore"),
     keeps("the time"),
     Quirk(
+        "reset keeps files", "keeps its state in a file among its resources", "process",
+        "processes", log=BAD_RESET,
+    ),
+    Quirk(
         "reset ignores parameters",
         "uses the parameters of its first episode in all others",
         "instance",
@@ -114,12 +119,32 @@ QUIRKS = (
     # Several instances
     Quirk("globals", "keeps its state in a global variable", "reset", "libraries", log=DISTURB),
     Quirk("one in a process", "refuses a second instance", neighbours="libraries", log=DISTURB),
+    Quirk(
+        "global parameters", "keeps parameters in global variables",
+        neighbours="libraries", log=DISTURB,
+    ),
+    Quirk(
+        "one saved state", "has one place for the FMU states of all instances",
+        neighbours="libraries", log=DISTURB, versions=STATES,
+    ),
+    Quirk("static buffer", "steps with a static buffer", neighbours="one thread", log=DISTURB),
+    Quirk(
+        "scratch file", "writes and reads a file among its resources",
+        neighbours="processes", log=DISTURB,
+    ),
+    Quirk(
+        "scratch in directory", "writes and reads a file in its working directory",
+        neighbours="processes", log=DISTURB,
+    ),
     Quirk("overruns with two", "writes beyond its memory if there is a second instance",
           neighbours="libraries", log=DISTURB),
     Quirk("strtok", "initializes with `strtok`", neighbours="one initialization at a time"),
     # Memory, files and calls
     Quirk("overruns", "writes a byte beyond its memory (it runs in worker processes)",
           log="harms its process"),
+    Quirk("changes directory", "makes its resources the working directory (you get yours back "
+          "when the environment is closed)"),
+    Quirk("needs its directory", "reads a file beside its library while that is loaded"),
     Quirk("no early reading", "returns Error if it is read before its initialization"),
     Quirk("reads a table", "has `\\` in the names of its archive"),
 )  # fmt: skip
@@ -132,6 +157,9 @@ def quirk_fmu(folder, version, token):
         fmu_tools.library_name(version, "Zoo"): zoo_tools.library(version, model="quirks"),
         "resources/tables/offset.txt": "0.25",
     }
+    if token == "needs its directory":
+        library = Path(fmu_tools.library_name(version, "Zoo"))
+        files[library.with_name("Zoo.txt").as_posix()] = "beside the library"
     if token == "reads a table":
         files = {name.replace("/", "\\"): content for name, content in files.items()}
     return fmu_tools.write_fmu(Path(folder) / "Quirks.fmu", files)

@@ -407,7 +407,7 @@ class TestLeaks:
             with path.open(buffering=30_000) as file:
                 file.readline()
 
-        growth = self.play(pool, 8000, read, leak=3600)
+        growth = self.play(pool, 16_000, read, leak=3600)
         assert growth > 20 * MB
         assert pool.health()["memory_growth"][0] == pytest.approx(growth, rel=0.1)
 

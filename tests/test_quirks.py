@@ -324,3 +324,12 @@ def test_info_tells_what_the_trial_has_shown(make_fmu, capsys):
     shown = capsys.readouterr().out
     assert "reset is wrong, instance is right to the last bit" in shown
     assert "episodes begin by 'instance'" in shown
+
+
+def test_the_working_directory_comes_back(make_fmu, tmp_path):
+    """The folder that the FMU has made the working directory is removed with the environment."""
+    env = QuirkEnv(make_fmu("changes directory"))
+    env.reset()
+    assert os.getcwd() != str(tmp_path)
+    env.close()
+    assert os.getcwd() == str(tmp_path)

@@ -3,10 +3,10 @@
 import gymnasium
 import numpy as np
 import pytest
-from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_fmu
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config, probe_fmu
 from gymnasium import spaces
 
-from fmugym import ConfigError, SimulationError
+from fmugym import ConfigError, FMUVectorEnv, SimulationError
 
 Box, Discrete, MultiBinary = spaces.Box, spaces.Discrete, spaces.MultiBinary
 
@@ -172,6 +172,20 @@ class TestObservations:
         assert env.observation_space == MultiBinary(1)
         observation, _ = env.reset()
         assert observation in env.observation_space
+
+    @pytest.mark.parametrize("name", ["steps", "n_out", "mode_out"])
+    def test_one_integer_of_many_environments(self, probe, name):
+        """The default observation is element-wise, as hooks should be."""
+
+        def observe(hooks):
+            config = probe_config(model_output_names=name)
+            envs = FMUVectorEnv(lambda: PlainEnv(probe(), config), 3, hooks=hooks)
+            observations = [envs.reset()[0]]
+            observations += [envs.step(np.zeros((3, 1)))[0] for _ in range(3)]
+            envs.close()
+            return [(row.tolist(), row.dtype) for row in observations]
+
+        assert observe("array") == observe("per_env")
 
     def test_observations_are_new_arrays(self, make_env):
         env = make_env()

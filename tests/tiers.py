@@ -30,6 +30,7 @@ EVERY = {
     "test_pool": 8,
     "test_slow_models": 3,
     "test_quirks": 31,
+    "test_rehearsals": 3,
     "test_words": 17,
     "test_zoo": 29,
 }

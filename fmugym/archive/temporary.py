@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -15,6 +16,9 @@ from typing import Final
 from fmugym.errors import FMULoadError
 
 __all__ = ["folder_name", "make_folder", "remove_folder", "sweep"]
+
+_made_in: Final[dict[Path, str]] = {}
+"""The working directory at the time when each folder was made."""
 
 _NAME: Final = re.compile(r"fmugym-(?P<pid>\d+)-(?P<namespace>\d+)-\w+")
 
@@ -46,17 +50,29 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(0o700)
     except OSError as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
+    with contextlib.suppress(OSError):
+        _made_in[folder] = os.getcwd()
 
 
 def remove_folder(folder: Path, owner: int) -> None:
-    """Remove a folder, unless this process is only a fork of its owner."""
+    """Remove a folder, unless this process is only a fork of its owner.
+
+    If an FMU has made it the working directory, the one from before is restored.
+    """
     if os.getpid() != owner:
         return
+    _leave(folder, _made_in.pop(folder, tempfile.gettempdir()))
     try:
         shutil.rmtree(folder, ignore_errors=True)
     except BaseException:  # such as KeyboardInterrupt: nobody comes back for the rest
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def _leave(folder: Path, directory: str) -> None:
+    with contextlib.suppress(OSError):
+        if Path.cwd().is_relative_to(folder.resolve()):
+            os.chdir(directory)
 
 
 @functools.cache

@@ -19,6 +19,7 @@ import os
 import shutil
 import weakref
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -26,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.description import Variable
+from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
@@ -43,6 +44,7 @@ from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.spec import ResetMethod
+from fmugym.pool.tape import Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
 
@@ -133,6 +135,7 @@ class NativePool(AttendedPool):
         self._result = self.outputs, self.statuses
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
+        self._listener = _Listener(fmu.description, spec)
         try:
             self._pool = self._open(log, private_libraries)
         except BaseException:
@@ -195,6 +198,7 @@ class NativePool(AttendedPool):
                 count=self.num_instances,
                 threads=self.threads,
                 callback=_Receiver(log, description.model_identifier, self._first_index),
+                listener=self._listener,
             )
         except OSError as error:
             reason, _, said = str(error).partition(_SAID)
@@ -302,6 +306,23 @@ class NativePool(AttendedPool):
 
     def _memory_growth(self) -> int:
         return 0 if self._watch is None else self._watch.growth
+
+    def rehearse_with(self, judge: Judge) -> None:
+        """See ``Pool.rehearse_with``."""
+        super().rehearse_with(judge)
+        self._listener.rehearsals = self._rehearsals
+
+    def record(self, resets: int, steps: int) -> None:
+        """See ``CountedPool.record``."""
+        self._open_pool().record(resets, steps)
+
+    def begin_by(self, method: ResetMethod) -> bool:
+        """See ``Pool.begin_by``; libraries that instances share cannot be loaded anew."""
+        if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
+            return False
+        self._open_pool().begin_by(False, method == ResetMethod.INSTANCE)
+        self._spec = replace(self._spec, reset_method=method)
+        return True
 
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""
@@ -499,6 +520,49 @@ class _Receiver:
         number = self._first_index + index
         texts = printable(category), printable(message)
         self._log.log(level, "%s_%d: [%s] %s", self._model, number, *texts)
+
+
+class _Listener:
+    """Passes on recordings of episodes; it must not refer to the pool."""
+
+    def __init__(self, description: ModelDescription, spec: PoolSpec) -> None:
+        self._description = description
+        self._widths = len(spec.inputs), len(spec.outputs)
+        self.rehearsals: Rehearsals | None = None
+
+    def __call__(self, recording: _native.Recording) -> None:
+        if self.rehearsals is not None:
+            self.rehearsals.receive(self._tape(*recording))
+
+    def _tape(
+        self,
+        types: bytes,
+        references: bytes,
+        starts: bytes,
+        first_outputs: bytes,
+        inputs: bytes,
+        outputs: bytes,
+        statuses: bytes,
+    ) -> Tape:
+        count, (width_in, width_out) = len(statuses), self._widths
+        return Tape(
+            self._variables(types, np.frombuffer(references, np.uint32).tolist()),
+            np.frombuffer(starts),
+            np.frombuffer(first_outputs),
+            np.frombuffer(inputs).reshape(count, width_in),
+            np.frombuffer(outputs).reshape(count, width_out),
+            np.frombuffer(statuses, np.int8),
+        )
+
+    def _variables(self, types: bytes, references: list[int]) -> tuple[Variable, ...]:
+        """Find variables; aliases are as good."""
+        version = self._description.fmi_major_version
+        known = {
+            (_type_number(v, version), v.value_reference): v
+            for v in self._description.variables.values()
+            if v.numeric
+        }
+        return tuple(known[pair] for pair in zip(types, references, strict=True))
 
 
 def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:

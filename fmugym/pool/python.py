@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.slot import Slot, Snapshot
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["PythonPool"]
 
@@ -93,6 +95,7 @@ class PythonPool(AttendedPool):
             if mask is None or mask[index]:
                 self._note(index, slot.reset(variables, values[:, index]))
         raise_caught()
+        self._note_reset(variables, values, mask)
 
     def step(
         self,
@@ -109,6 +112,8 @@ class PythonPool(AttendedPool):
         if observations is not None:
             np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
         raise_caught()
+        if self._is_recording:
+            self._note_step(skip)
         return self.outputs, self.statuses
 
     def _note(self, index: int, status: int) -> None:
@@ -142,6 +147,7 @@ class PythonPool(AttendedPool):
             raise SimulationError("the snapshot was taken from another pool")
         for index in chosen:
             self._slots[index].require_own(snapshot[index])
+        self._drop_recording()
         for index in chosen:
             self._note(index, self._slots[index].restore(snapshot[index]))
         raise_caught()
@@ -166,6 +172,15 @@ class PythonPool(AttendedPool):
 
     def _memory_growth(self) -> int:
         return 0 if self._watch is None else self._watch.growth
+
+    def begin_by(self, method: ResetMethod) -> bool:
+        """See ``Pool.begin_by``; the library cannot be loaded anew."""
+        if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
+            return False
+        self._spec = replace(self._spec, reset_method=method)
+        for slot in self._slots:
+            slot.begin_by(method)
+        return True
 
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""

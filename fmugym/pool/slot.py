@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, SimulationError, printable
@@ -98,6 +98,11 @@ class Slot:
         self._start_key: tuple[tuple[Variable, ...], bytes] | None = None
         self._saved: SavedState | None = None
         self._good_outputs = self._output_row.tolist()
+
+    def begin_by(self, method: ResetMethod) -> None:
+        """Let later episodes begin in another way, without saved states."""
+        self._spec = replace(self._spec, reset_method=method)
+        self._restores, self._saved = False, None
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
         """Start a new episode by the spec's reset method.

@@ -93,7 +93,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
             return self.action
         if isinstance(values, range):  # the range of an Integer, which may be wide
             return values[0] + self.action
-        return np.array(values)[self.action]
+        return np.take(values, self.action)
 
     def _update(self) -> None:
         """Update integrators and filters of the task; called once after each step of the FMU."""

@@ -200,9 +200,21 @@ def outputs_observation(
     return lambda state: make()(state)
 
 
+def _places(values: Sequence[int], numbers: Any) -> tuple[Any, Any]:
+    """Find numbers among rising values; returns their places, and whether they are there."""
+    if isinstance(values, range):  # which may be too long for an array
+        return numbers.astype(np.int64) - values[0], (numbers >= values[0]) & (
+            numbers <= values[-1]
+        )
+    table = np.array(values)
+    places = np.searchsorted(table, numbers)
+    return places, table[np.minimum(places, len(table) - 1)] == numbers
+
+
 def _discrete_observation(
     interface: Interface, space: spaces.Discrete
-) -> Callable[[Sequence[float]], Any]:
+) -> Callable[[Sequence[Any]], Any]:
+    """Make the function for one output, which is a number or an array."""
     if len(interface.outputs) != 1:
         raise ConfigError(
             f"{len(interface.outputs)} outputs do not make an element of {space}; "
@@ -210,15 +222,18 @@ def _discrete_observation(
         )
     values = discrete_values(interface, interface.outputs)
     if values is None or space.n != len(values):
-        return lambda state: np.int64(state[0])
+        return lambda state: np.asarray(state[0]).astype(np.int64)[()]
     (variable,) = interface.outputs
+    start = int(space.start)
 
-    def observe(state: Sequence[float]) -> np.int64:
-        try:
-            return np.int64(values.index(int(state[0])) + int(space.start))
-        except ValueError:
+    def observe(state: Sequence[Any]) -> Any:
+        numbers = np.asarray(state[0])
+        places, is_known = _places(values, numbers)
+        if not is_known.all():
             raise SimulationError(
-                f"output {variable.name!r} is {state[0]:g}, which is not one of its declared values"
-            ) from None
+                f"output {variable.name!r} is {numbers[~is_known].flat[0]:g}, which is not one of "
+                "its declared values"
+            )
+        return places + start
 
     return observe

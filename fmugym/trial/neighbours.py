@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final
 
 import numpy as np
 
+from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.access import Access
@@ -28,6 +29,7 @@ from fmugym.pool.patience import licence_errors, require_licence
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
+from fmugym.trial.rehearsal import Starts
 from fmugym.trial.trial import Candidate
 
 __all__ = ["default_spec", "disturb_in_threads", "disturb_in_turn"]
@@ -39,6 +41,11 @@ _DEFAULT_STEP_SIZE: Final = 0.01
 
 _MOST_OUTPUTS: Final = 1000
 _STEPS: Final = 30
+_EPISODES: Final = (_STEPS, 3, 3)
+"""The steps of each episode. From the third one on, a saved state may be restored."""
+_NUDGE: Final = 0.01
+"""How far equal start values of two instances are moved apart, as a fraction."""
+
 _ROUNDS: Final = 20
 _THREAD_SECONDS: Final = 0.2
 """The real time in seconds after which a comparison in threads ends."""
@@ -62,17 +69,21 @@ def default_spec(fmu: FMU) -> PoolSpec:
 def disturb_in_turn(
     candidate: Candidate,
     spec: PoolSpec | None = None,
+    starts: Starts | None = None,
     *,
     private_libraries: bool = False,
 ) -> bool:
-    """Compare an instance run alone with one run beside another that gets different inputs.
+    """Compare an instance run alone with one beside another that gets other values.
 
-    Each run loads a fresh copy of the FMU's library. FMUs may still share things outside their
-    library: files, other libraries, licences.
+    Inputs and start values differ. There are several episodes, since an instance may spoil the
+    saved states of another. Each run loads a fresh copy of the FMU's library. FMUs may still share
+    things outside their library: files, other libraries, licences.
 
     Args:
         candidate: The FMU.
-        spec: What to do in a step; by default all inputs are written and all outputs read.
+        spec: What to do at a reset and in a step; by default all inputs are written and all
+            outputs read.
+        starts: The start values of the two instances; by default those of the FMU.
         private_libraries: Whether each instance has a copy of the library.
 
     Returns:
@@ -83,9 +94,13 @@ def disturb_in_turn(
         SimulationError: If an instance alone fails.
     """
     spec = default_spec(candidate.open()) if spec is None else spec
-    alone, inputs = _run_alone(candidate, spec, private_libraries)
+
+    def run(inputs: FloatArray) -> FloatArray:
+        return _run(candidate, spec, starts or Starts(), inputs, private_libraries)
+
+    alone, inputs = _run_alone(spec, run)
     try:
-        beside = _run(candidate, spec, inputs, private_libraries)
+        beside = run(inputs)
     except LicenceError:
         raise
     except (FMULoadError, SimulationError) as error:
@@ -95,15 +110,15 @@ def disturb_in_turn(
 
 
 def _run_alone(
-    candidate: Candidate, spec: PoolSpec, private_libraries: bool
+    spec: PoolSpec, run: Callable[[FloatArray], FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Run one instance with moving inputs, or with constant ones if the FMU then fails."""
     inputs = _inputs_of_two(spec, 1.0)
     try:
-        return _run(candidate, spec, inputs[:1], private_libraries), inputs
+        return run(inputs[:1]), inputs
     except SimulationError:
         inputs = _inputs_of_two(spec, 0.0)
-        return _run(candidate, spec, inputs[:1], private_libraries), inputs
+        return run(inputs[:1]), inputs
 
 
 def _inputs_of_two(spec: PoolSpec, amplitude: float) -> FloatArray:
@@ -115,30 +130,59 @@ def _inputs_of_two(spec: PoolSpec, amplitude: float) -> FloatArray:
 
 
 def _run(
-    candidate: Candidate, spec: PoolSpec, inputs: FloatArray, private_libraries: bool
+    candidate: Candidate,
+    spec: PoolSpec,
+    starts: Starts,
+    inputs: FloatArray,
+    private_libraries: bool,
 ) -> FloatArray:
     """Step instances of a fresh copy in turn; return the outputs of the first one."""
     count = len(inputs)
     fmu = candidate.open()
     pool = local_pool(fmu, spec, count, logger, threads=1, private_libraries=private_libraries)
+    values = _start_values(starts)[:, :count]
     try:
-        return _trajectory(pool, inputs)
+        episodes = [
+            _trajectory(pool, starts.variables, values, inputs[:, :steps]) for steps in _EPISODES
+        ]
+        return np.concatenate(episodes)
     finally:
         pool.close()
 
 
-def _trajectory(pool: Pool, inputs: FloatArray) -> FloatArray:
-    outputs, statuses = pool.reset((), np.zeros((0, pool.num_instances)))
+def _start_values(starts: Starts) -> FloatArray:
+    """The start values of two instances, shape (P, 2).
+
+    A caller may give each environment its own value even where the config has one number, so every
+    Real differs.
+    """
+    first, second = starts.column(0), starts.column(1).copy()
+    for index, variable in enumerate(starts.variables):
+        if variable.kind == "real" and second[index] == first[index]:
+            second[index] = _nudged(variable, float(first[index, 0]))
+    return np.hstack([first, second])
+
+
+def _nudged(variable: Variable, value: float) -> float:
+    """A value one percent away, within the limits if possible."""
+    distance = _NUDGE * (abs(value) or abs(variable.nominal or 1.0))
+    above, below = value + distance, value - distance
+    return above if above <= variable.maximum or below < variable.minimum else below
+
+
+def _trajectory(
+    pool: Pool, variables: tuple[Variable, ...], values: FloatArray, inputs: FloatArray
+) -> FloatArray:
+    outputs, statuses = pool.reset(variables, values)
     require_licence(pool)
-    rows = []
-    for step in range(_STEPS + 1):
+    rows = [outputs[:, 0].copy()]
+    for step in range(inputs.shape[1]):
         if statuses[0] > Status.WARNING:
-            if step > 1 and statuses[0] == Status.TERMINATED:
-                break
-            raise SimulationError(pool.failure(0))
+            break
+        outputs, statuses = pool.step(inputs[:, step].T)
         rows.append(outputs[:, 0].copy())
-        if step < _STEPS:
-            outputs, statuses = pool.step(inputs[:, step].T)
+    if statuses[0] not in (Status.OK, Status.WARNING, Status.TERMINATED):
+        raise SimulationError(pool.failure(0))
     return np.array(rows)
 
 

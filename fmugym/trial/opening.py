@@ -20,7 +20,8 @@ from fmugym.pool.progress import progress
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
-from fmugym.trial.trial import Candidate, examine
+from fmugym.trial.repetition import Repetition
+from fmugym.trial.trial import Candidate, examine, revise
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = ["make_pool"]
@@ -42,6 +43,7 @@ def make_pool(
     isolation: str | None = None,
     workers: int | None = None,
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
+    rehearse: bool = False,
 ) -> Pool:
     """Make the fastest pool that gives correct values.
 
@@ -64,6 +66,8 @@ def make_pool(
             process, unless instances disturb each other and private libraries do not help.
         workers: See ``ProcessPool``; by default one for each instance if they disturb each other.
         call_timeout: See ``ProcessPool``; calls in this process have no time limit.
+        rehearse: Whether a spare instance plays episodes again now and then, to see whether they
+            begin anew. It takes one more seat of a licence.
 
     Raises:
         ConfigError: If the backend, the isolation or the reset method is unknown.
@@ -86,7 +90,10 @@ def make_pool(
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
-            return _open(fmu, spec, num_instances, log, completed, call_timeout)
+            pool = _open(fmu, spec, num_instances, log, completed, call_timeout)
+        if rehearse and reset_method is None:
+            _rehearse(pool, fmu, spec, starts, verdict, completed, log)
+        return pool
 
     return Patience(spec.licence_wait, log).call(attempt)
 
@@ -110,6 +117,7 @@ def _open(
             native=plan.native,
             workers=plan.workers,
             threads=plan.threads,
+            own_files=plan.own_files,
             call_timeout=call_timeout,
         )
         pool.attend(Attendant.of(fmu.path.name, spec, log))
@@ -123,6 +131,34 @@ def _open(
         threads=plan.threads,
         private_libraries=plan.private_libraries,
     )
+
+
+def _rehearse(
+    pool: Pool,
+    fmu: FMU,
+    spec: PoolSpec,
+    starts: Starts | None,
+    verdict: Verdict,
+    plan: _Plan,
+    log: logging.Logger,
+) -> None:
+    """Let the trial of resets be repeated in training, if it was made and can be repeated."""
+    candidate = Candidate.of(fmu)
+    always_fresh = plan.method is ResetMethod.PROCESS
+    if candidate.exempt or not verdict.deterministic or not verdict.resets or always_fresh:
+        return
+    tried = _tried(spec)
+    spec = replace(spec, reset_method=plan.method)
+
+    def keep(found: Verdict) -> None:
+        revise(candidate, tried, starts, found)
+
+    pool.rehearse_with(Repetition(candidate, spec, verdict, plan.native, keep, log))
+
+
+def _tried(spec: PoolSpec) -> PoolSpec:
+    """The part of a spec that a trial uses."""
+    return replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
 
 
 def _is_native(backend: str) -> bool:
@@ -146,6 +182,7 @@ class _Plan:
     isolation: str | None = None
     workers: int | None = None
     one_initialization: bool = False
+    own_files: bool = False
 
     @property
     def method(self) -> ResetMethod:
@@ -190,7 +227,8 @@ class _Plan:
             plan, what = self, "isolation='none' keeps them in one process all the same"
         elif neighbours is not Neighbours.ONE_THREAD:
             workers = self.workers or num_instances
-            plan, what = replace(self, isolation="process", workers=workers), "each gets a process"
+            plan = replace(self, isolation="process", workers=workers, own_files=True)
+            what = "each gets a process with a copy of the FMU's files"
         asked_for = self.isolation == "process"
         level = logging.INFO if asked_for else logging.WARNING
         log.log(level, "the instances of %s disturb each other: %s", fmu.path.name, what)
@@ -232,7 +270,7 @@ def _verdict(
 ) -> Verdict:
     """Get the verdict on an FMU from a trial, or from this process if trials are turned off."""
     candidate = Candidate.of(fmu)
-    spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
+    spec = _tried(spec)
     if is_bundled(fmu.path):
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
     several = num_instances > 1 and plan.private_libraries is None and not plan.has_own_workers

@@ -27,7 +27,7 @@ from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.trial import Candidate
 from fmugym.trial.verdict import Grade
 
-__all__ = ["Rehearsal", "Starts"]
+__all__ = ["Rehearsal", "Starts", "difference", "tolerance_of"]
 
 _SHORT: Final = 3
 """The steps of a short episode."""
@@ -99,7 +99,7 @@ class Rehearsal:
         self.deterministic, self.reason = True, ""
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
         self._references: list[_Run] = []
-        self._tolerance = _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)
+        self._tolerance = tolerance_of(spec)
         self._find_reference()
 
     @property
@@ -123,8 +123,8 @@ class Rehearsal:
         again = self._play_fresh(0)
         if not _same(again, self._references[0]):
             self.deterministic = False
-            difference = _difference(again, self._references[0])
-            self._tolerance = max(self._tolerance, _SLACK * difference)
+            noise = difference(again.rows, self._references[0].rows)
+            self._tolerance = max(self._tolerance, _SLACK * noise)
 
     def _play_fresh(self, start: int, *, measured: bool = False) -> _Run:
         pool = self._open(ResetMethod.RESET)
@@ -202,7 +202,7 @@ class Rehearsal:
         if _same(run, reference):
             return Grade.BITWISE
         close = len(run.rows) == len(reference.rows) and run.status == reference.status
-        if close and _difference(run, reference) <= self._tolerance:
+        if close and difference(run.rows, reference.rows) <= self._tolerance:
             return Grade.TOLERANCE
         return Grade.WRONG
 
@@ -211,10 +211,20 @@ def _same(one: _Run, other: _Run) -> bool:
     return one.rows.tobytes() == other.rows.tobytes() and one.status == other.status
 
 
-def _difference(one: _Run, other: _Run) -> float:
-    """The largest difference of an output, as a fraction of its largest magnitude."""
-    length = min(len(one.rows), len(other.rows))
-    a, b = one.rows[:length], other.rows[:length]
+def tolerance_of(spec: PoolSpec) -> float:
+    """By how much two runs of a solver may differ, as a fraction of the largest magnitude."""
+    return _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)
+
+
+def difference(one: FloatArray, other: FloatArray) -> float:
+    """The largest difference of an output, as a fraction of its largest magnitude.
+
+    Args:
+        one: A row of outputs for each step.
+        other: The same of another run; the rows that one of them lacks are left out.
+    """
+    length = min(len(one), len(other))
+    a, b = one[:length], other[:length]
     if a.size == 0:
         return 0.0
     scale = np.maximum(np.abs(a).max(axis=0), np.abs(b).max(axis=0))

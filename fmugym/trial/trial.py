@@ -50,6 +50,7 @@ __all__ = [
     "examine",
     "known_verdict",
     "meet",
+    "revise",
 ]
 
 logger = logging.getLogger(__name__)
@@ -213,9 +214,7 @@ def examine(
         FMULoadError: As ``meet``, if ``must_survive``.
         LicenceError: If an instance got no licence.
     """
-    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0)  # the rest is tried
-    asked = _digest(repr((tried, starts, candidate.preload)).encode())
-    key = f"{_content_key(candidate.path)}-{asked}"
+    key = _verdict_key(candidate, spec, starts)
     known = Verdict.from_text(recall(key))
     if known is not None and (known.neighbours is not None or not several):
         return known
@@ -223,6 +222,12 @@ def examine(
     if found.complete:
         remember(key, found.to_text())
     return found
+
+
+def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> None:
+    """Replace the verdict that ``examine`` has cached for the same arguments."""
+    for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path)):
+        remember(key, verdict.to_text())
 
 
 def _examine(request: Request, must_survive: bool) -> Verdict:
@@ -452,6 +457,13 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 # Keys of the cache
+
+
+def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
+    """The scope of a verdict on resets and neighbours."""
+    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0)  # the rest is tried
+    asked = _digest(repr((tried, starts, candidate.preload)).encode())
+    return f"{_content_key(candidate.path)}-{asked}"
 
 
 def _content_key(path: Path) -> str:

@@ -35,7 +35,7 @@ from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.rehearsal import Rehearsal, Starts
 from fmugym.trial.trial import Request, Stage, patience
-from fmugym.trial.verdict import Grade, Neighbours
+from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 _NO_DIALOGUES: Final = 0x0003
 """``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""
@@ -97,9 +97,10 @@ def _try(request: Request, notes: Notes) -> None:
     complete = _try_alone(request, notes)
     notes.answer(complete=complete)
     if complete and request.spec is not None:
-        _try_resets(request, notes)
+        method = _try_resets(request, notes)
         if request.several:
-            _try_several(request, notes)
+            spec = replace(request.spec, reset_method=method)
+            _try_several(replace(request, spec=spec), notes)
 
 
 def _end_after(seconds: float) -> None:
@@ -163,16 +164,16 @@ def _reset_and_step(pool: Pool, spec: PoolSpec, notes: Notes) -> None:
         pool.step(start_inputs(spec)[:, None])
 
 
-def _try_resets(request: Request, notes: Notes) -> None:
-    """Grade the reset methods, fastest first, until one is exact to the last bit."""
+def _try_resets(request: Request, notes: Notes) -> ResetMethod:
+    """Grade the reset methods, fastest first, until one is exact to the last bit; return it."""
     notes.stage(Stage.REFERENCE)
     if Stage.REFERENCE in request.skip:
-        return
+        return ResetMethod.RESET
     rehearsal = Rehearsal(request.candidate, request.spec, request.starts or Starts())
     if not rehearsal.possible:
-        return
+        return ResetMethod.RESET
     notes.answer(deterministic=rehearsal.deterministic)
-    grades: dict[str, str] = {}
+    grades: dict[ResetMethod, Grade] = {}
     for method in _methods(request):
         stage = Stage.of(method)
         notes.stage(stage)
@@ -181,6 +182,7 @@ def _try_resets(request: Request, notes: Notes) -> None:
         notes.answer(resets=grades)
         if grades[method] == Grade.BITWISE:
             break
+    return Verdict(resets=grades).reset_method
 
 
 def _methods(request: Request) -> list[ResetMethod]:
@@ -226,12 +228,22 @@ def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bo
     notes.stage(stage)
     if stage in request.skip:
         return True
+    reloads = private_libraries and request.spec.reset_method is ResetMethod.LIBRARY
+    spec = request.spec if reloads else _without_reloading(request.spec)
     try:
-        return disturb_in_turn(request.candidate, request.spec, private_libraries=private_libraries)
+        return disturb_in_turn(
+            request.candidate, spec, request.starts, private_libraries=private_libraries
+        )
     except LicenceError:
         raise
     except FMUGymError:  # a lone instance fails too: it needs the caller's values
         return False
+
+
+def _without_reloading(spec: PoolSpec) -> PoolSpec:
+    """Instances that share a library, or this process, can only be made anew themselves."""
+    reloads = spec.reset_method in (ResetMethod.LIBRARY, ResetMethod.PROCESS)
+    return replace(spec, reset_method=ResetMethod.INSTANCE) if reloads else spec
 
 
 class _Echo(logging.Logger):

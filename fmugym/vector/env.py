@@ -146,8 +146,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         env, count = self._prototype, self.num_envs
         if not self._use_arrays(hooks):
             envs = self._make_all()
-            spaces = self.action_space
-            return PerEnvEngine(envs, self._pool, max_episode_steps, spaces, self._add_info)
+            return PerEnvEngine(envs, self._pool, max_episode_steps, self.action_space)
         if hooks != "array":
             programs = find_programs(env, required=hooks == "compiled")
             if programs is not None:

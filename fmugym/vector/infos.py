@@ -1,8 +1,4 @@
-"""Infos and observations of N environments.
-
-Infos are arrays by name, each with a mask that says which environments it is for, as in Gymnasium's
-vector environments. Outside of its mask an array holds zeros, or None where it holds objects.
-"""
+"""Infos and observations of N environments; ``fmugym.vector.codec`` has the form of infos."""
 
 from __future__ import annotations
 
@@ -15,6 +11,7 @@ import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.values import LateDict
+from fmugym.vector.codec import coded, within
 
 __all__ = [
     "copy_rows",
@@ -26,28 +23,13 @@ __all__ = [
     "observations_of",
     "restricted",
     "rows_as_objects",
-    "within",
 ]
-
-
-def within(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Copy values of environments, but zero (or None) outside of a mask."""
-    result = np.zeros_like(values) if values.dtype != object else np.full_like(values, None)
-    result[mask] = values[mask]
-    return result
 
 
 def drawn_info(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
     """The info of a reset: what was drawn or overridden, by name; no caller changes the rows."""
     mask = mask.copy()
-    return {"drawn": LateDict.of(_drawn_rows, drawn, mask), "_drawn": mask}  # rarely read
-
-
-def _drawn_rows(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for name, row in drawn.items():
-        values[name], values[f"_{name}"] = within(mask, row), mask.copy()
-    return values
+    return {"drawn": LateDict.of(coded, drawn, mask), "_drawn": mask}  # rarely read
 
 
 def final_infos(

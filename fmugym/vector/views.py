@@ -29,7 +29,8 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     space: Any = env.action_space
     action = np.zeros((*space.shape, count), space.dtype)
     variables = EpisodeVariables(env.config.episode_variables)
-    variables.update({name: np.zeros(count) for name in variables})
+    starts = env.config.episode_variables
+    variables.update({name: np.zeros((*np.shape(starts[name]), count)) for name in variables})
     return Readings(
         values=outputs,
         out=NamedValues("output", list(env.out), lambda: outputs),

@@ -57,6 +57,8 @@ class ProcessPool(AttendedPool):
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
+        own_files: Whether each worker has a copy of the FMU's files, which is also its working
+            directory.
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
@@ -80,6 +82,7 @@ class ProcessPool(AttendedPool):
         native: bool = True,
         workers: int | None = None,
         threads: int | None = None,
+        own_files: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
     ) -> None:
         self.num_instances = num_instances
@@ -99,7 +102,8 @@ class ProcessPool(AttendedPool):
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
-        setups = _share_out(replace(setup, native=native, threads=threads), self.workers)
+        setup = replace(setup, native=native, threads=threads, own_files=own_files)
+        setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
 
@@ -119,6 +123,7 @@ class ProcessPool(AttendedPool):
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
             self._crew.note_lost()
+            self._note_reset(variables, values, mask)
 
     def _as_mask(self, mask: MaskArray | None) -> MaskArray:
         if mask is None:
@@ -212,10 +217,33 @@ class ProcessPool(AttendedPool):
         replies = self._crew.run(
             "a step", self._crew.able, lambda supervisor: supervisor.step(code)
         )
+        if self._is_recording:
+            self._record_step(skip)
         if not self._crew.any_lost and Code.TROUBLE not in replies.values():
             return 0
         self._crew.note_lost()
         return int(np.count_nonzero(self.statuses > Status.WARNING))
+
+    def _record_step(self, skip: MaskArray | None) -> None:
+        if self._crew.lost[0]:  # something else may have ended the process
+            self._drop_recording()
+        else:
+            self._note_step(skip)
+
+    def begin_by(self, method: ResetMethod) -> bool:
+        """See ``Pool.begin_by``; the libraries of workers cannot be loaded anew."""
+        if method == ResetMethod.PROCESS and self.workers == self.num_instances:
+            self._spec = replace(self._spec, reset_method=method)
+            return True
+        if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
+            return False
+        with self._lock:
+            self._spec = replace(self._spec, reset_method=method)
+            for supervisor in self._crew.supervisors:
+                supervisor.begin_by(method)
+            able = self._crew.able
+            self._crew.run("a change", able, lambda s: s.tell("begin_by", str(method)))
+        return True
 
     def save(self) -> _Snapshot:
         """See ``Pool.save``."""
@@ -236,6 +264,7 @@ class ProcessPool(AttendedPool):
         if parts.keys() != set(self._crew.supervisors):
             raise SimulationError("the snapshot was taken from another pool")
         with self._lock:
+            self._drop_recording()
             self._require_present(mask)
             concerned = self._crew.of_any(mask)
             for supervisor in concerned:

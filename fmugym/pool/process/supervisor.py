@@ -8,6 +8,7 @@ import math
 import socket
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +20,7 @@ from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo
 from fmugym.pool.process.worker import Setup
-from fmugym.pool.spec import INITIALIZATION_FACTOR
+from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 
 __all__ = ["INSTANTIATION", "LostError", "Supervisor", "patience_with"]
 
@@ -173,6 +174,11 @@ class Supervisor:
         self.begin_closing()
         self.close(deadline)
         self._deaths, self.reason = deaths, printable(f"{self._setup.path.name}: {reason}")
+
+    def begin_by(self, method: ResetMethod) -> None:
+        """Let the episodes of later processes begin in another way."""
+        spec = replace(self._setup.spec, reset_method=method)
+        self._setup = replace(self._setup, spec=spec)
 
     def note_success(self) -> None:
         """Remember that a reset has succeeded."""

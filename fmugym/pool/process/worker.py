@@ -10,11 +10,12 @@ import contextlib
 import itertools
 import logging
 import os
+import shutil
 import signal
 import socket
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +25,7 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import FMU, ExtractedFMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, FMULoadError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool, PoolSpec
 from fmugym.pool.health import HealthArray
@@ -32,12 +33,17 @@ from fmugym.pool.leaks import ProcessGrowth
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
+from fmugym.pool.spec import ResetMethod
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
 
 _IGNORED_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGTTIN", "SIGTTOU")
 """The first are meant for the parent, and often sent to all of its processes; the workers end with
 it. The last two would stop a process in the background that uses the terminal."""
+
+
+_COPIES: Final = "copies-for-workers"
+"""The folder within the FMU's one that has the copies."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,8 @@ class Setup:
         number: Which of the pool's workers it is.
         native: Whether the worker's own pool is a ``NativePool``.
         threads: See ``NativePool``.
+        own_files: Whether the worker has a copy of the folder, which is also its working
+            directory, because instances would share files otherwise.
     """
 
     path: Path
@@ -75,6 +83,7 @@ class Setup:
     number: int = 0
     native: bool = False
     threads: int = 1
+    own_files: bool = False
 
     @classmethod
     def of(cls, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> Setup:
@@ -92,6 +101,28 @@ class Setup:
             environment=dict(os.environ),
             block=slice(num_instances),
         )
+
+    @property
+    def needs_copy(self) -> bool:
+        """Whether the worker needs its own copy of the folder: an FMU may keep state in files."""
+        return self.own_files or self.spec.reset_method is ResetMethod.PROCESS
+
+    def with_copy(self) -> Setup:
+        """Copy the folder afresh, in the place of the copy of an earlier worker.
+
+        Raises:
+            FMULoadError: If the system refuses.
+        """
+        folder = self.folder / _COPIES / str(self.number)
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.copytree(self.folder, folder, ignore=shutil.ignore_patterns(_COPIES))
+        except (OSError, shutil.Error) as error:
+            raise FMULoadError(
+                f"{self.path.name} needs a copy of its files for each process: {error}"
+            ) from None
+        directory = str(folder) if self.own_files else self.directory
+        return replace(self, folder=folder, directory=directory)
 
 
 def _working_directory() -> str:
@@ -195,6 +226,7 @@ class BlockWorker:
 
     def open(self, setup: Setup) -> None:
         """Make the pool; the first call."""
+        setup = setup.with_copy() if setup.needs_copy else setup
         _enter(setup.directory, setup.folder)
         os.environ.update(setup.environment)
         log = logging.getLogger(__name__)
@@ -230,6 +262,10 @@ class BlockWorker:
         self._pool.reset(self._variables[number], values, mask)
         self._publish()
         return self._growth.after(int(np.count_nonzero(mask)))
+
+    def begin_by(self, method: str) -> None:
+        """See ``Pool.begin_by``."""
+        self._pool.begin_by(ResetMethod(method))
 
     def save(self) -> int:
         """See ``Pool.save``; the snapshot stays here, and its number is returned."""

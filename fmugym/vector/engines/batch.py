@@ -25,10 +25,11 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.step import conclude
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
+from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results
-from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of, within
+from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, column, take
 
@@ -254,7 +255,8 @@ class BatchEngine(Engine):
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
             self._note_foreign(indices, not default)
-        self._place(plan.constant_variables, plan.constant_variables.values(), indices)
+        starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
+        self._place(plan.constant_variables, starts, indices)
         constant = plan.constant_parameters.keys() - plan.told.keys()
         given = {name: self._given[name][indices] for name in self._given if name in constant}
         self._place(given, given.values(), indices)
@@ -449,7 +451,7 @@ class BatchEngine(Engine):
             return
         stopped, failed = self._stopped(statuses), self._failed(statuses)
         if stopped.any():
-            result.infos.update({"fmu_terminated": stopped, "_fmu_terminated": stopped.copy()})
+            result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
         reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
         for index in _indices(wrong_rewards, ~failed):
             reasons[index] = f"_reward_policy returned {result.rewards[index]}{self._when(index)}"
@@ -479,9 +481,8 @@ class BatchEngine(Engine):
             self._undo(result, faulty & ~failed, reasons)
         texts = np.full(self._n, None, dtype=object)
         texts[faulty] = list(reasons.values())
-        rates = within(faulty, fault_rates(self._pool.health()))
-        result.infos.update({"fault": texts, "_fault": faulty})
-        result.infos.update({"fault_rate": rates, "_fault_rate": faulty.copy()})
+        rates = fault_rates(self._pool.health())
+        result.infos.update(coded({"fault": texts, "fault_rate": rates}, faulty))
         result.rewards[faulty] = config.fault_reward
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
+from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks import results
@@ -35,8 +37,8 @@ logger = logging.getLogger(__name__)
 
 _FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
 
-_SCALES = (1.0, -0.3, 10.0, 300.0, -1e5)
-"""The magnitudes of the states that programs are compared with hooks on."""
+_WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
+"""Magnitudes of other states that programs are compared with hooks on."""
 
 _make_tuple: Any = tuple.__new__  # takes a third of the time of a NamedTuple's constructor
 
@@ -57,13 +59,20 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
     try:
         _require_playable(env)
         task = trace_hooks(env)
-        require_same(env, sample_states(env, _SCALES), task)
+        require_same(env, sample_states(env, (1.0,)), task)
+        with suppress(IndexError):  # hooks may look up what is not in their tables
+            require_same(env, sample_states(env, _WILD_SCALES), task)
     except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
         logger.info("%s. They run on arrays, which is slower", text)
         return None
+    for why in task.left.values():
+        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
+        if required:
+            raise ConfigError(text)
+        logger.info("%s. It runs on arrays, the others are compiled", text)
     return task
 
 
@@ -107,15 +116,16 @@ class CompiledEngine(BatchEngine):
         self._prepared = False
         if task is None or not _can_draw(task, plan):
             return
-        self._names = plan.drawn_names
+        self._names, self._left = plan.drawn_names, task.left
         self._drawn_shape = len(self._names), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
-        self._keeps_actions = task.judgement.loads("load_action") or task.loads(
-            "load_previous_action"
-        )
+        reads_actions = task.judgement.loads("load_action") or task.loads("load_previous_action")
+        is_typed = not self.env._input_writer.all_real  # then an error may name the action
+        self._keeps_actions = reads_actions or is_typed or bool(task.left)
+        self._starts_here = not task.left and (bool(task.seen) or self.env._pool_observes)
         self._make_rows(task)
-        self._layout = _Layout(task, self._n)
+        self._layout = _Layout(task, self.env)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -204,7 +214,7 @@ class CompiledEngine(BatchEngine):
         flat = {name: row.reshape(-1, self._n) for name, row in self._rows.items()}
         before = {name: row.reshape(-1, self._n) for name, row in self._before.items()}
         constants = plan.constant_variables
-        keeps = not task.judgement.is_always_finite or bool(task.seen)
+        keeps = not task.judgement.is_always_finite or not self._starts_here or bool(task.seen)
         return {
             "kept": self._kept,
             "keeps_always": keeps or task.judgement.loads("kept"),
@@ -250,7 +260,7 @@ class CompiledEngine(BatchEngine):
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        if options or self._any_foreign or not self._prepared:
+        if options or self._any_foreign or not self._prepared or not self._starts_here:
             return super().reset(mask, seeds, options)
         self.has_moved = False
         if seeds is not None:
@@ -302,46 +312,92 @@ class CompiledEngine(BatchEngine):
         if self._any_foreign or not self._prepared:
             return self._step_on_arrays(actions, resetting)
         self._longest = self._limit  # this path does not count steps
-        seen = self._new_seen()
-        rewards = np.empty(self._n)
-        terminated, truncated = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
-        judged = rewards, terminated, truncated
         self.has_moved = False
-        if resetting is not None and self._draws_ahead:
+        if self._left or (resetting is not None and self._draws_ahead):
             actions = self._flat(actions)  # a refused step draws nothing
         drawn, last, started = self._draw_ahead(resetting), None, None
-        if self.starts_at_ends and not self._draws_ahead:
+        if self.starts_at_ends and not self._draws_ahead and self._starts_here:
             last, started = self._new_seen(), np.empty(self._n, _BOOL)
+        if "_get_inputs" in self._left:
+            self._call_get_inputs(actions, resetting)
+        rewards = np.empty(self._n)
+        judged = rewards, np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
+        seen = self._new_seen()
         play = self._play if resetting is started is None else self._play_with_resets
-        self.has_moved = True
+        arrays = seen, *judged, drawn, last, started
         try:
-            troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
+            troubled, ended, begun = play(actions, *arrays)
         except (TypeError, ValueError, BufferError) as error:
             require_refusal(error)
-            self.has_moved = False
-            actions = self._flat(actions)
+            troubled, ended, begun = play(self._flat(actions), *arrays)
+        except IndexError:  # of a hook
             self.has_moved = True
-            troubled, ended, begun = play(actions, seen, *judged, drawn, last, started)
+            raise
+        self.has_moved = True
         self.any_ended = ended > begun
-        observations, infos = self._divided(seen)
+        infos: dict[str, Any] = {}
         if resetting is not None:
-            infos |= _start_infos(self._names, drawn, resetting)
+            infos = _start_infos(self._names, drawn, resetting)
         elif begun:
-            infos = LateDict.of(self._infos_at_ends, infos, drawn, last, started)
-        result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
-        if troubled:
+            infos = LateDict.of(self._infos_at_ends, drawn, last, started)
+        result: StepResult = _make_tuple(StepResult, (seen, *judged, infos))
+        return self._completed(result, troubled, resetting, started)
+
+    def _completed(
+        self, result: StepResult, troubled: int, resetting: MaskArray | None, started: Any
+    ) -> StepResult:
+        """Add what the pool does not do itself; that is nothing for most tasks."""
+        if self._layout.has_own:
+            observations, infos = self._divided(result.observations)
+            result = result._replace(observations=observations, infos=infos | result.infos)
+        if self._left:
+            result = self._with_hooks_left(result, resetting)
+        if troubled or self._left:
             self._mend(result, resetting if started is None else started)
         return result
 
-    def _infos_at_ends(
-        self, infos: dict[str, Any], drawn: FloatArray, last: Any, started: MaskArray
-    ) -> dict[str, Any]:
+    def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:
         """The infos of a step in which episodes have followed others."""
-        observations, last_infos = self._divided(last)
+        observations, infos = self._divided(last)
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
-        final = final_infos(objects, restricted(last_infos, started), started)
-        return infos | _start_infos(self._names, drawn, started) | final
+        final = final_infos(objects, restricted(infos, started), started)
+        return _start_infos(self._names, drawn, started) | final
+
+    def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
+        """Call this hook on arrays, before the pool takes over the actions."""
+        env = self.env
+        before = env.action, env.previous_action, env.previous_state
+        env.previous_action, env.action = env.action, np.moveaxis(actions, 0, -1)
+        env.previous_state, env._in_hooks = env.state.copy(), True
+        try:
+            self._write_inputs(env._get_inputs(), resetting)
+        finally:
+            env._in_hooks = False
+            env.action, env.previous_action, env.previous_state = before
+
+    def _with_hooks_left(self, result: StepResult, resetting: MaskArray | None) -> StepResult:
+        """Call the hooks that are not compiled, in their order."""
+        env, left, n = self.env, self._left, self._n
+        observations, infos = result.observations, result.infos
+        env.done, env._in_hooks = result.terminated.copy(), True
+        idle = slice(0) if resetting is None else resetting
+        try:
+            if "_is_truncated" in left:
+                flags = results.flags("_is_truncated", env._is_truncated(), n)
+                flags[idle] = False
+                np.logical_or(result.truncated, flags, out=result.truncated)
+                self.note_ends(result.terminated, result.truncated)
+            if "_reward_policy" in left:
+                result.rewards[:] = results.rewards(env._reward_policy(), n)
+                result.rewards[idle] = 0.0
+            if "_get_observation" in left:
+                observations = self._observe()
+            if "_get_info" in left:
+                infos = self._infos(np.ones(n, np.bool_)) | infos
+        finally:
+            env._in_hooks = False
+        return result._replace(observations=observations, infos=infos)
 
     def _flat(self, actions: Any) -> npt.NDArray[Any]:
         """The actions as the pool takes them, environments first.
@@ -405,11 +461,12 @@ class _Layout:
 
     Args:
         task: The programs.
-        num_envs: N.
+        env: The environment, with the arrays of N.
     """
 
-    def __init__(self, task: TracedTask, num_envs: int) -> None:
-        self.has_own = bool(task.seen)
+    def __init__(self, task: TracedTask, env: FMUEnv) -> None:
+        num_envs = len(env.step_count)
+        self.has_own = bool(task.seen) or not env._pool_observes
         self._shapes = [((num_envs, *array.shape), array.dtype) for array in task.seen]
         self._paths = [array.path for array in task.seen]
         self._is_plain = self._paths == [("observation",)]
@@ -429,16 +486,7 @@ class _Layout:
             for parent in parents:
                 place = place.setdefault(parent, {})
             place[name] = array
-        return tree["observation"], _masked(tree["info"], num_envs)
-
-
-def _masked(infos: Mapping[str, Any], count: int) -> dict[str, Any]:
-    """Infos of all environments, with their masks."""
-    values = {
-        name: _masked(value, count) if type(value) is dict else value
-        for name, value in infos.items()
-    }
-    return values | {f"_{name}": np.ones(count, np.bool_) for name in values}
+        return tree["observation"], with_masks(tree["info"], np.ones(num_envs, np.bool_))
 
 
 def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
@@ -446,5 +494,4 @@ def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[s
 
 
 def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    named = dict(zip(names, np.where(mask, drawn, 0.0), strict=True))
-    return named | {f"_{name}": mask.copy() for name in named}
+    return coded(dict(zip(names, drawn, strict=True)), mask)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -18,12 +18,11 @@ from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
+from fmugym.vector.codec import gathered
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 
 __all__ = ["PerEnvEngine"]
-
-AddInfo = Callable[[dict[str, Any], dict[str, Any], int], dict[str, Any]]
 
 
 class PerEnvEngine(Engine):
@@ -36,7 +35,6 @@ class PerEnvEngine(Engine):
         pool: Their pool of N instances.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
         action_space: The space of the actions of all environments.
-        add_info: Merges the info of one environment into that of all.
     """
 
     def __init__(
@@ -45,7 +43,6 @@ class PerEnvEngine(Engine):
         pool: Pool,
         max_episode_steps: int | None,
         action_space: Any,
-        add_info: AddInfo,
     ) -> None:
         super().__init__(len(envs))
         self._envs, self._pool = envs, pool
@@ -56,7 +53,6 @@ class PerEnvEngine(Engine):
         self._together = not any(env._own.step for env in envs)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
-        self._add_info = add_info
         self._space = envs[0].observation_space
         self._observations: list[Any] = [None] * len(envs)
 
@@ -105,15 +101,13 @@ class PerEnvEngine(Engine):
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        infos: dict[str, Any] = {}
+        infos: dict[int, dict[str, Any]] = {}
         self.has_moved = False
         for index in np.flatnonzero(mask).tolist():
             seed = None if seeds is None else seeds[index]
-            self._observations[index], info = self._reset(index, seed, options)
-            if info:
-                infos = self._with_info(infos, info, index)
+            self._observations[index], infos[index] = self._reset(index, seed, options)
         self.note_starts(mask)
-        return self._stacked(), infos
+        return self._stacked(), gathered(infos, len(self._envs))
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
@@ -132,7 +126,7 @@ class PerEnvEngine(Engine):
             raise
 
     def _results(self, items: Sequence[Any], idle: Sequence[bool]) -> StepResult:
-        infos: dict[str, Any] = {}
+        infos: dict[int, dict[str, Any]] = {}
         rewards, terminated, truncated = [], [], []
         statuses = self._pool.statuses.tolist()
         for index, (env, action) in enumerate(zip(self._envs, items, strict=True)):
@@ -147,10 +141,11 @@ class PerEnvEngine(Engine):
             terminated.append(ended)
             truncated.append(cut_off or env.step_count >= self._limit)
             if info:
-                infos = self._with_info(infos, info, index)
+                infos[index] = info
         ends = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
         self.note_ends(*ends)
-        return StepResult(self._stacked(), np.array(rewards, np.float64), *ends, infos)
+        told = gathered(infos, len(items))
+        return StepResult(self._stacked(), np.array(rewards, np.float64), *ends, told)
 
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
@@ -211,15 +206,6 @@ class PerEnvEngine(Engine):
         if len(items) != len(self._envs):
             raise ConfigError(f"there are {len(items)} actions, expected {len(self._envs)}")
         return items
-
-    def _with_info(self, infos: dict[str, Any], info: Any, index: int) -> dict[str, Any]:
-        """Merge the info of one environment; Gymnasium merges only what its types can hold."""
-        try:
-            return self._add_info(infos, info, index)
-        except Exception:  # users' infos may raise anything
-            raise ConfigError(
-                f"environment {index}: its info does not fit those of the others: {shown(info)}"
-            ) from None
 
     def _stacked(self) -> Any:
         empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)

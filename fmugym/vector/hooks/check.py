@@ -121,7 +121,7 @@ def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> Readings:
             batch.previous_state[:, index] *= scale
     for name, values in rows.items():
         if name in batch.variables:
-            batch.variables[name] = np.array(values)
+            batch.variables[name] = np.moveaxis(np.array(values), 0, -1)
     batch.parameters = {n: np.array(v) for n, v in rows.items() if n not in batch.variables}
     return batch
 

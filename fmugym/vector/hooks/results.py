@@ -18,7 +18,7 @@ from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.results import given
-from fmugym.vector.infos import within
+from fmugym.vector.codec import coded
 
 __all__ = [
     "environments_first",
@@ -180,23 +180,24 @@ def restore_variable(
 
 def info_arrays(info: Any, mask: MaskArray) -> dict[str, Any]:
     """Turn the result of ``_get_info``, environments last, into infos of those in a mask."""
+    return coded(_info_rows(info, len(mask)), mask)
+
+
+def _info_rows(info: Any, count: int) -> dict[str, Any]:
     given(info, "_get_info")
     named = check_mapping("what _get_info returned", info)
-    values = {name: _info_array(name, value, mask) for name, value in named.items()}
-    return values | {f"_{name}": mask.copy() for name in values}
+    return {name: _info_row(name, value, count) for name, value in named.items()}
 
 
-def _info_array(name: str, value: Any, mask: MaskArray) -> Any:
-    count = len(mask)
+def _info_row(name: str, value: Any, count: int) -> Any:
     wanted = f"as {name!r} one value, or an array with {count} elements in the last axis"
     with _expected("_get_info", value, wanted):
         if isinstance(value, Mapping):
-            return info_arrays(value, mask)
+            return _info_rows(value, count)
         array = np.asarray(value)
         if array.ndim and array.shape[-1] != count:
             raise _mismatch("_get_info", value, wanted)
-        rows = environments_first(array) if array.ndim else _everywhere(value, array, count)
-        return within(mask, rows)
+        return environments_first(array) if array.ndim else _everywhere(value, array, count)
 
 
 def _everywhere(value: Any, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -68,6 +67,8 @@ class TracedTask:
         seen: The arrays that the second program stores.
         variables: The types of the episode variables by name.
         updated: The names of the variables that ``_update`` writes.
+        left: The hooks that cannot be traced, and why. They run on arrays; no other hook needs
+            what they return.
     """
 
     inputs: Program
@@ -75,6 +76,7 @@ class TracedTask:
     seen: tuple[SeenArray, ...]
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
+    left: Mapping[str, str]
 
     def loads(self, kind: str) -> bool:
         """Whether one of the programs loads values of this kind."""
@@ -88,8 +90,8 @@ def trace_hooks(env: FMUEnv) -> TracedTask:
         env: A prototype whose actions make an array.
 
     Raises:
-        UntraceableError: If the hooks do what a program cannot do; the text names the hook, the
-            line and what it does.
+        UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
+            program cannot do; the text names the hook, the line and what it does.
     """
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
@@ -108,6 +110,7 @@ class _Tracer:
         self._env = env
         self._graph = Graph()
         self._contents = Contents(env)
+        self._left: dict[str, str] = {}
         self._tables = dict(_tables(env))
         self._variables: dict[str, np.dtype[Any]] = {
             name: np.dtype(np.float64) for name in env.variables
@@ -126,18 +129,21 @@ class _Tracer:
         raise UntraceableError("_update gives a variable another type in each step")
 
     def _traced(self) -> TracedTask:
+        self._left = {}
         inputs = self._trace_inputs()
         self._begin(judging=True)
         stores, updated = self._trace_update()
-        done = self._flag("_is_done")
+        done = int(self._call("_is_done", self._flag_node))
         stopped = self._graph.load("stopped", None, np.bool_, None)
         results = [self._or(done, stopped)]
         self._env.done = self._whole(results[0], np.dtype(np.bool_))
-        results.append(self._flag("_is_truncated"))
-        results.append(self._reward())
+        results.append(self._or_left("_is_truncated", self._flag_node, np.False_))
+        results.append(self._or_left("_reward_policy", self._reward_node, np.float64(0.0)))
         seen, more = self._trace_seen()
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
-        return TracedTask(inputs, judgement, tuple(seen), dict(self._variables), updated)
+        return TracedTask(
+            inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
+        )
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
@@ -181,9 +187,13 @@ class _Tracer:
 
     def _trace_inputs(self) -> Program:
         self._begin(judging=False)
-        nodes = self._call("_get_inputs", self._input_nodes)
-        stores = [Store(int(node), ("input", index)) for index, node in enumerate(nodes)]
-        return compile_graph(self._graph, stores, [], 0)
+        try:
+            nodes = self._call("_get_inputs", self._input_nodes)
+            stores = [Store(int(node), ("input", index)) for index, node in enumerate(nodes)]
+            return compile_graph(self._graph, stores, [], 0)
+        except UntraceableError as reason:
+            self._left["_get_inputs"] = str(reason)
+            return compile_graph(Graph(), [], [], 0)
 
     def _input_nodes(self, value: Any) -> list[int]:
         variables = self._env._interface.inputs
@@ -254,8 +264,13 @@ class _Tracer:
             cells[place] = choose(active, assigned, present)
         return Symbols(self._graph, cells, old.dtype, writeable=False)
 
-    def _flag(self, name: str) -> int:
-        return int(self._call(name, self._flag_node))
+    def _or_left(self, name: str, of: Callable[[Any], Any], constant: Any) -> int:
+        """Trace a hook. If that fails, leave it to numpy; a constant takes its place."""
+        try:
+            return int(self._call(name, of))
+        except UntraceableError as reason:
+            self._left[name] = str(reason)
+            return self._graph.constant(constant, constant.dtype).node
 
     def _flag_node(self, value: Any) -> Any:
         symbols = as_symbols(self._graph, value)
@@ -265,24 +280,34 @@ class _Tracer:
                 raise UntraceableError("a flag is no Boolean")
         return self._nodes(symbols, (), np.bool_)
 
-    def _reward(self) -> int:
-        return int(self._call("_reward_policy", lambda value: self._nodes(value, (), np.float64)))
+    def _reward_node(self, value: Any) -> Any:
+        return self._nodes(value, (), np.float64)
 
     def _trace_seen(self) -> tuple[list[SeenArray], list[Store]]:
-        """Trace the observation unless the pool makes it, and the info if there is one."""
+        """Trace the info if there is one, and the observation unless the pool makes it."""
+        env = self._env
+        infos = self._seen("_get_info", self._see_info) if env._has_info else ([], [])
+        if env._pool_observes and not infos[0]:
+            return infos
+        seen, stores = self._seen("_get_observation", self._see_observation)
+        shift = len(seen)
+        moved = [s._replace(slot=(s.slot[0] + shift, *s.slot[1:])) for s in infos[1]]
+        return seen + infos[0], stores + moved
+
+    def _seen(self, name: str, see: Callable[..., None]) -> tuple[list[SeenArray], list[Store]]:
+        """The arrays that a hook fills; none if it is left to numpy."""
         seen: list[SeenArray] = []
         stores: list[Store] = []
-        env = self._env
-        if not env._pool_observes or env._has_info:
-            space = env.observation_space
-
-            def observe(value: Any) -> None:
-                self._see(("observation",), value, space, seen, stores)
-
-            self._call("_get_observation", observe)
-        if env._has_info:
-            self._call("_get_info", lambda value: self._see_info(("info",), value, seen, stores))
+        try:
+            self._call(name, lambda value: see(value, seen, stores))
+            compile_graph(self._graph, stores, [], len(seen))
+        except UntraceableError as reason:
+            self._left[name] = str(reason)
+            return [], []
         return seen, stores
+
+    def _see_observation(self, value: Any, seen: list[SeenArray], stores: list[Store]) -> None:
+        self._see(("observation",), value, self._env.observation_space, seen, stores)
 
     def _see(
         self,
@@ -308,11 +333,15 @@ class _Tracer:
         return self._nodes(symbols, shape, dtype)
 
     def _see_info(
-        self, path: tuple[str, ...], value: Any, seen: list[SeenArray], stores: list[Store]
+        self,
+        value: Any,
+        seen: list[SeenArray],
+        stores: list[Store],
+        path: tuple[str, ...] = ("info",),
     ) -> None:
         for name, part in dict(value).items():
             if isinstance(part, Mapping):
-                self._see_info((*path, name), part, seen, stores)
+                self._see_info(part, seen, stores, (*path, name))
                 continue
             symbols = as_symbols(self._graph, part)
             if symbols.ndim == 0:
@@ -339,24 +368,24 @@ def _rounded(variable: Any, value: Any) -> Any:
     """The nearest integer, or the nearest item of an Enumeration; NaN outside of the range."""
     low, high = variable.integer_limits
     largest = 2.0**53
-    rounded: Any = np.rint(value)
-    items = sorted(item for _, item in variable.items)
+    rounded: Any = np.rint(value) + 0.0  # an integer has no negative zero
+    items = [item for _, item in variable.items]
     if items:
-        low, high = items[0], items[-1]
+        low, high = min(items), max(items)
         rounded = _nearest(items, rounded)
     within = (rounded >= float(max(low, -largest))) & (rounded <= float(min(high, largest)))
     return np.where(within, rounded, np.where(np.isfinite(value), np.nan, value))
 
 
 def _nearest(items: list[int], value: Any) -> Any:
-    """The nearest of rising items; of two that are as near, the smaller one."""
-    if items == list(range(items[0], items[-1] + 1)):
+    """The nearest of some items, the first of those that are as near; others stay."""
+    if set(items) == set(range(min(items), max(items) + 1)):
         return value
-    inside = (value >= items[0]) & (value <= items[-1])
-    nearest: Any = np.where(inside, float(items[0]), value)
-    for before, item in pairwise(items):
-        nearest = np.where(inside & (value - before > item - value), float(item), nearest)
-    return nearest
+    nearest: Any = np.full_like(value, float(items[0]))
+    for item in items[1:]:
+        nearest = np.where(abs(item - value) < abs(nearest - value), float(item), nearest)
+    inside = (value >= min(items)) & (value <= max(items))
+    return np.where(inside, nearest, value)
 
 
 def _placed(env: FMUEnv, name: str, error: Exception) -> str:

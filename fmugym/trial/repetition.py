@@ -1,0 +1,156 @@
+"""The rehearsal repeated in training: a spare instance plays a recorded episode again.
+
+The spare is a fresh instance in a process of its own. It cannot harm the training, and its library
+shares nothing with the others. If it gives other outputs than the training has seen, the reset
+method does not make instances like new. Later episodes then begin by the next method, and so do
+those of later environments.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from fmugym.errors import FMUGymError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.tape import Tape
+from fmugym.trial.rehearsal import difference, tolerance_of
+from fmugym.trial.trial import Candidate
+from fmugym.trial.verdict import Grade, Verdict
+
+__all__ = ["Repetition"]
+
+_silent: Final = logging.Logger("fmugym.trial.spare", logging.CRITICAL + 1)
+"""Drops what the spare says: the FMU says the same in training."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The outputs before the first step and after each, and the statuses of the steps."""
+
+    rows: FloatArray
+    statuses: tuple[int, ...]
+
+    @classmethod
+    def of(cls, tape: Tape) -> _Run:
+        """What the training has seen."""
+        return cls(np.vstack([tape.first_outputs, tape.outputs]), tuple(tape.statuses.tolist()))
+
+    def until(self, step: int) -> tuple[bytes, tuple[int, ...]]:
+        """The run up to a step; equal runs are the same to the last bit."""
+        return self.rows[: step + 1].tobytes(), self.statuses[:step]
+
+    def equals(self, other: _Run) -> bool:
+        """Whether two runs are the same to the last bit."""
+        return self.until(len(self.rows)) == other.until(len(other.rows))
+
+
+class Repetition:
+    """Judges recorded episodes; a ``fmugym.pool.tape.Judge``.
+
+    Args:
+        candidate: The FMU.
+        spec: That of the pool that records.
+        verdict: That of the trial.
+        native: Whether the spare is stepped by the native pool.
+        revise: Keeps a new verdict for later environments.
+        log: Is warned if episodes do not begin anew.
+    """
+
+    def __init__(
+        self,
+        candidate: Candidate,
+        spec: PoolSpec,
+        verdict: Verdict,
+        native: bool,
+        revise: Callable[[Verdict], None],
+        log: logging.Logger,
+    ) -> None:
+        self._candidate, self._spec, self._verdict = candidate, spec, verdict
+        self._native, self._revise, self._log = native, revise, log
+
+    def __call__(self, tape: Tape, begin_by: Callable[[ResetMethod], bool]) -> bool:
+        """See ``fmugym.pool.tape.Judge``."""
+        name, seen = self._candidate.path.name, _Run.of(tape)
+        try:
+            fresh = self._play(tape)
+            if self._is_close(seen, fresh):
+                self._log.info("%s: a fresh instance repeats %d steps", name, len(tape.inputs))
+                return True
+            if not fresh.equals(self._play(tape)):
+                self._log.info("%s: two fresh instances differ, nothing can be compared", name)
+                return False
+        except FMUGymError as error:
+            self._log.info("%s: no spare instance plays an episode again: %s", name, error)
+            return False
+        return self._go_down(self._describe(seen, fresh), begin_by)
+
+    def _play(self, tape: Tape) -> _Run:
+        """Play a recorded episode on a fresh instance."""
+        spec = replace(self._spec, reset_method=ResetMethod.RESET, leak_limit=None)
+        pool = ProcessPool(self._candidate.open(), spec, 1, _silent, native=self._native, workers=1)
+        try:
+            return _played(pool, tape)
+        finally:
+            pool.close()
+
+    def _is_close(self, seen: _Run, fresh: _Run) -> bool:
+        if seen.equals(fresh):
+            return True
+        loose = self._verdict.resets.get(self._spec.reset_method) is Grade.TOLERANCE
+        if not loose or seen.statuses != fresh.statuses:
+            return False
+        return difference(seen.rows, fresh.rows) <= tolerance_of(self._spec)
+
+    def _describe(self, seen: _Run, fresh: _Run) -> str:
+        """Name the first difference: the step, and its statuses or a variable with its values."""
+        step = next(i for i in range(len(seen.rows)) if seen.until(i) != fresh.until(i))
+        if step and seen.statuses[step - 1] != fresh.statuses[step - 1]:
+            got, expected = (Status(run.statuses[step - 1]).name.title() for run in (seen, fresh))
+            return f"step {step} returned {got}, and {expected} with a fresh instance"
+        rows = seen.rows[step].tolist(), fresh.rows[step].tolist()
+        index = next(i for i, (a, b) in enumerate(zip(*rows, strict=True)) if repr(a) != repr(b))
+        name = self._spec.outputs[index].name
+        got, expected = rows[0][index], rows[1][index]
+        return f"{name} was {got!r} after {step} steps, and {expected!r} with a fresh instance"
+
+    def _go_down(self, what: str, begin_by: Callable[[ResetMethod], bool]) -> bool:
+        """Take the next reset method; returns whether this pool can do so."""
+        used = self._spec.reset_method
+        bad = (Grade.WRONG, Grade.FAILS)
+        lower = [m for m in list(ResetMethod) if self._verdict.resets.get(m) not in bad]
+        lower = [m for m in lower if list(ResetMethod).index(m) > list(ResetMethod).index(used)]
+        method = lower[0] if lower else ResetMethod.PROCESS
+        now = begin_by(method)
+        name = self._candidate.path.name
+        self._log.warning(
+            "%s does not begin anew by the method %r: %s. %s begin by the method %r",
+            *(name, str(used), what),
+            *("Episodes now" if now else "The episodes of later environments", str(method)),
+        )
+        resets = dict(self._verdict.resets) | {used: Grade.WRONG, method: Grade.BITWISE}
+        reason = f"in training, with the method {str(used)!r}, {what}"
+        reasons = (*self._verdict.reasons, reason)
+        self._verdict = replace(self._verdict, resets=resets, reasons=reasons)
+        self._spec = replace(self._spec, reset_method=method)
+        self._revise(self._verdict)
+        return now
+
+
+def _played(pool: Pool, tape: Tape) -> _Run:
+    outputs, statuses = pool.reset(tape.variables, tape.starts[:, None])
+    rows, codes = [outputs[:, 0].copy()], []
+    for row in tape.inputs:
+        if statuses[0] > Status.WARNING:
+            break
+        outputs, statuses = pool.step(row[:, None])
+        rows.append(outputs[:, 0].copy())
+        codes.append(int(statuses[0]))
+    return _Run(np.array(rows), tuple(codes))

@@ -1,0 +1,127 @@
+"""The form of infos of N environments, and the ways into it and out of it.
+
+Infos are arrays by name with environments on the first axis, each with a mask that says which
+environments it is for: ``infos["x"]`` and ``infos["_x"]``, as in Gymnasium's vector environments.
+Outside of its mask an array holds zeros, or None where it holds objects. A dict in an info becomes
+a dict of such arrays, with a mask of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import MaskArray
+
+__all__ = ["coded", "gathered", "handed_out", "with_masks", "within"]
+
+
+def within(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Copy values of environments, but zero (or None) outside of a mask."""
+    result = np.zeros_like(values) if values.dtype != object else np.full_like(values, None)
+    result[mask] = values[mask]
+    return result
+
+
+def with_masks(values: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+    """Make infos of arrays that are zero, or None, outside of a mask already."""
+    infos: dict[str, Any] = {}
+    for name, value in values.items():
+        infos[name] = with_masks(value, mask) if isinstance(value, Mapping) else value
+        infos[f"_{name}"] = mask.copy()
+    return infos
+
+
+def coded(rows: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+    """Make infos of the environments in a mask from arrays of all environments."""
+    return with_masks(_within_all(rows, mask), mask)
+
+
+def _within_all(rows: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+    return {
+        name: _within_all(row, mask) if isinstance(row, Mapping) else within(mask, row)
+        for name, row in rows.items()
+    }
+
+
+def gathered(infos: Mapping[int, Mapping[str, Any]], count: int) -> dict[str, Any]:
+    """Make infos of those of single environments.
+
+    The first value of a name decides on the type: numbers make an array of numbers, arrays an array
+    with one more axis, dicts a dict, and anything else an array of objects.
+
+    Args:
+        infos: The infos by the number of the environment.
+        count: N.
+
+    Raises:
+        ConfigError: If a value does not fit the first one of its name.
+    """
+    result: dict[str, Any] = {}
+    for name in dict.fromkeys(name for info in infos.values() for name in info):
+        own = {index: info[name] for index, info in infos.items() if name in info}
+        mask = np.zeros(count, np.bool_)
+        mask[list(own)] = True
+        result[name], result[f"_{name}"] = _gathered_values(name, own, count), mask
+    return result
+
+
+def _gathered_values(name: str, own: Mapping[int, Any], count: int) -> Any:
+    first = next(iter(own.values()))
+    if isinstance(first, dict):
+        for index, value in own.items():
+            if not isinstance(value, dict):
+                raise _misfit(name, index, value)
+        return gathered(own, count)
+    values = _empty_for(first, count)
+    for index, value in own.items():
+        try:
+            values[index] = value
+        except Exception:  # users' infos may raise anything
+            raise _misfit(name, index, value) from None
+    return values
+
+
+def _empty_for(value: Any, count: int) -> npt.NDArray[Any]:
+    kind = type(value)
+    if kind in (int, float, bool) or issubclass(kind, np.number):
+        return np.zeros(count, kind)
+    if isinstance(value, np.ndarray):
+        return np.zeros((count, *value.shape), value.dtype)
+    return np.full(count, None, object)
+
+
+def _misfit(name: str, index: int, value: Any) -> ConfigError:
+    return ConfigError(
+        f"environment {index}: its info does not fit those of the others: {name!r} is "
+        f"{shown(value)}"
+    )
+
+
+def handed_out(infos: Mapping[str, Any], into: Any) -> None:
+    """Write infos to the dicts of single environments; numbers become Python's.
+
+    Args:
+        infos: The infos.
+        into: The dict of each environment, by number.
+    """
+    for name, values in infos.items():
+        mask = infos.get(f"_{name}")
+        if mask is None:  # it is a mask itself
+            continue
+        indices = np.flatnonzero(mask).tolist()
+        for index, value in zip(indices, _parts(values, indices), strict=True):
+            into[index][name] = value
+
+
+def _parts(values: Any, indices: list[int]) -> list[Any]:
+    if isinstance(values, Mapping):
+        parts: dict[int, Any] = {index: {} for index in indices}
+        handed_out(values, parts)
+        return list(parts.values())
+    chosen = values[indices]
+    return chosen.tolist() if chosen.ndim == 1 else list(chosen)

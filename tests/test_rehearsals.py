@@ -1,0 +1,249 @@
+"""Episodes of the training are played again by a spare instance, and what follows from it."""
+
+import functools
+import logging
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zoo_tools
+from fmu_tools import library_name, write_fmu
+
+import fmugym
+from fmugym.pool import tape
+from fmugym.pool.tape import Rehearsals
+from fmugym.trial.trial import known_verdict
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
+
+STEP = 0.5
+SOURCE = Path(__file__).parent / "tires.c"
+XML = """<fmiModelDescription fmiVersion="2.0" modelName="Tires" guid="{token}">
+<CoSimulation modelIdentifier="Tires" canGetAndSetFMUstate="{states}"/>
+<ModelVariables>
+<ScalarVariable name="u" valueReference="0" causality="input">
+<Real start="0" min="-1" max="1"/></ScalarVariable>
+<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="gain" valueReference="2" causality="parameter" variability="fixed">
+<Real start="1"/></ScalarVariable>
+</ModelVariables><ModelStructure/></fmiModelDescription>"""
+WAYS = {
+    "native": {"backend": "native"},
+    "python": {"backend": "python"},
+    "isolated": {"backend": "native", "isolation": "process"},
+}
+all_ways = pytest.mark.parametrize("way", WAYS)
+
+
+@functools.cache
+def library():
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "Tires.so"
+        flags = ["-shared", "-fPIC", "-O1", "-Wall", "-Wno-unused-parameter"]
+        subprocess.run([*zoo_tools.compiler(), *flags, SOURCE, "-o", path], check=True)
+        return path.read_bytes()
+
+
+class TiringEnv(fmugym.FMI2CSEnv):
+    def __init__(self, path, gain=1.0, backend=None, isolation=None, **config):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "model_parameters": {"gain": gain},
+            "time_step": STEP,
+        } | config
+        super().__init__(path, config, logging.INFO, backend=backend, isolation=isolation)
+
+    def _is_done(self):
+        return self.state[0] > 1e9
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch, tmp_path):
+    """Rehearse after a few episodes, and let the trial cache what it finds."""
+    monkeypatch.setattr(tape, "_FIRST_RESETS", 16)
+    monkeypatch.setattr(tape, "_FIRST_STEPS", 32)
+    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def make_fmu(tmp_path):
+    def make(token, states=None):
+        able = "restore" in token if states is None else states
+        files = {
+            "modelDescription.xml": XML.format(token=token, states=str(able).lower()),
+            library_name(2, "Tires"): library(),
+        }
+        return write_fmu(tmp_path / "Tires.fmu", files)
+
+    return make
+
+
+def play(env, episodes, steps=3):
+    """Play episodes with an input of 1; returns the last outputs of each."""
+    ends = []
+    for _ in range(episodes):
+        env.reset()
+        for _ in range(steps):
+            env.step(np.ones(1, np.float32))
+        ends.append(float(env.state[0]))
+    return ends
+
+
+def warnings(caplog):
+    found = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+    return [text for text in found if "begin anew" in text]
+
+
+@all_ways
+@pytest.mark.parametrize("token", ["reset", "restore"])
+def test_a_method_that_tires_is_replaced(make_fmu, way, token, caplog):
+    path = make_fmu(token)
+    env = TiringEnv(path, **WAYS[way])
+    assert env.reset_method == token
+    ends = play(env, 500)
+    (text,) = warnings(caplog)
+    lower = "reset" if token == "restore" else "instance"
+    assert f"Tires.fmu does not begin anew by the method {token!r}: y was" in text
+    assert "1.0 after 1 steps, and 0.5 with a fresh instance" in text
+    assert text.endswith(f"Episodes now begin by the method {lower!r}")
+    assert set(ends[:50]) == {1.5}
+    assert len(set(ends[50:150])) > 1
+    assert set(ends[-50:]) == {1.5}
+    assert env.reset_method == lower
+    assert env.health["rehearsals"] >= 2
+    env.close()
+    again = TiringEnv(path, **WAYS[way])
+    assert again.reset_method == lower
+    again.close()
+    verdict = known_verdict(fmugym.FMU(path))
+    assert verdict.reset_method == lower
+    assert f"in training, with the method {token!r}, y was 1.0" in verdict.reasons[-1]
+
+
+def test_what_a_pool_cannot_do_is_left_to_later_environments(make_fmu, caplog):
+    """Instances share the library, so it cannot be loaded anew for one of them."""
+    path = make_fmu("stubborn instance")
+    env = TiringEnv(path, **WAYS["native"])
+    assert env.reset_method == "instance"
+    play(env, 200)
+    text = warnings(caplog)[-1]
+    assert text.endswith("The episodes of later environments begin by the method 'library'")
+    env.close()
+    env = TiringEnv(path, **WAYS["native"])
+    assert env.reset_method == "library"
+    assert set(play(env, 100)) == {1.5}
+    env.close()
+
+
+@all_ways
+def test_a_step_that_fails(make_fmu, way, caplog):
+    env = TiringEnv(make_fmu("reset fails"), **WAYS[way])
+    for _ in range(500):
+        env.reset()
+        env.step(np.ones(1, np.float32))
+    (text,) = warnings(caplog)
+    assert "step 1 returned Error, and Ok with a fresh instance" in text
+    env.close()
+
+
+@pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 2}, {"isolation": "process"}])
+def test_a_vector_environment(make_fmu, caplog, options):
+    """With compiled hooks, too: the recording is made where the steps are done."""
+    path = make_fmu("restore")
+    envs = fmugym.FMUVectorEnv(lambda: TiringEnv(path, max_episode_steps=3), 4, **options)
+    envs.reset(seed=0)
+    ends = []
+    for _ in range(1600):
+        observations, _, _, truncated, _ = envs.step(np.ones((4, 1), np.float32))
+        ends += observations[truncated, 0].tolist()
+    assert len(warnings(caplog)) == 1
+    assert set(ends[:200]) == {1.5}
+    assert len(set(ends)) > 1
+    assert set(ends[-200:]) == {1.5}
+    assert envs.health["rehearsals"].tolist() == [envs.health["rehearsals"][0]] * 4
+    envs.close()
+
+
+@all_ways
+def test_a_well_behaved_fmu_notices_nothing(make_fmu, way, caplog):
+    """Drawn start values, moving inputs, states restored and snapshots of the caller."""
+    gain = fmugym.Uniform(0.5, 1.5)
+    results = []
+    for rehearsals in (True, False):
+        path = make_fmu("fine", states=True)
+        env = TiringEnv(path, gain, rehearsals=rehearsals, **WAYS[way])
+        env.reset(seed=3)
+        ends = []
+        for index in range(400):
+            env.reset()
+            for _ in range(1 + index % 70):
+                env.step(env.action_space.low * np.sin(index).astype(np.float32))
+            ends.append(env.state[0])
+        results.append(ends)
+        assert env.health["rehearsals"] == (3 if rehearsals else 0)
+        env.close()
+    assert results[0] == results[1]
+    assert warnings(caplog) == []
+    assert not [r for r in caplog.records if "differ" in r.getMessage()]
+
+
+def test_noise_is_no_reason(make_fmu, caplog, monkeypatch):
+    env = TiringEnv(make_fmu("restore noise"), **WAYS["native"])
+    monkeypatch.setenv("TIRES_NOISE", "1")
+    play(env, 100)
+    assert warnings(caplog) == []
+    assert "two fresh instances differ" in caplog.text
+    assert env.reset_method == "restore"
+    env.close()
+
+
+class TestWhoRehearses:
+    def count(self, path, **config):
+        env = TiringEnv(path, **config)
+        play(env, 40)
+        count = env.health["rehearsals"]
+        env.close()
+        return count
+
+    def test_config(self, make_fmu):
+        path = make_fmu("fine")
+        assert self.count(path) == 1
+        assert self.count(path, rehearsals=False) == 0
+        assert self.count(path, reset_method="reset") == 0
+        assert self.count(path, probe_timeout=None) == 0
+        assert self.count(path, max_instances=1) == 0
+        assert self.count(path, max_instances=2) == 1
+        with pytest.raises(fmugym.ConfigError, match="rehearsals"):
+            TiringEnv(path, rehearsals="no")
+
+    def test_bundled_fmus_do_not(self):
+        env = fmugym.envs.CartPoleEnv()
+        for _ in range(60):
+            env.reset()
+            env.step(0)
+        assert env.health["rehearsals"] == 0
+        env.close()
+
+
+def test_how_often(monkeypatch):
+    """The bound on the cost: starts and steps of all rehearsals so far, per thousand."""
+    monkeypatch.undo()
+
+    class Pool:
+        num_instances = 8
+
+    pool = Pool()
+    rehearsals = Rehearsals(pool, lambda *_: True)
+    resets = 0
+    for count in range(1, 12):
+        more, steps = rehearsals.next()
+        resets += 8 * more
+        assert count <= 1e-3 * resets
+        assert count * 2 * tape.TAPE_ROWS <= 1e-3 * 8 * steps
+        rehearsals.count += 1
+    assert 8 * steps < 11 * 2**24

@@ -1,0 +1,91 @@
+"""The form of infos is that of Gymnasium's vector environments, whichever way leads into it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from vector_tools import require_equal, require_same_infos
+
+from fmugym import ConfigError
+from fmugym.vector.codec import coded, gathered, handed_out, with_masks
+
+COUNT = 4
+NUMBERS = st.integers(-100, 100) | st.floats(-1e6, 1e6) | st.booleans()
+KINDS = {
+    "integer": st.integers(-100, 100),
+    "number": st.floats(-1e6, 1e6),
+    "flag": st.booleans(),
+    "single": st.floats(-100.0, 100.0, width=32).map(np.float32),
+    "numpy flag": st.booleans().map(np.bool_),
+    "text": st.text(max_size=3),
+    "array": st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=2).map(np.array),
+}
+FLAT = st.fixed_dictionaries({}, optional=KINDS)
+NESTED = st.fixed_dictionaries({}, optional=KINDS | {"inner": FLAT})
+INFOS = st.dictionaries(st.integers(0, COUNT - 1), NESTED)
+
+
+def by_gymnasium(infos):
+    env = gym.vector.VectorEnv()
+    env.num_envs = COUNT
+    result = {}
+    for index, info in infos.items():
+        result = env._add_info(result, info, index)
+    return result
+
+
+@settings(max_examples=200, deadline=None)
+@given(INFOS)
+def test_gathered_as_gymnasium_does(infos):
+    ours, theirs = gathered(infos, COUNT), by_gymnasium(infos)
+    assert list(ours) == list(theirs)
+    require_same_infos(ours, theirs)
+
+
+@settings(max_examples=200, deadline=None)
+@given(INFOS)
+def test_handed_out_again(infos):
+    into = [{} for _ in range(COUNT)]
+    handed_out(gathered(infos, COUNT), into)
+    for index, info in enumerate(into):
+        expected = infos.get(index, {})
+        assert info.keys() == expected.keys()
+        for name, value in info.items():
+            require_equal_parts(value, expected[name])
+
+
+def require_equal_parts(value, expected):
+    if isinstance(expected, dict):
+        assert value.keys() == expected.keys()
+        for name in expected:
+            require_equal_parts(value[name], expected[name])
+    else:
+        np.testing.assert_array_equal(value, expected)
+
+
+def test_rows_make_the_same_infos_as_single_environments():
+    mask = np.array([True, False, True, False])
+    rows = {"x": np.arange(4.0), "inner": {"y": np.arange(8).reshape(4, 2)}}
+    single = {i: {"x": float(i), "inner": {"y": rows["inner"]["y"][i]}} for i in (0, 2)}
+    ours, theirs = coded(rows, mask), gathered(single, COUNT)
+    assert list(ours) == list(theirs)
+    require_same_infos(ours, theirs)
+    require_equal(ours["x"], np.array([0.0, 0.0, 2.0, 0.0]))
+    assert ours["_x"] is not ours["_inner"]
+
+
+def test_objects_are_none_outside_of_the_mask():
+    texts = np.array(["a", "b"], object)
+    mask = np.array([False, True])
+    assert coded({"text": texts}, mask)["text"].tolist() == [None, "b"]
+    assert with_masks({"text": texts}, mask)["text"] is texts
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [(1.0, "a"), (np.zeros(2), np.zeros(3)), ({"a": 1}, 2), (1.0, {"a": 1}), (np.zeros(2), None)],
+)
+def test_values_that_do_not_fit_are_named(first, second):
+    with pytest.raises(ConfigError, match=r"environment 3: its info does not fit .*'odd' is"):
+        gathered({1: {"odd": first}, 3: {"odd": second}}, COUNT)
