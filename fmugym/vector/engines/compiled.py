@@ -348,8 +348,7 @@ class CompiledEngine(BatchEngine):
     ) -> StepResult:
         """Add what the pool does not do itself; that is nothing for most tasks."""
         if self._layout.has_own:
-            observations, infos = self._divided(result.observations)
-            result = result._replace(observations=observations, infos=infos | result.infos)
+            result = self._layout.completed(result)
         if self._left:
             result = self._with_hooks_left(result, resetting)
         if troubled or self._left:
@@ -475,8 +474,13 @@ class _Layout:
         """New arrays for a step."""
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
 
+    def completed(self, result: StepResult) -> StepResult:
+        """The result with observations and infos made of the arrays of a step."""
+        observations, infos = self.divided(result.observations, len(result.rewards))
+        return _with(result, observations, infos | result.infos if infos else result.infos)
+
     def divided(self, arrays: Any, num_envs: int) -> tuple[Any, dict[str, Any]]:
-        """The observations and the infos."""
+        """The observations and the infos of these arrays."""
         if self._is_plain:
             return arrays[0], {}
         tree: dict[str, Any] = {"observation": {}, "info": {}}
@@ -486,7 +490,14 @@ class _Layout:
             for parent in parents:
                 place = place.setdefault(parent, {})
             place[name] = array
-        return tree["observation"], with_masks(tree["info"], np.ones(num_envs, np.bool_))
+        infos = with_masks(tree["info"], np.ones(num_envs, np.bool_)) if tree["info"] else {}
+        return tree["observation"], infos
+
+
+def _with(result: StepResult, observations: Any, infos: dict[str, Any]) -> StepResult:
+    judged = result.rewards, result.terminated, result.truncated
+    replaced: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
+    return replaced
 
 
 def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
