@@ -5,6 +5,7 @@
 #include <stdlib.h>
 
 #include "failures.h"
+#include "initial_states.h"
 #include "instances.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */
@@ -85,6 +86,20 @@ size_t pool_start(Pool *pool, const Call *call, bool *outside) {
         }
     }
     return troubled;
+}
+
+bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values) {
+    return start->count <= pool->start_width &&
+           instance_knows_start(pool, &pool->instances[index], start, values);
+}
+
+bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size) {
+    return instance_pack(pool, &pool->instances[index], bytes, size);
+}
+
+bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed) {
+    return make_room_for_starts(pool, start) &&
+           instance_adopt(pool, &pool->instances[index], start, packed);
 }
 
 /* Reads variables of one instance into a column of values. */

@@ -259,6 +259,19 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends);
  * and sets outside if a hook looked up an index outside of a table. */
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
+/* A serialized FMU state after initialization. */
+typedef struct {
+    const double *start_values; /* one for each variable of the Access */
+    const double *outputs;      /* just after initialization */
+    const char *bytes;
+    size_t size;
+} Packed;
+
+/* These three are for one instance; initial_states.h describes them. */
+bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values);
+bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size);
+bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed);
+
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 

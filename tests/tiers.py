@@ -25,6 +25,7 @@ SLOW_MODULES = {
 
 EVERY = {
     "test_hostile_archive": 9,
+    "test_initial_states": 6,
     "test_licences": 12,
     "test_neighbours": 4,
     "test_pool": 8,

@@ -260,7 +260,8 @@ class CompiledEngine(BatchEngine):
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        if options or self._any_foreign or not self._prepared or not self._starts_here:
+        starts_here = self._starts_here and not self._pool.is_attended
+        if options or self._any_foreign or not self._prepared or not starts_here:
             return super().reset(mask, seeds, options)
         self.has_moved = False
         if seeds is not None:
