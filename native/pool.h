@@ -255,9 +255,9 @@ size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
  * turn before and after. Writes all observations. */
 size_t pool_play(Pool *pool, const Call *call, Ends *ends);
-/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all
- * observations. */
-size_t pool_start(Pool *pool, const Call *call);
+/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
+ * and sets outside if a hook looked up an index outside of a table. */
+size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
 /* A serialized FMU state after initialization. */
 typedef struct {
