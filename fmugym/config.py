@@ -100,6 +100,9 @@ class EnvConfig:
             may take a seat. None for no limit.
         max_initializations_per_second: How many instantiations and initializations may begin in a
             second of real time, counted together; None for no limit.
+        keep_initial_states: Whether to keep the state after initialization and warm-up, for other
+            instances and on disk, where this gives the same results to the last bit. For models
+            that take long to initialize.
         licence_wait: Seconds of real time to wait for a licence that the FMU does not get; 0 to
             give up at once.
 
@@ -135,6 +138,7 @@ class EnvConfig:
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT
     max_instances: int | None = None
     max_initializations_per_second: float | None = None
+    keep_initial_states: bool = False
     licence_wait: float = 0.0
 
     @classmethod
@@ -177,6 +181,10 @@ class EnvConfig:
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))
             self._set("reset_method", check_option("reset method", self.reset_method, methods))
+        if not isinstance(self.keep_initial_states, bool | np.bool_):
+            raise ConfigError(
+                f"keep_initial_states must be True or False, got {shown(self.keep_initial_states)}"
+            )
         if isinstance(self.archive_limits, Mapping):
             self._set("archive_limits", _archive_limits(self.archive_limits))
         self._check_names()

@@ -5,6 +5,7 @@
 #include <stdlib.h>
 
 #include "failures.h"
+#include "initial_states.h"
 #include "instances.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */
@@ -58,15 +59,47 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     return troubled;
 }
 
-size_t pool_start(Pool *pool, const Call *call) {
+/* Stores the observations of all, as the program makes them. */
+static Verdict observe_all(const Pool *pool, const Turn *turn) {
+    const size_t end = pool->settings.count;
+    PlayScratch registers;
+    Verdict verdict = {.ended = 0};
+
+    play_open(turn, end, &registers);
+    for (size_t first = 0; first < end; first += RUN) {
+        play_observe(turn, first, length_of_run(first, end), &registers, &verdict);
+    }
+    return verdict;
+}
+
+size_t pool_start(Pool *pool, const Call *call, bool *outside) {
     const size_t troubled = pool_reset(pool, call);
 
+    if (call->observations == NULL) {
+        const Verdict verdict = observe_all(pool, call->turn);
+        *outside = verdict.outside;
+        return troubled + verdict.troubled;
+    }
     for (size_t i = 0; i < pool->settings.count; i++) {
         if (call->mask.data != NULL && !is_in(call->mask, i)) {
             write_observation(pool, i, call->observations);
         }
     }
     return troubled;
+}
+
+bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values) {
+    return start->count <= pool->start_width &&
+           instance_knows_start(pool, &pool->instances[index], start, values);
+}
+
+bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size) {
+    return instance_pack(pool, &pool->instances[index], bytes, size);
+}
+
+bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed) {
+    return make_room_for_starts(pool, start) &&
+           instance_adopt(pool, &pool->instances[index], start, packed);
 }
 
 /* Reads variables of one instance into a column of values. */

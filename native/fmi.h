@@ -123,6 +123,10 @@ typedef struct Fmi {
     Status (*free_state)(const Library *library, void *component, void **state);
     /* The serialized size, or 0 if the FMU does not report it. */
     size_t (*state_size)(const Library *library, void *component, void *state);
+    Status (*serialize)(const Library *library, void *component, void *state, char *bytes,
+                        size_t size);
+    Status (*deserialize)(const Library *library, void *component, const char *bytes, size_t size,
+                          void **state);
 } Fmi;
 
 extern const Fmi fmi1, fmi2, fmi3;

@@ -44,6 +44,8 @@ typedef struct {
     int (*set_state)(void *component, void *state);
     int (*free_state)(void *component, void **state);
     int (*state_size)(void *component, void *state, size_t *size);
+    int (*serialize)(void *component, void *state, char *bytes, size_t size);
+    int (*deserialize)(void *component, const char *bytes, size_t size, void **state);
 } Functions;
 
 static const Binding bindings[] = {
@@ -68,6 +70,8 @@ static const Binding bindings[] = {
     {"SetFMUstate", offsetof(Functions, set_state), false},
     {"FreeFMUstate", offsetof(Functions, free_state), false},
     {"SerializedFMUstateSize", offsetof(Functions, state_size), false},
+    {"SerializeFMUstate", offsetof(Functions, serialize), false},
+    {"DeSerializeFMUstate", offsetof(Functions, deserialize), false},
 };
 
 /* FMUs keep the pointer, so it must stay valid as long as any instance exists. */
@@ -219,6 +223,20 @@ static size_t state_size(const Library *library, void *component, void *state) {
     return sane(f->state_size(component, state, &size)) <= STATUS_WARNING ? size : 0;
 }
 
+static Status serialize(const Library *library, void *component, void *state, char *bytes,
+                        size_t size) {
+    const Functions *f = functions_of(library);
+    return f->serialize == NULL ? STATUS_ERROR
+                                : sane(f->serialize(component, state, bytes, size));
+}
+
+static Status deserialize(const Library *library, void *component, const char *bytes, size_t size,
+                          void **state) {
+    const Functions *f = functions_of(library);
+    return f->deserialize == NULL ? STATUS_ERROR
+                                  : sane(f->deserialize(component, bytes, size, state));
+}
+
 static bool exchange(const Library *library, const Exchange *e) {
     return exchange_by(&fmi2, library, e);
 }
@@ -241,4 +259,6 @@ const Fmi fmi2 = {
     .set_state = set_state,
     .free_state = free_state,
     .state_size = state_size,
+    .serialize = serialize,
+    .deserialize = deserialize,
 };

@@ -36,6 +36,8 @@ typedef struct {
     int (*set_state)(void *instance, void *state);
     int (*free_state)(void *instance, void **state);
     int (*state_size)(void *instance, void *state, size_t *size);
+    int (*serialize)(void *instance, void *state, char *bytes, size_t size);
+    int (*deserialize)(void *instance, const char *bytes, size_t size, void **state);
 } Functions;
 
 #define ACCESS(name, type)                                                                         \
@@ -67,6 +69,8 @@ static const Binding bindings[] = {
     {"SetFMUState", offsetof(Functions, set_state), false},
     {"FreeFMUState", offsetof(Functions, free_state), false},
     {"SerializedFMUStateSize", offsetof(Functions, state_size), false},
+    {"SerializeFMUState", offsetof(Functions, serialize), false},
+    {"DeserializeFMUState", offsetof(Functions, deserialize), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -192,6 +196,20 @@ static size_t state_size(const Library *library, void *instance, void *state) {
     return sane(f->state_size(instance, state, &size)) <= STATUS_WARNING ? size : 0;
 }
 
+static Status serialize(const Library *library, void *instance, void *state, char *bytes,
+                        size_t size) {
+    const Functions *f = functions_of(library);
+    return f->serialize == NULL ? STATUS_ERROR
+                                : sane(f->serialize(instance, state, bytes, size));
+}
+
+static Status deserialize(const Library *library, void *instance, const char *bytes, size_t size,
+                          void **state) {
+    const Functions *f = functions_of(library);
+    return f->deserialize == NULL ? STATUS_ERROR
+                                  : sane(f->deserialize(instance, bytes, size, state));
+}
+
 static bool exchange(const Library *library, const Exchange *e) {
     return exchange_by(&fmi3, library, e);
 }
@@ -214,4 +232,6 @@ const Fmi fmi3 = {
     .set_state = set_state,
     .free_state = free_state,
     .state_size = state_size,
+    .serialize = serialize,
+    .deserialize = deserialize,
 };

@@ -210,6 +210,7 @@ void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scrat
     start_episodes(turn, begin, count);
     copy_rows(play, begin, count);
     program_run(&play->judgement, &source, begin, count, scratch->judgement, &notes);
+    memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
     for (size_t j = 0; j < count; j++) {
         verdict->troubled += notes.not_finite[j];
     }
@@ -217,6 +218,25 @@ void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scrat
     verdict->ended += judge(turn, begin, count, registers[results[DONE]].flags,
                             registers[results[TRUNCATED]].flags,
                             registers[results[REWARD]].doubles, &verdict->troubled);
+}
+
+/* The program updates no variables where an episode has ended: it stores those from before. */
+void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
+                  Verdict *verdict) {
+    const Play *play = turn->play;
+    const Source source = source_of(turn);
+    uint8_t *ended = play->ended + begin, before[PROGRAM_WIDTH];
+    Notes notes = {.outside = false};
+
+    copy_rows(play, begin, count);
+    memcpy(before, ended, count);
+    memset(ended, 1, count);
+    program_run(&play->judgement, &source, begin, count, scratch->judgement, &notes);
+    memcpy(ended, before, count);
+    for (size_t j = 0; j < count; j++) {
+        verdict->troubled += notes.not_finite[j];
+    }
+    verdict->outside |= notes.outside;
 }
 
 void play_skip(const Turn *turn, size_t index) {

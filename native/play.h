@@ -82,6 +82,8 @@ typedef struct {
     uint8_t *terminated, *truncated;
     char *const *seen; /* the arrays of the observations and infos that the judgement stores */
     float *last_observations; /* those of episodes that end, where the next ones start at once */
+    char *const *last_seen;   /* the same for the arrays that the judgement stores */
+    const size_t *seen_sizes; /* bytes of one environment in each of these arrays */
     uint8_t *started;         /* where they have started; NULL if they start in the next step */
     double *drawn; /* a row for each draw; only the values drawn in this step are written. Values
                     * that were given are read from it */
@@ -99,6 +101,7 @@ typedef struct {
 typedef struct {
     size_t ended;    /* episodes that have just ended */
     size_t troubled; /* environments with numbers that are not finite */
+    uint8_t not_finite[PROGRAM_WIDTH]; /* which of the latest run have stored such numbers */
     bool outside;    /* whether a hook looked up an index outside of a table */
 } Verdict;
 
@@ -109,6 +112,11 @@ void play_open(const Turn *turn, size_t count, PlayScratch *scratch);
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
                 Verdict *verdict);
+
+/* Stores the observations and infos of environments outside of a step or after a start, at most
+ * PROGRAM_WIDTH of them. */
+void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
+                  Verdict *verdict);
 
 /* Keeps the outputs of a run, before the new ones replace them. */
 void play_keep_outputs(const Play *play, size_t begin, size_t count);

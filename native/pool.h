@@ -255,9 +255,22 @@ size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
  * turn before and after. Writes all observations. */
 size_t pool_play(Pool *pool, const Call *call, Ends *ends);
-/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all
- * observations. */
-size_t pool_start(Pool *pool, const Call *call);
+/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
+ * and sets outside if a hook looked up an index outside of a table. */
+size_t pool_start(Pool *pool, const Call *call, bool *outside);
+
+/* A serialized FMU state after initialization. */
+typedef struct {
+    const double *start_values; /* one for each variable of the Access */
+    const double *outputs;      /* just after initialization */
+    const char *bytes;
+    size_t size;
+} Packed;
+
+/* These three are for one instance; initial_states.h describes them. */
+bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values);
+bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size);
+bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed);
 
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);

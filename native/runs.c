@@ -366,7 +366,8 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
         troubled += do_run(task, first, count, scratch);
         play_judge(turn, first, count, &registers, &verdict);
         if (turn->started != NULL) {
-            troubled += starts_after_ends(task, first, count, scratch, &started);
+            const PlayedRun run = {first, count, &registers, &verdict};
+            troubled += starts_after_ends(task, run, scratch, &started);
         }
     }
     atomic_add(&task->ended, verdict.ended);

@@ -47,7 +47,7 @@ def library(folder):
     return path.read_bytes()
 
 
-def make_fmu(folder, token, flags=""):
+def make_fmu(folder, token, flags='canSerializeFMUstate="true"'):
     """Write the FMU that does what its token says."""
     files = {
         "modelDescription.xml": XML.format(token=token, flags=flags),

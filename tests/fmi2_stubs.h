@@ -22,9 +22,11 @@ STUB(GetString)
 STUB(SetInteger)
 STUB(SetBoolean)
 STUB(SetString)
+#ifndef OWN_SERIALIZATION
 STUB(SerializedFMUstateSize)
 STUB(SerializeFMUstate)
 STUB(DeSerializeFMUstate)
+#endif
 STUB(GetDirectionalDerivative)
 STUB(SetRealInputDerivatives)
 STUB(GetRealOutputDerivatives)

@@ -3,9 +3,11 @@
 import logging
 import math
 
+import fmpy
 import gymnasium as gym
 import numpy as np
 import pytest
+from fmu_tools import PlainEnv, probe_fmu
 
 import fmugym
 from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
@@ -450,3 +452,53 @@ def test_register_makes_an_id():
     assert [env.step(np.zeros(1, np.float32))[3] for _ in range(2)] == [False, True]
     env.close()
     gym.registry.pop("tests/Swing-v0")
+
+
+class TestTolerance:
+    """The solver's tolerance; the probe tells which one it was given, -1 for none."""
+
+    EXPERIMENT = '<DefaultExperiment tolerance="0.0025"/><TypeDefinitions>'
+
+    @pytest.fixture(params=[2, 3])
+    def path(self, tmp_path, request):
+        return probe_fmu(tmp_path, request.param, {"<TypeDefinitions>": self.EXPERIMENT})
+
+    @pytest.fixture(params=["native", "python", "process"])
+    def seen(self, make_env, path, request):
+        """Make what the FMU sees with a config."""
+        way = {"isolation": "process"} if request.param == "process" else {}
+        backend = "auto" if request.param == "process" else request.param
+
+        class Env(PlainEnv):
+            def __init__(self, path, config, **options):
+                super().__init__(path, config, backend=backend, **options)
+
+        def make(**config):
+            env = make_env(path=path, cls=Env, **way, **config)
+            env.reset()
+            return env.read_variables("tolerance")["tolerance"]
+
+        return make
+
+    def test_is_that_of_the_default_experiment_as_in_fmpy(self, seen, path):
+        result = fmpy.simulate_fmu(
+            str(path), fmi_type="CoSimulation", stop_time=0.1, validate=False, output=["tolerance"]
+        )
+        assert seen() == result["tolerance"][0] == 0.0025
+
+    def test_is_that_of_the_config(self, seen, path):
+        result = fmpy.simulate_fmu(
+            str(path),
+            fmi_type="CoSimulation",
+            stop_time=0.1,
+            validate=False,
+            relative_tolerance=1e-6,
+            output=["tolerance"],
+        )
+        assert seen(tolerance=1e-6) == result["tolerance"][0] == 1e-6
+
+    @pytest.mark.parametrize("version", [2, 3])
+    def test_is_not_given_if_there_is_none(self, make_env, version):
+        env = make_env(version)
+        env.reset()
+        assert env.read_variables("tolerance")["tolerance"] == -1.0

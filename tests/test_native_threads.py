@@ -312,7 +312,8 @@ def test_an_exception_does_not_repeat_a_step_of_a_vector_environment(probe, hook
         with pytest.raises(type(error)):
             envs.step(np.array([0, 1]))
         logger.removeHandler(handler)
-        assert envs.step(np.array([0, 1]))[0].tolist() == [[0.0], [pytest.approx(0.1)]]
+    steps = {text.partition("] ")[2] for text in handler.texts}
+    assert len(steps) == 1, "only one step was done"
 
 
 def test_an_exception_while_closing_leaves_nothing_open(pool_class, probe, temp_root):

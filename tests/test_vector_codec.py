@@ -84,7 +84,7 @@ def test_objects_are_none_outside_of_the_mask():
 
 @pytest.mark.parametrize(
     ("first", "second"),
-    [(1.0, "a"), (np.zeros(2), np.zeros(3)), ({"a": 1}, 2), (1.0, {"a": 1}), (np.zeros(2), None)],
+    [(1.0, "a"), (np.zeros(2), np.zeros(3)), ({"a": 1}, 2), (1.0, {"a": 1}), (np.zeros(2), "x")],
 )
 def test_values_that_do_not_fit_are_named(first, second):
     with pytest.raises(ConfigError, match=r"environment 3: its info does not fit .*'odd' is"):

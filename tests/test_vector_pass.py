@@ -249,3 +249,71 @@ class TestGuards:
         mask, observations = np.ones(shapes[0], np.bool_), np.empty(shapes[1], np.float32)
         with pytest.raises(ValueError, match="must have the shape"):
             pool.start(mask, observations, np.empty((4, 4)))
+
+
+class Tracking(Drawing):
+    """Observations, infos and episode variables of its own."""
+
+    def __init__(self):
+        super().__init__(
+            episode_variables={"target": Uniform(-1.0, 1.0), "integral": 0.0}, max_episode_steps=7
+        )
+
+    def _update(self):
+        error = self.variables["target"] - self.state[0]
+        self.variables["integral"] = self.variables["integral"] + 0.1 * error
+
+    def _is_done(self):
+        return abs(self.variables["integral"]) > 0.3
+
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        return gym.spaces.Dict({"plant": box, "steps": gym.spaces.Box(0, 99, (1,), np.int64)})
+
+    def _get_observation(self):
+        target, integral = self.variables["target"], self.variables["integral"]
+        plant = np.array([np.sin(self.state[0]) - target, integral, self.previous_state[1]])
+        return {"plant": plant, "steps": np.array([self.step_count])}
+
+    def _get_info(self):
+        return {"error": self.variables["target"] - self.state[0]}
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
+@pytest.mark.parametrize("num_envs", [3, 70])
+def test_tasks_with_observations_of_their_own(mode, num_envs, outside):
+    ours, theirs = make_pair(Tracking, mode, num_envs, hooks="compiled")
+    assert run_side_by_side(ours, theirs, mode, 40) > 5 * num_envs
+    assert not outside
+    ours.close()
+    theirs.close()
+
+
+def played(envs, mode, steps):
+    """The results of random steps, and of the resets that follow them."""
+    envs.reset(seed=3)
+    rng, results = np.random.default_rng(0), []
+    for _ in range(steps):
+        result = envs.step(rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32))
+        results.append(result)
+        ended = result[2] | result[3]
+        if mode is DISABLED and ended.any():
+            results.append(envs.reset(options={"reset_mask": ended}))
+    envs.close()
+    return results
+
+
+@pytest.mark.parametrize("env_id", ["fmugym/Pendulum-v0", "fmugym/CloudPendulum-v0"])
+@pytest.mark.parametrize("mode", [SAME_STEP, DISABLED], ids=lambda mode: mode.name)
+def test_bundled_tasks_with_observations_of_their_own(env_id, mode, outside):
+    ours, theirs = (
+        gym.make_vec(env_id, num_envs=5, autoreset_mode=mode, hooks=hooks)
+        for hooks in ("compiled", "array")
+    )
+    results = played(ours, mode, 420)
+    assert not outside
+    for first, second in zip(results, played(theirs, mode, 420), strict=True):
+        for mine, other in zip(first[:-1], second[:-1], strict=True):
+            require_equal(mine, other)
+        require_same_infos(first[-1], second[-1])
+    assert outside

@@ -1,12 +1,15 @@
 """Typical tasks are compiled: targets, integrals, histories, tables, goals, types of inputs."""
 
+import logging
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from fmu_tools import PlainEnv, probe_config
-from test_vector_program import Task, require_same
-from vector_tools import require_pair_equal
+from test_vector_program import Task, require_bits, require_same, require_variables
+from vector_tools import require_pair_equal, require_same_infos, sampled_actions
 
+import fmugym
 from fmugym import ConfigError, Uniform
 from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
@@ -322,3 +325,78 @@ def test_faults_of_hooks_that_are_left():
         envs.close()
     assert results[0] == results[1]
     assert "_reward_policy returned inf" in results[0][2][1]
+
+
+@each_mode
+def test_failures_of_the_fmu_are_those_on_arrays(mode):
+    """Variables, actions and states of the step before stay what they are on arrays."""
+
+    one, other = (
+        FMUVectorEnv(FailingCart, 50, hooks=hooks, autoreset_mode=mode)
+        for hooks in ("compiled", "array")
+    )
+    logging.getLogger("fmugym.FailingCart").setLevel(logging.CRITICAL)
+    one.reset(seed=3)
+    other.reset(seed=3)
+    for actions in sampled_actions(one, 30):
+        first, second = one.step(actions), other.step(actions)
+        for a, b in zip(first[:4], second[:4], strict=True):
+            require_bits(a, b)
+        require_same_infos(first[4], second[4])
+        require_variables(one, other)
+    assert one.health["discards"].tolist() == other.health["discards"].tolist()
+    assert one.health["discards"].sum() > 50
+    one.close()
+    other.close()
+
+
+class FailingCart(fmugym.FMUEnv):
+    """Its FMU fails where the push is absurd."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot"],
+            "model_parameters": {"x_0": Uniform(-0.5, 0.5)},
+            "episode_variables": {"integral": 0.0},
+            "time_step": 0.05,
+            "max_episode_steps": 9,
+        }
+        super().__init__(fmugym.bundled_fmu("CartPole"), config)
+
+    def _get_action_space(self):
+        return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def _get_inputs(self):
+        return [np.where(self.action[0] > 0.8, np.float64(1e308), 2.0 * self.previous_action[1])]
+
+    def _update(self):
+        self.variables["integral"] = self.variables["integral"] + self.state[0]
+
+    def _is_done(self):
+        return np.abs(self.state[0]) > 1.0
+
+    def _get_observation_space(self):
+        return wide((4,))
+
+    def _get_observation(self):
+        before = self.previous_state[0], self.action[1]
+        return np.array([self.state[0], self.variables["integral"], *before], np.float32)
+
+    def _get_info(self):
+        return {"integral": self.variables["integral"], "before": self.previous_state[0]}
+
+
+def test_results_do_not_depend_on_threads():
+    one, other = (
+        FMUVectorEnv(Tracking, 3000, hooks=hooks, threads=threads)
+        for hooks, threads in (("compiled", 2), ("array", 1))
+    )
+    np.testing.assert_array_equal(one.reset(seed=0)[0], other.reset(seed=0)[0])
+    one.action_space.seed(0)
+    for _ in range(12):
+        actions = one.action_space.sample()
+        for a, b in zip(one.step(actions)[:4], other.step(actions)[:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+    one.close()
+    other.close()

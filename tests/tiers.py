@@ -25,6 +25,7 @@ SLOW_MODULES = {
 
 EVERY = {
     "test_hostile_archive": 9,
+    "test_initial_states": 6,
     "test_licences": 12,
     "test_neighbours": 4,
     "test_pool": 8,
@@ -45,6 +46,7 @@ SLOW_TESTS = (
     "test_executable.py::TestMissingLibraries::test_beside",
     "test_guards.py::TestLeaks",
     "test_hostile_archive.py::TestMemory",
+    "test_held_out.py::test_a_folder",
     "test_identification.py::TestOutputError",
     "test_identification.py::test_example",
     "test_identification.py::test_odd",

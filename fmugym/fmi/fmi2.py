@@ -35,6 +35,8 @@ class FMI2Instance(Instance):
     def _function_name(self, name: str) -> str:
         return f"fmi2{name}"
 
+    _deserialize: ClassVar = "DeSerialize"
+
     def _state_function(self, verb: str) -> str:
         return f"{verb}FMUstate"
 

@@ -63,6 +63,7 @@ class Instance(ABC):
     """numpy's type for each C type of this FMI version."""
     enumeration_type: ClassVar = "Integer"
     """The C type of enumerations in this FMI version."""
+    _deserialize: ClassVar = "Deserialize"
 
     def __init__(
         self,
@@ -394,9 +395,7 @@ class Instance(ABC):
         state = ctypes.c_void_p()
         get_state = self._function(self._state_function("Get"))
         self.check("saving the FMU state", get_state(self._component, ctypes.byref(state)))
-        if not self._may_return:
-            self._may_return = True
-            self.step = self._prepare_step()
+        self._note_return()
         saved = SavedState(self, state)
         self._saved_states.add(saved)
         return saved
@@ -405,6 +404,42 @@ class Instance(ABC):
     def number_of_states(self) -> int:
         """How many saved states are in use."""
         return len(self._saved_states)
+
+    def serialize(self, state: SavedState) -> bytes:
+        """Turn a state of this instance into bytes.
+
+        Raises:
+            SimulationError: If the FMU fails.
+        """
+        name, size = self._state_function(""), ctypes.c_size_t(0)
+        get_size = self._function(f"Serialized{name}Size")
+        self.check("sizing a state", get_size(self._component, state.pointer, ctypes.byref(size)))
+        data = ctypes.create_string_buffer(size.value)
+        serialize = self._function(f"Serialize{name}")
+        self.check("serializing a state", serialize(self._component, state.pointer, data, size))
+        return data.raw
+
+    def deserialize(self, data: bytes) -> SavedState:
+        """Make a state of bytes that an instance of the same FMU has serialized.
+
+        Raises:
+            SimulationError: If the FMU fails.
+        """
+        pointer = ctypes.c_void_p()
+        deserialize = self._function(self._state_function(self._deserialize))
+        size = ctypes.c_size_t(len(data))
+        status = deserialize(self._component, data, size, ctypes.byref(pointer))
+        self.check("deserializing a state", status)
+        self._note_return()
+        saved = SavedState(self, pointer)
+        self._saved_states.add(saved)
+        return saved
+
+    def _note_return(self) -> None:
+        """From now on the FMU may be returned to an earlier state, and is told so in each step."""
+        if not self._may_return:
+            self._may_return = True
+            self.step = self._prepare_step()
 
     def restore_state(self, state: SavedState) -> None:
         """Return to a state saved by this instance.

@@ -163,6 +163,11 @@ class Pool(ABC):
         return ResetMethod.RESET
 
     @property
+    def is_attended(self) -> bool:
+        """Whether something goes with ``reset``, so that no other call should start episodes."""
+        return False
+
+    @property
     def can_play(self) -> bool:
         """Whether the pool can run compiled hooks within a step (``NativePool.prepare_play``)."""
         return False

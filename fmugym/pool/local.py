@@ -13,6 +13,7 @@ from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.python import PythonPool
 from fmugym.pool.spec import PoolSpec
+from fmugym.pool.states import InitialStates
 
 __all__ = ["local_pool"]
 
@@ -74,7 +75,7 @@ def local_pool(
         )
     else:
         pool = PythonPool(fmu, spec, num_instances, log, counts=counts)
-    if attended:
-        pool.attend(Attendant.of(fmu.path.name, spec, log))
+    states = InitialStates(spec) if spec.state_files else None
+    pool.attend(Attendant.of(fmu.path.name, spec, log, states) if attended else states)
     announce(STEP)
     return pool

@@ -32,7 +32,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
-from fmugym.pool.attendant import AttendedPool
+from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -299,6 +299,27 @@ class NativePool(AttendedPool):
         if failed >= 0:
             raise SimulationError(self.failure(failed))
         return values
+
+    def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
+        """See ``AttendedPool.knows_start``."""
+        return self._open_pool().knows_start(index, self._access(variables), values.tobytes())
+
+    def pack(self, index: int) -> InitialState | None:
+        """See ``AttendedPool.pack``."""
+        data = self._open_pool().pack(index)
+        return None if data is None else InitialState(self.outputs[:, index].tobytes(), data)
+
+    def adopt(
+        self,
+        index: int,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        state: InitialState,
+    ) -> bool:
+        """See ``AttendedPool.adopt``."""
+        return self._open_pool().adopt(
+            index, self._access(variables), values.tobytes(), state.outputs, state.data
+        )
 
     def _count_steps(self) -> None:
         if self._close.alive:

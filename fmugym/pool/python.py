@@ -18,7 +18,7 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.log import raise_caught
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
-from fmugym.pool.attendant import AttendedPool
+from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
@@ -165,6 +165,30 @@ class PythonPool(AttendedPool):
             restore_arithmetic()
         raise_caught()
         return values
+
+    def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
+        """See ``AttendedPool.knows_start``."""
+        return self._slots[index].knows_start(variables, values)
+
+    def pack(self, index: int) -> InitialState | None:
+        """See ``AttendedPool.pack``."""
+        try:
+            return self._slots[index].pack()
+        finally:
+            restore_arithmetic()
+
+    def adopt(
+        self,
+        index: int,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        state: InitialState,
+    ) -> bool:
+        """See ``AttendedPool.adopt``."""
+        try:
+            return self._slots[index].adopt(variables, values, state)
+        finally:
+            restore_arithmetic()
 
     def _count_steps(self) -> None:
         for slot in self._slots:

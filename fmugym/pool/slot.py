@@ -12,6 +12,7 @@ from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
+from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
@@ -166,6 +167,35 @@ class Slot:
         if not _is_fine(got) or self._output_row.tobytes() != self._first_outputs:
             self._saved, self._restores = None, False  # whatever the trial showed
         return self._saved is not None
+
+    def knows_start(self, variables: tuple[Variable, ...], values: FloatArray) -> bool:
+        """See ``AttendedPool.knows_start``."""
+        alive = self._saved is not None and self._instance.phase is not Phase.DEAD
+        return alive and self._start_key == (variables, values.tobytes())
+
+    def pack(self) -> InitialState | None:
+        """See ``AttendedPool.pack``."""
+        if not self._restores:
+            return None
+        try:
+            data = self._instance.serialize(self._instance.save_state())
+        except SimulationError:
+            return None
+        return InitialState(self._output_row.tobytes(), data)
+
+    def adopt(
+        self, variables: tuple[Variable, ...], values: FloatArray, state: InitialState
+    ) -> bool:
+        """See ``AttendedPool.adopt``."""
+        if not self._restores or self._instance.phase is Phase.DEAD:
+            return False
+        try:
+            self._saved = self._instance.deserialize(state.data)
+        except SimulationError:
+            return False
+        self._start_key = (variables, values.tobytes())
+        self._first_outputs = state.outputs
+        return True
 
     def _keep_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> None:
         """Keep the state if a later reset can use it."""

@@ -74,6 +74,9 @@ class PoolSpec:
             initialization to the next; see ``fmugym.pool.pacing``.
         turn: Which turn this pool has in making and initializing instances, and how many turns
             there are.
+        keep_states: Whether initial states are kept for other instances and processes, if the trial
+            shows that they work there.
+        state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
         licence_wait: How long to wait for a refused licence, in seconds of real time.
     """
 
@@ -95,6 +98,8 @@ class PoolSpec:
     initialization_interval: float = 0.0
     turn: tuple[int, int] = (0, 1)
     licence_wait: float = 0.0
+    keep_states: bool = False
+    state_files: str = ""
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""

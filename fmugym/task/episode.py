@@ -80,7 +80,7 @@ class EpisodePlan:
         self._sampler = Sampler(distributions)
         self._start_values = self.constants.reshape(-1, 1).copy()
 
-    @property
+    @cached_property
     def parameter_names(self) -> list[str]:
         """The names of the parameters, in the order of ``constants``."""
         return list(self._parameters)
@@ -90,7 +90,7 @@ class EpisodePlan:
         """The names of the drawn parameters and variables, in the order of the draws."""
         return [name for _, name, _ in self._random_parameters] + self._random_variables
 
-    @property
+    @cached_property
     def drawn_rows(self) -> list[int]:
         """For each draw, the index of its parameter; -1 for an episode variable."""
         rows = [index for index, *_ in self._random_parameters]
@@ -110,13 +110,13 @@ class EpisodePlan:
         recipes = [recipe for recipe in of_parameters + of_variables if recipe is not None]
         return recipes if len(recipes) == len(self.drawn_names) else None
 
-    @property
+    @cached_property
     def constant_parameters(self) -> dict[str, Any]:
         """The parameters that are not drawn."""
         drawn = set(self.drawn_names)
         return {name: value for name, value in self._parameters.items() if name not in drawn}
 
-    @property
+    @cached_property
     def constant_variables(self) -> dict[str, Any]:
         """The episode variables that are not drawn."""
         drawn = set(self.drawn_names)

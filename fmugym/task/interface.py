@@ -94,6 +94,7 @@ class Interface:
             input_limits=tuple(map(self._limits, self.inputs)),
             initialization_interval=_interval(config.max_initializations_per_second),
             licence_wait=config.licence_wait,
+            keep_states=bool(config.keep_initial_states),
         )
 
     def _warm_up_steps(self) -> int:

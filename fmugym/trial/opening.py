@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import FMU
@@ -21,7 +21,7 @@ from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMe
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
-from fmugym.trial.trial import Candidate, examine, revise
+from fmugym.trial.trial import Candidate, examine, revise, state_files
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = ["make_pool"]
@@ -89,6 +89,8 @@ def make_pool(
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
+        if spec.keep_states:
+            completed = completed.with_states(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             pool = _open(fmu, spec, num_instances, log, completed, call_timeout)
         if rehearse and reset_method is None:
@@ -107,7 +109,12 @@ def _open(
     plan: _Plan,
     call_timeout: float | None,
 ) -> Pool:
-    spec = replace(spec, reset_method=plan.method, one_initialization=plan.one_initialization)
+    spec = replace(
+        spec,
+        reset_method=plan.method,
+        one_initialization=plan.one_initialization,
+        state_files=plan.state_files,
+    )
     if plan.isolation == "process":
         pool = ProcessPool(
             fmu,
@@ -182,6 +189,7 @@ class _Plan:
     isolation: str | None = None
     workers: int | None = None
     one_initialization: bool = False
+    state_files: str = ""
     own_files: bool = False
 
     @property
@@ -210,6 +218,15 @@ class _Plan:
             log.warning("%s harms its process: it runs in worker processes", fmu.path.name)
             plan = replace(plan, isolation="process")
         return plan._with_means_of_reset(num_instances)
+
+    def with_states(self, fmu: FMU, verdict: Verdict, log: logging.Logger) -> _Plan:
+        """Keep initial states where they give the same results to the last bit; log if not."""
+        obstacle = _obstacle_to_states(fmu, verdict, self.method)
+        if obstacle:
+            log.warning("%s: no initial state is kept: %s", fmu.path.name, obstacle)
+            return self
+        log.info("%s: initial states are kept for other instances and on disk", fmu.path.name)
+        return replace(self, state_files=state_files(fmu))
 
     def _apart(
         self, fmu: FMU, neighbours: Neighbours, num_instances: int, log: logging.Logger
@@ -248,6 +265,27 @@ class _Plan:
         if method is ResetMethod.PROCESS:
             return replace(self, reset_method=method, isolation="process", workers=num_instances)
         return replace(self, reset_method=method)
+
+
+def _obstacle_to_states(fmu: FMU, verdict: Verdict, method: ResetMethod) -> str:
+    """Why the initial states of an FMU must not be kept; "" if they may be."""
+    if not fmu.description.capabilities.can_serialize_fmu_state:
+        return "the FMU does not offer to serialize its state"
+    if verdict.states is None:
+        return "no trial has shown that they work in another process"
+    if method is not ResetMethod.RESTORE:
+        return f"episodes begin by the method {str(method)!r}, not by 'restore'"
+    if verdict.states is not Grade.BITWISE:
+        return f"in another process, the trial of a state {_GRADES[verdict.states]}"
+    return ""
+
+
+_GRADES: Final = {
+    Grade.TOLERANCE: "gives other results in the last digits",
+    Grade.WRONG: "gives other results",
+    Grade.FAILS: "fails",
+    Grade.ABSENT: "was not possible",
+}
 
 
 def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:

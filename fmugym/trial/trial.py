@@ -40,7 +40,7 @@ from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
-from fmugym.trial.cache import recall, remember
+from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = [
@@ -105,6 +105,8 @@ class Stage(StrEnum):
     RESET = "the rehearsal of resets"
     INSTANCE = "the rehearsal of new instances"
     LIBRARY = "the rehearsal of libraries loaded anew"
+    STATE = "the serialization of an initial state"
+    RESUMED = "the rehearsal of an initial state from another process"
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
     THREADS = "the comparison with an instance in another thread"
@@ -127,6 +129,8 @@ class Request:
         several: Whether to try several instances.
         alone: Whether it is known that instances must not share a copy of the library.
         skip: The stages in which an earlier worker died.
+        sample: The ``Sample`` of an initial state that another worker has made, if this one has to
+            try only that.
         check_memory: Whether the C library checks for memory errors (glibc only).
     """
 
@@ -136,6 +140,7 @@ class Request:
     several: bool = False
     alone: bool = False
     skip: frozenset[str] = frozenset()
+    sample: Any = None
     check_memory: bool = True
 
 
@@ -153,6 +158,7 @@ class _Outcome:
     answer: dict[str, Any]
     end: str
     last_lines: list[str]
+    sample: bytes | None = None
 
     @property
     def shows_memory_error(self) -> bool:
@@ -187,6 +193,14 @@ def known_verdict(fmu: FMU) -> Verdict | None:
     return Verdict.from_text(recall(_content_key(fmu.path)))
 
 
+def state_files(fmu: FMU) -> str:
+    """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
+    try:
+        return str(cache_folder() / "states" / _content_key(fmu.path))
+    except RuntimeError:  # there is no folder for caches
+        return ""
+
+
 def examine(
     candidate: Candidate,
     spec: Any,
@@ -216,12 +230,18 @@ def examine(
     """
     key = _verdict_key(candidate, spec, starts)
     known = Verdict.from_text(recall(key))
-    if known is not None and (known.neighbours is not None or not several):
+    if known is not None and _answers(known, spec, several):
         return known
     found = _examine(Request(candidate, spec, starts, several, alone), must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found
+
+
+def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
+    """Whether a verdict tells all that is asked."""
+    knows_states = verdict.states is not None or not spec.keep_states
+    return knows_states and (verdict.neighbours is not None or not several)
 
 
 def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> None:
@@ -251,10 +271,23 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
     verdict = notes.verdict
+    if request.spec is not None and request.spec.keep_states and verdict.complete:
+        verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
     logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
     return verdict
+
+
+def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -> Grade:
+    """Let a second process begin with an initial state of the first one."""
+    if verdict.resets.get(ResetMethod.RESTORE) is not Grade.BITWISE:
+        return Grade.ABSENT
+    if sample is None:
+        return Grade.FAILS
+    outcome = _run(replace(request, sample=pickle.loads(sample)))
+    _Notes().require_licence(request.candidate.path.name, outcome)
+    return Grade(outcome.answer.get("states", Grade.FAILS))
 
 
 class _Notes:
@@ -263,10 +296,12 @@ class _Notes:
     def __init__(self) -> None:
         self._answer: dict[str, Any] = {}
         self._deaths: list[_Outcome] = []
+        self.sample: bytes | None = None
 
     def add(self, outcome: _Outcome) -> None:
         """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
+        self.sample = outcome.sample or self.sample
         if "finished" not in outcome.answer:
             self._deaths.append(outcome)
 
@@ -326,12 +361,19 @@ def _run(request: Request) -> _Outcome:
             end, last_lines = _watch(folder, request)
         except OSError as error:
             end, last_lines = f"found no Python to start: {error}", []
-        return _Outcome(_stage(folder), _answer(folder), end, last_lines)
+        return _Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
 
 
 def _stage(folder: Path) -> str | None:
     try:
         return (folder / "stage").read_text()
+    except OSError:
+        return None
+
+
+def _sample(folder: Path) -> bytes | None:
+    try:
+        return (folder / "sample").read_bytes()
     except OSError:
         return None
 
@@ -461,7 +503,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     """The scope of a verdict on resets and neighbours."""
-    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0)  # the rest is tried
+    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0, keep_states=False)
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
     return f"{_content_key(candidate.path)}-{asked}"
 

@@ -54,6 +54,7 @@ class Verdict:
         resets: The grade of each reset method that was tried.
         neighbours: What several instances need; None if only one was tried.
         isolate: Whether a lone instance has harmed its process.
+        states: The grade of an initial state in a second process; None if it was not tried.
         instances: How many instances the trial used at once, each of which may take a licence.
         reasons: The observations, one sentence each, for the log and ``fmugym info``.
     """
@@ -63,6 +64,7 @@ class Verdict:
     resets: Mapping[ResetMethod, Grade] = field(default_factory=dict)
     neighbours: Neighbours | None = None
     isolate: bool = False
+    states: Grade | None = None
     instances: int = 1
     reasons: tuple[str, ...] = ()
 
@@ -85,6 +87,7 @@ class Verdict:
                 "resets": {str(method): str(grade) for method, grade in self.resets.items()},
                 "neighbours": None if self.neighbours is None else str(self.neighbours),
                 "isolate": self.isolate,
+                "states": None if self.states is None else str(self.states),
                 "instances": self.instances,
                 "reasons": list(self.reasons),
             }
@@ -115,6 +118,7 @@ class Verdict:
             resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
             neighbours=None if given is None else Neighbours(given),
             isolate=flags[2],
+            states=None if data["states"] is None else Grade(data["states"]),
             instances=data["instances"],
             reasons=tuple(reasons),
         )

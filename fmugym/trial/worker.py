@@ -33,7 +33,7 @@ from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
-from fmugym.trial.rehearsal import Rehearsal, Starts
+from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
 from fmugym.trial.trial import Request, Stage, patience
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -66,6 +66,11 @@ class Notes:
         (self._folder / "call").write_text(call)
         _end_after(patience(call, self._timeout))
 
+    def keep(self, sample: Sample | None) -> None:
+        """Leave a sample for another process, if there is one."""
+        if sample is not None:
+            (self._folder / "sample").write_bytes(pickle.dumps(sample))
+
     def answer(self, **values: Any) -> None:
         """Add to the answer; the file is replaced atomically."""
         self._answer |= values
@@ -94,6 +99,9 @@ def main(folder: Path) -> None:
 
 
 def _try(request: Request, notes: Notes) -> None:
+    if request.sample is not None:
+        _try_sample(request, notes)
+        return
     complete = _try_alone(request, notes)
     notes.answer(complete=complete)
     if complete and request.spec is not None:
@@ -182,7 +190,24 @@ def _try_resets(request: Request, notes: Notes) -> ResetMethod:
         notes.answer(resets=grades)
         if grades[method] == Grade.BITWISE:
             break
+    if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
+        _make_sample(rehearsal, request, notes)
     return Verdict(resets=grades).reset_method
+
+
+def _make_sample(rehearsal: Rehearsal, request: Request, notes: Notes) -> None:
+    """Write down an initial state for a second process."""
+    notes.stage(Stage.STATE)
+    if Stage.STATE not in request.skip:
+        notes.keep(rehearsal.sample())
+
+
+def _try_sample(request: Request, notes: Notes) -> None:
+    """Grade an initial state of another process."""
+    notes.stage(Stage.RESUMED)
+    starts = request.starts or Starts()
+    rehearsal = Rehearsal(request.candidate, request.spec, starts, request.sample)
+    notes.answer(states=rehearsal.grade_sample())
 
 
 def _methods(request: Request) -> list[ResetMethod]:

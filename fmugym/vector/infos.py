@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import MaskArray
 from fmugym.task.values import LateDict
-from fmugym.vector.codec import coded, within
+from fmugym.vector.codec import with_masks, within
 
 __all__ = [
     "copy_rows",
@@ -26,10 +26,23 @@ __all__ = [
 ]
 
 
-def drawn_info(drawn: Mapping[str, FloatArray], mask: MaskArray) -> dict[str, Any]:
-    """The info of a reset: what was drawn or overridden, by name; no caller changes the rows."""
+def drawn_info(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+    """The info of a reset.
+
+    Args:
+        drawn: What was drawn or overridden, by name: one number, or one for each environment in the
+            mask. No caller changes it.
+        mask: The environments that were reset.
+    """
     mask = mask.copy()
-    return {"drawn": LateDict.of(coded, drawn, mask), "_drawn": mask}  # rarely read
+    return {"drawn": LateDict.of(_drawn_rows, drawn, mask), "_drawn": mask}  # rarely read
+
+
+def _drawn_rows(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+    rows = {name: np.zeros(len(mask)) for name in drawn}
+    for name, values in drawn.items():
+        rows[name][mask] = values
+    return with_masks(rows, mask)
 
 
 def final_infos(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 from fmugym.archive.fmu import FMU
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.pool import PoolSpec
 from fmugym.task.opening import deferred_pools, env_numbers
 
 __all__ = ["EnvMaker", "make_with_pool"]
@@ -87,7 +89,12 @@ def _differences(first: FMUEnv, second: FMUEnv) -> dict[str, bool]:
     return {
         "class": type(first) is not type(second),
         "FMU": first.fmu.path != second.fmu.path,
-        "interface to the FMU": first._spec != second._spec,
+        "interface to the FMU": not _are_equal(first._spec, second._spec),
         "action space": first.action_space != second.action_space,
         "observation space": first.observation_space != second.observation_space,
     }
+
+
+def _are_equal(first: PoolSpec, second: PoolSpec) -> bool:
+    """Compare by content; variables of FMUs that were opened apart are different objects."""
+    return first == second or asdict(first) == asdict(second)

@@ -408,8 +408,9 @@ enum {
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];
-    Py_buffer seen_buffers[MOST_SEEN];
-    char *seen[MOST_SEEN];
+    Py_buffer seen_buffers[MOST_SEEN], last_buffers[MOST_SEEN];
+    char *seen[MOST_SEEN], *last_seen[MOST_SEEN];
+    size_t seen_sizes[MOST_SEEN];
     Turn turn;
     Call call;
     bool bad_action;
@@ -418,14 +419,22 @@ typedef struct {
 } PyTurn;
 
 /* None stands for episodes that start in the step after the end of the previous one. */
-static bool take_starts_at_ends(PyPool *self, PyObject *last, PyObject *started, PyTurn *t) {
+static bool take_starts_at_ends(PyPool *self, const Playing *playing, PyObject *last,
+                                PyObject *started, PyTurn *t) {
     const Settings *s = &self->pool.settings;
     const Py_ssize_t n = (Py_ssize_t)s->count;
 
-    return last == Py_None ||
-           (take_matrix(last, &t->buffers[LAST], WRITTEN, "the last observations", ITEM_FLOAT32, n,
-                        (Py_ssize_t)s->num_observed) &&
-            take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n));
+    if (last == Py_None) {
+        return true;
+    }
+    for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
+        t->seen_sizes[i] = (size_t)(playing->judgement.seen_bytes[i] / n);
+    }
+    return (t->buffers[SEEN].obj == NULL
+                ? take_seen(&playing->judgement, last, t->last_buffers, t->last_seen)
+                : take_matrix(last, &t->buffers[LAST], WRITTEN, "the last observations",
+                              ITEM_FLOAT32, n, (Py_ssize_t)s->num_observed)) &&
+           take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n);
 }
 
 /* The observations are one array that the pool fills itself, or those that the program stores. */
@@ -484,7 +493,7 @@ static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *a
            take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
            take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
                        (Py_ssize_t)playing->play.draws->count, n) &&
-           take_starts_at_ends(self, args[LAST], args[STARTED], t);
+           take_starts_at_ends(self, playing, args[LAST], args[STARTED], t);
 }
 
 static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
@@ -500,6 +509,8 @@ static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .seen = t->seen,
         .drawn = b[DRAWN].buf,
         .last_observations = b[LAST].buf,
+        .last_seen = t->last_seen,
+        .seen_sizes = t->seen_sizes,
         .started = b[STARTED].buf,
     };
     t->call = (Call){
@@ -522,6 +533,13 @@ static void do_play(PyPool *self, bool alone, void *context) {
     }
 }
 
+static bool is_outside(const PyTurn *t) {
+    if (t->ends.outside) {
+        PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
+    }
+    return t->ends.outside;
+}
+
 static PyObject *play_turn(PyPool *self, PyTurn *t) {
     if (!perform(self, PLAY, do_play, t)) {
         return NULL;
@@ -530,8 +548,7 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
         PyErr_SetString(PyExc_ValueError, "an action is out of range");
         return NULL;
     }
-    if (t->ends.outside) {
-        PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
+    if (is_outside(t)) {
         return NULL;
     }
     return report_messages(self)
@@ -540,26 +557,37 @@ static PyObject *play_turn(PyPool *self, PyTurn *t) {
                : NULL;
 }
 
+/* Clears what is used of the many buffers. */
+static void clear_turn(const Playing *playing, PyTurn *t) {
+    const size_t size = playing->judgement.program.number_of_seen * sizeof(Py_buffer);
+
+    t->bad_action = false;
+    memset(t->buffers, 0, sizeof t->buffers);
+    memset(t->seen_buffers, 0, size);
+    memset(t->last_buffers, 0, size);
+}
+
+static void release_turn(const Playing *playing, PyTurn *t) {
+    for (int i = 0; i < TURN_BUFFERS; i++) {
+        release_buffer(&t->buffers[i]);
+    }
+    for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
+        release_buffer(&t->seen_buffers[i]);
+        release_buffer(&t->last_buffers[i]);
+    }
+}
+
 static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
-    const size_t seen = playing->judgement.program.number_of_seen;
     PyTurn t;
     PyObject *result = NULL;
 
-    t.bad_action = false;
-    memset(t.buffers, 0, sizeof t.buffers);
-    memset(t.seen_buffers, 0, seen * sizeof *t.seen_buffers);
-
+    clear_turn(playing, &t);
     if (take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
         result = play_turn(self, &t);
     }
-    for (int i = 0; i < TURN_BUFFERS; i++) {
-        release_buffer(&t.buffers[i]);
-    }
-    for (size_t i = 0; i < seen; i++) {
-        release_buffer(&t.seen_buffers[i]);
-    }
+    release_turn(playing, &t);
     return result;
 }
 
@@ -588,19 +616,19 @@ static void do_start(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
 
     t->call.alone = alone;
-    t->troubled = pool_start(&self->pool, &t->call);
+    t->ends.outside = false;
+    t->troubled = pool_start(&self->pool, &t->call, &t->ends.outside);
 }
 
-static bool take_start_arrays(PyPool *self, const Play *play, PyObject *const *args, PyTurn *t) {
-    const Settings *s = &self->pool.settings;
-    const Py_ssize_t n = (Py_ssize_t)s->count;
+static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *const *args,
+                              PyTurn *t) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
     Py_buffer *b = t->buffers;
 
     return take_vector(args[0], &b[MASK], COPIED, "the mask", ITEM_BOOLEAN, n) &&
-           take_matrix(args[1], &b[SEEN], WRITTEN, "observations", ITEM_FLOAT32, n,
-                       (Py_ssize_t)s->num_observed) &&
+           take_observations(self, playing, args[1], t) &&
            take_matrix(args[2], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)play->draws->count, n);
+                       (Py_ssize_t)playing->play.draws->count, n);
 }
 
 static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
@@ -608,15 +636,13 @@ static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *ar
     PyTurn t;
     bool done = false;
 
-    memset(&t, 0, sizeof t);
-    if (take_start_arrays(self, &playing->play, args, &t)) {
+    clear_turn(playing, &t);
+    if (take_start_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
         t.call.mask = (Mask){t.buffers[MASK].buf, t.buffers[MASK].strides[0]};
-        done = perform(self, RESET, do_start, &t) && report_messages(self);
+        done = perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self);
     }
-    for (int i = 0; i < TURN_BUFFERS; i++) {
-        release_buffer(&t.buffers[i]);
-    }
+    release_turn(playing, &t);
     return done ? PyLong_FromSize_t(t.troubled) : NULL;
 }
 

@@ -87,6 +87,9 @@ PyObject *py_recycle(PyObject *object, PyObject *unused);
 PyObject *py_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_begin_by(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_costs(PyObject *object, PyObject *unused);
+PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_pack(PyObject *object, PyObject *index);
+PyObject *py_adopt(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_uses_states(PyObject *object, PyObject *unused);
 
 PyObject *py_save(PyObject *object, PyObject *unused);

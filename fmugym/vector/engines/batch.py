@@ -68,6 +68,7 @@ class BatchEngine(Engine):
 
     def _make_parameters(self, plan: EpisodePlan) -> None:
         self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
+        self._drawn_rows = np.array(plan.drawn_rows, np.intp)[:, None]
         names = [variable.name for variable in plan.model_variables]
         self._parameters = dict(zip(names, self._start_values, strict=True))
         self.env.parameters = MappingProxyType(self._parameters)
@@ -207,22 +208,16 @@ class BatchEngine(Engine):
                 f"environment {index}: the first observation is not finite: {first}"
             )
 
-    def _begin(
-        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan
-    ) -> dict[str, FloatArray]:
+    def _begin(self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan) -> dict[str, Any]:
         """Draw and start episodes; return the values for the info, by name."""
-        values = self._draw(indices, plan)
+        drawn = self._streams.draw(plan, indices)
+        values = self._place_episodes(drawn, indices, plan)
         self.has_moved = True
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
         self._forget(indices, plan)
-        return {name: self._drawn(name) for name in [*plan.told, *plan.drawn_names]}
-
-    def _drawn(self, name: str) -> FloatArray:
-        """The row of a drawn value; a variable may have become a table of equal rows."""
-        row = self._row(name)
-        return (row if row.ndim == 1 else row.reshape(-1, self._n)[0]).copy()
+        return plan.told | dict(zip(plan.drawn_names, drawn, strict=True))
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""
@@ -243,26 +238,36 @@ class BatchEngine(Engine):
             if statuses[index] > Status.WARNING:
                 raise failed_reset(f"environment {index}: {self._pool.failure(index)}")
 
-    def _draw(self, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
-        """Draw episodes into the rows of the parameters and variables.
+    def _place_episodes(
+        self, drawn: FloatArray, indices: IndexArray, plan: EpisodePlan
+    ) -> FloatArray:
+        """Write the values of episodes into the rows of the parameters and variables.
 
         Returns:
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env._plan
-        self._place(plan.drawn_names, self._streams.draw(plan, indices), indices)
+        if default and not self.env.variables:
+            self._start_values[self._drawn_rows, indices] = drawn
+        else:
+            self._place(plan.drawn_names, drawn, indices)
         if not default or self._any_foreign:
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
             self._note_foreign(indices, not default)
-        starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
-        self._place(plan.constant_variables, starts, indices)
-        constant = plan.constant_parameters.keys() - plan.told.keys()
-        given = {name: self._given[name][indices] for name in self._given if name in constant}
-        self._place(given, given.values(), indices)
+        if plan.constant_variables:
+            starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
+            self._place(plan.constant_variables, starts, indices)
+        if self._given:
+            self._place_given(indices, plan)
         if default:
             return self._start_values
         return np.stack([self._parameters[variable.name] for variable in plan.model_variables])
+
+    def _place_given(self, indices: IndexArray, plan: EpisodePlan) -> None:
+        constant = plan.constant_parameters.keys() - plan.told.keys()
+        given = {name: self._given[name][indices] for name in self._given if name in constant}
+        self._place(given, given.values(), indices)
 
     def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
         for name, value in zip(names, values, strict=True):
@@ -291,9 +296,9 @@ class BatchEngine(Engine):
         env._in_hooks = True
         try:
             self._take_actions(actions, resetting)
-            drawn: dict[str, FloatArray] = {}
+            drawn: dict[str, Any] = {}
             if resetting is not None:
-                drawn = self._begin(resetting, np.flatnonzero(resetting), env._plan)
+                drawn = self._begin(resetting, resetting.nonzero()[0], env._plan)
             observed = self._new_observations()
             self.has_moved = True
             pool.step(None, resetting, observed)

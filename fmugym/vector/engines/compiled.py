@@ -28,7 +28,7 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
-from fmugym.vector.infos import final_infos, rows_as_objects
+from fmugym.vector.infos import final_infos, observations_of, restricted, rows_as_objects
 from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -123,7 +123,7 @@ class CompiledEngine(BatchEngine):
         reads_actions = task.judgement.loads("load_action") or task.loads("load_previous_action")
         is_typed = not self.env._input_writer.all_real  # then an error may name the action
         self._keeps_actions = reads_actions or is_typed or bool(task.left)
-        self._starts_here = not task.seen and not task.left and self.env._pool_observes
+        self._starts_here = not task.left and (bool(task.seen) or self.env._pool_observes)
         self._make_rows(task)
         self._layout = _Layout(task, self.env)
         self._play = self._pool.prepare_play(
@@ -214,7 +214,7 @@ class CompiledEngine(BatchEngine):
         flat = {name: row.reshape(-1, self._n) for name, row in self._rows.items()}
         before = {name: row.reshape(-1, self._n) for name, row in self._before.items()}
         constants = plan.constant_variables
-        keeps = not task.judgement.is_always_finite or not self._starts_here
+        keeps = not task.judgement.is_always_finite or not self._starts_here or bool(task.seen)
         return {
             "kept": self._kept,
             "keeps_always": keeps or task.judgement.loads("kept"),
@@ -260,19 +260,33 @@ class CompiledEngine(BatchEngine):
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        if options or self._any_foreign or not self._prepared or not self._starts_here:
+        starts_here = self._starts_here and not self._pool.is_attended
+        if options or self._any_foreign or not self._prepared or not starts_here:
             return super().reset(mask, seeds, options)
         self.has_moved = False
         if seeds is not None:
             self._streams.seed(seeds, np.flatnonzero(mask))
         self._streams.require_seeds()
-        observations, drawn = np.empty(self._shape, _FLOAT32), self._draw_ahead(mask)
+        seen, drawn = self._new_seen(), self._draw_ahead(mask)
         self.has_moved = True
-        if self._start(mask, observations, drawn):
+        troubled = self._start(mask, seen, drawn)
+        observations, infos = self._divided(seen)
+        if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
             self._require_finite_start(observations, mask)
         self.any_ended = bool(np.count_nonzero(self.ended))
-        return observations, _start_infos(self._names, drawn, mask)
+        infos = restricted(infos, mask) if infos else infos
+        return observations, infos | _start_infos(self._names, drawn, mask)
+
+    def _new_seen(self) -> Any:
+        """New arrays for what hooks or the pool make of a step: observations and infos."""
+        layout = self._layout
+        return layout.new_arrays() if layout.has_own else np.empty(self._shape, _FLOAT32)
+
+    def _divided(self, seen: Any) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos in these arrays."""
+        layout = self._layout
+        return layout.divided(seen, self._n) if layout.has_own else (seen, {})
 
     def _draw_ahead(self, mask: MaskArray | None) -> FloatArray:
         """Make the array of drawn values; those of episodes that only Python can draw are in it."""
@@ -304,14 +318,12 @@ class CompiledEngine(BatchEngine):
             actions = self._flat(actions)  # a refused step draws nothing
         drawn, last, started = self._draw_ahead(resetting), None, None
         if self.starts_at_ends and not self._draws_ahead and self._starts_here:
-            last, started = np.empty(self._shape, _FLOAT32), np.empty(self._n, _BOOL)
+            last, started = self._new_seen(), np.empty(self._n, _BOOL)
         if "_get_inputs" in self._left:
             self._call_get_inputs(actions, resetting)
         rewards = np.empty(self._n)
         judged = rewards, np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
-        seen = (
-            self._layout.new_arrays() if self._layout.has_own else np.empty(self._shape, _FLOAT32)
-        )
+        seen = self._new_seen()
         play = self._play if resetting is started is None else self._play_with_resets
         arrays = seen, *judged, drawn, last, started
         try:
@@ -328,7 +340,7 @@ class CompiledEngine(BatchEngine):
         if resetting is not None:
             infos = _start_infos(self._names, drawn, resetting)
         elif begun:
-            infos = LateDict.of(_infos_at_ends, self._names, drawn, last, started)
+            infos = LateDict.of(self._infos_at_ends, drawn, last, started)
         result: StepResult = _make_tuple(StepResult, (seen, *judged, infos))
         return self._completed(result, troubled, resetting, started)
 
@@ -337,13 +349,20 @@ class CompiledEngine(BatchEngine):
     ) -> StepResult:
         """Add what the pool does not do itself; that is nothing for most tasks."""
         if self._layout.has_own:
-            observations, infos = self._layout.divided(result.observations, self._n)
-            result = result._replace(observations=observations, infos=infos | result.infos)
+            result = self._layout.completed(result)
         if self._left:
             result = self._with_hooks_left(result, resetting)
         if troubled or self._left:
             self._mend(result, resetting if started is None else started)
         return result
+
+    def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:
+        """The infos of a step in which episodes have followed others."""
+        observations, infos = self._divided(last)
+        is_array = isinstance(observations, np.ndarray)
+        objects = (rows_as_objects if is_array else observations_of)(observations, started)
+        final = final_infos(objects, restricted(infos, started), started)
+        return _start_infos(self._names, drawn, started) | final
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -456,8 +475,13 @@ class _Layout:
         """New arrays for a step."""
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
 
+    def completed(self, result: StepResult) -> StepResult:
+        """The result with observations and infos made of the arrays of a step."""
+        observations, infos = self.divided(result.observations, len(result.rewards))
+        return _with(result, observations, infos | result.infos if infos else result.infos)
+
     def divided(self, arrays: Any, num_envs: int) -> tuple[Any, dict[str, Any]]:
-        """The observations and the infos."""
+        """The observations and the infos of these arrays."""
         if self._is_plain:
             return arrays[0], {}
         tree: dict[str, Any] = {"observation": {}, "info": {}}
@@ -467,14 +491,14 @@ class _Layout:
             for parent in parents:
                 place = place.setdefault(parent, {})
             place[name] = array
-        return tree["observation"], with_masks(tree["info"], np.ones(num_envs, np.bool_))
+        infos = with_masks(tree["info"], np.ones(num_envs, np.bool_)) if tree["info"] else {}
+        return tree["observation"], infos
 
 
-def _infos_at_ends(
-    names: list[str], drawn: FloatArray, last: npt.NDArray[Any], started: MaskArray
-) -> dict[str, Any]:
-    infos = _start_infos(names, drawn, started)
-    return infos | final_infos(rows_as_objects(last, started), {}, started)
+def _with(result: StepResult, observations: Any, infos: dict[str, Any]) -> StepResult:
+    judged = result.rewards, result.terminated, result.truncated
+    replaced: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
+    return replaced
 
 
 def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
