@@ -13,6 +13,7 @@ import fmugym
 from fmugym.pool import states
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.states import StateFiles
+from fmugym.tools.overview import as_text, overview
 from fmugym.trial.trial import known_verdict
 from fmugym.trial.verdict import Grade
 
@@ -80,6 +81,8 @@ class TestSingle:
     def test_is_initialized_once_for_all_processes(self, folder, config, initializations):
         path = make_fmu(folder, "slow")
         env = DemandingEnv(path, keep_initial_states=True, **config)
+        text = as_text(overview(fmugym.FMU(path)))
+        assert "an initial state in another process is right to the last bit" in text
         initializations(0)
         assert play_and_close(env) == EXPECTED
         assert initializations(0) == 1
@@ -183,6 +186,7 @@ class TestTrial:
             assert play_and_close(env) == EXPECTED
         assert state_files() == []
         assert known_verdict(fmugym.FMU(path)).states is grade
+        assert overview(fmugym.FMU(path))["trial"]["initial_state"] == str(grade)
         assert "no initial state is kept" in caplog.text
         assert reason in caplog.text
 

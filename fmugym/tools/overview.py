@@ -90,6 +90,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "reset_method": str(verdict.reset_method) if verdict.resets else None,
         "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
         "isolate": verdict.isolate,
+        "initial_state": None if verdict.states is None else str(verdict.states),
         "instances_at_once": verdict.instances,
         "deaths": list(verdict.reasons),
     }
@@ -226,6 +227,8 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
         parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
     if trial["isolate"]:
         parts.append("it harms its process and is isolated")
+    if trial["initial_state"]:
+        parts.append(f"an initial state in another process is {_GRADES[trial['initial_state']]}")
     count = trial["instances_at_once"]
     parts = parts or ["it survived"]
     parts.append(f"tried with {count} {'instance' if count == 1 else 'instances'} at once")
