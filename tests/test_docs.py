@@ -206,7 +206,7 @@ def test_table_of_shapes_is_what_hooks_see():
                 "model_input_names": "tau",
                 "model_output_names": ["q", "q_dot"],
                 "model_parameters": {"m": fmugym.Uniform(0.05, 0.07)},
-                "episode_variables": {"target": 0.5},
+                "episode_variables": {"target": 0.5, "past": np.zeros(1)},
                 "bounds": {"tau": (-1, 1)},
                 "time_step": 0.02,
             }
