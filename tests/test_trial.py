@@ -67,7 +67,8 @@ def started(monkeypatch):
     class Popen(subprocess.Popen):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            workers.append(self)
+            if trial._WORKER in self.args:  # a fixture may start a compiler
+                workers.append(self)
 
     monkeypatch.setattr(trial.subprocess, "Popen", Popen)
     return workers
