@@ -263,7 +263,7 @@ def _variable(name: str, value: Any) -> Any:
         return _variable_array(what, value)
     value = as_distribution(what, value)
     if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
-        raise ConfigError(f"{what} must be a number, got {shown(value)}")
+        raise ConfigError(f"{what} must be a number or an array of numbers, got {shown(value)}")
     return value if is_distribution(value) else check_number(what, value)
 
 

@@ -17,13 +17,15 @@ os.environ["FMUGYM_CACHE_DIR"] = _cache.name
 
 @pytest.hookimpl(tryfirst=True)  # before pytest looks at -m
 def pytest_collection_modifyitems(items):
-    """Mark as slow what ``tiers.py`` leaves out of the default run."""
+    """Mark what ``tiers.py`` leaves out of the default run and of ``.ci/run``."""
     seen = collections.Counter()
     for item in items:
         node_id = item.nodeid.removeprefix("tests/")
         test = node_id.partition("[")[0]
         if tiers.is_slow(node_id, seen[test]):
             item.add_marker(pytest.mark.slow)
+        if tiers.is_exhaustive(node_id, seen[test]):
+            item.add_marker(pytest.mark.exhaustive)
         seen[test] += 1
 
 

@@ -1,7 +1,8 @@
-"""Which tests the default run leaves out, so that it takes at most 90 s on two cores.
+"""Three tiers of tests: the default run, ``slow`` tests, and ``exhaustive`` ones among these.
 
-``python -m pytest -m ""`` runs every test, and so does ``.ci/run``. Every feature stays in the
-default run: of a test with many combinations of parameters, it takes every n-th.
+The default run takes at most 90 s on two cores. ``.ci/run`` also runs the slow tests that are not
+exhaustive, and ``.ci/full`` runs every test, as ``python -m pytest -m ""`` does. Every feature is
+in the default run: of a test with many combinations of parameters, it takes every n-th.
 """
 
 SLOW_MODULES = {
@@ -40,6 +41,17 @@ EVERY = {
 EVERY_OF_OTHERS = 12
 """For the modules that are not in ``EVERY``."""
 
+EVERY_IN_CI = {
+    "test_quirks": 4,
+    "test_words": 5,
+    "test_zoo": 5,
+}
+"""By module: of each test's combinations, ``.ci/run`` takes every n-th; all of other modules.
+
+The numbers have no factor in common with those of FMI versions and ways of running, so that each of
+these occurs with others in turn.
+"""
+
 SLOW_TESTS = (
     "test_cli.py::TestSkeleton::test_runs_for",
     "test_cloud_pendulum.py::TestExits",
@@ -77,3 +89,9 @@ def is_slow(node_id, number):
     if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS):
         return True
     return number % EVERY.get(module, EVERY_OF_OTHERS) > 0
+
+
+def is_exhaustive(node_id, number):
+    """Whether a slow test is left to ``.ci/full``; the arguments are those of ``is_slow``."""
+    module = node_id.partition(".py")[0]
+    return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0
