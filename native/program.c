@@ -187,11 +187,11 @@ static void load_stopped(const Source *s, size_t begin, size_t count, uint8_t *t
 static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1};
 
 static void note_not_finite(const Register *from, uint32_t type, size_t count, Notes *notes) {
-    if (type == FLOAT64) {
+    if (type == VALUE_DOUBLE) {
         for (size_t j = 0; j < count; j++) {
             notes->not_finite[j] |= !(fabs(from->doubles[j]) <= DBL_MAX);
         }
-    } else if (type == FLOAT32) {
+    } else if (type == VALUE_FLOAT) {
         for (size_t j = 0; j < count; j++) {
             notes->not_finite[j] |= !(fabsf(from->floats[j]) <= FLT_MAX);
         }

@@ -96,7 +96,7 @@ extern const char *const operation_names[NUMBER_OF_OPERATIONS];
     X(uint8_t, 'B')                                                                                \
     X(Flag, '?')
 
-enum { VALUE_TYPES = 11, FLOAT64 = 0, FLOAT32 = 1, INT64 = 2, FLAG = 10 };
+enum { VALUE_TYPES = 11, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_INT64 = 2, VALUE_FLAG = 10 };
 
 /* What extra means depends on the operation: the row, the element of an action, the slot, the
  * call, the table, the pair of types. */

@@ -43,9 +43,6 @@ _MOST_OUTPUTS: Final = 1000
 _STEPS: Final = 30
 _EPISODES: Final = (_STEPS, 3, 3)
 """The steps of each episode. From the third one on, a saved state may be restored."""
-_NUDGE: Final = 0.01
-"""How far equal start values of two instances are moved apart, as a fraction."""
-
 _ROUNDS: Final = 20
 _THREAD_SECONDS: Final = 0.2
 """The real time in seconds after which a comparison in threads ends."""
@@ -140,7 +137,8 @@ def _run(
     count = len(inputs)
     fmu = candidate.open()
     pool = local_pool(fmu, spec, count, logger, threads=1, private_libraries=private_libraries)
-    values = _start_values(starts)[:, :count]
+    both = starts.apart()  # a caller may give each environment its own value of a fixed parameter
+    values = np.hstack([both.column(0), both.column(1)])[:, :count]
     try:
         episodes = [
             _trajectory(pool, starts.variables, values, inputs[:, :steps]) for steps in _EPISODES
@@ -148,26 +146,6 @@ def _run(
         return np.concatenate(episodes)
     finally:
         pool.close()
-
-
-def _start_values(starts: Starts) -> FloatArray:
-    """The start values of two instances, shape (P, 2).
-
-    A caller may give each environment its own value even where the config has one number, so every
-    Real differs.
-    """
-    first, second = starts.column(0), starts.column(1).copy()
-    for index, variable in enumerate(starts.variables):
-        if variable.kind == "real" and second[index] == first[index]:
-            second[index] = _nudged(variable, float(first[index, 0]))
-    return np.hstack([first, second])
-
-
-def _nudged(variable: Variable, value: float) -> float:
-    """A value one percent away, within the limits if possible."""
-    distance = _NUDGE * (abs(value) or abs(variable.nominal or 1.0))
-    above, below = value + distance, value - distance
-    return above if above <= variable.maximum or below < variable.minimum else below
 
 
 def _trajectory(

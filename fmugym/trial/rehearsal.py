@@ -45,6 +45,11 @@ _AMPLITUDES: Final = (1.0, 0.1, 0.0)
 _RELATIVE_TOLERANCE: Final = 1e-4
 """The solver tolerance if neither the config nor the FMU gives one."""
 
+_NUDGE: Final = 0.01
+"""How far equal start values of two episodes are moved apart, as a fraction."""
+
+_PLAYED: Final = (Status.OK, Status.WARNING, Status.TERMINATED)
+
 _SLACK: Final = 10.0
 """By how many tolerances two runs of a solver may differ."""
 
@@ -64,6 +69,22 @@ class Starts:
     def column(self, index: int) -> FloatArray:
         """The values of one episode, shape (P, 1)."""
         return np.array(self.values, np.float64).reshape(-1, 2)[:, index : index + 1]
+
+    def apart(self) -> Starts:
+        """The same start values, but Reals that are equal in both episodes are one percent apart.
+
+        An attribute that is set later may change them, although the config does not.
+        """
+        pairs = zip(self.variables, self.values, strict=True)
+        return replace(self, values=tuple(_apart(variable, *pair) for variable, pair in pairs))
+
+
+def _apart(variable: Variable, first: float, second: float) -> tuple[float, float]:
+    if first != second or variable.kind != "real":
+        return first, second
+    distance = _NUDGE * (abs(first) or abs(variable.nominal or 1.0))
+    above, below = first + distance, first - distance
+    return first, above if above <= variable.maximum or below < variable.minimum else below
 
 
 @dataclass(frozen=True)
@@ -86,11 +107,13 @@ class Sample:
     """An initial state, and what followed it in the process that made it.
 
     Attributes:
+        starts: The start values of both episodes.
         state: The state after an initialization with the first start values.
         inputs: The inputs of the steps, shape (steps, inputs).
         runs: The episodes of fresh instances with the first and with the second start values.
     """
 
+    starts: Starts
     state: InitialState
     inputs: FloatArray
     runs: tuple[_Run, ...]
@@ -127,6 +150,7 @@ class Rehearsal:
         if sample is None:
             self._find_reference()
         else:
+            self._starts = sample.starts
             self._inputs, self._steps = sample.inputs, len(sample.inputs)
             self._references = list(sample.runs)
 
@@ -141,11 +165,20 @@ class Rehearsal:
             self._inputs = moving_inputs(self._spec, _LONGEST, amplitude)
             self._steps = _LONGEST
             first = self._play_fresh(0, measured=True)
-            if first.status in (Status.OK, Status.WARNING, Status.TERMINATED):
-                self._references = [first, self._play_fresh(1)]
+            if first.status in _PLAYED:
+                self._references = [first, self._play_with_other_starts()]
                 self._compare_fresh_instances()
                 return
             self.reason = first.failure
+
+    def _play_with_other_starts(self) -> _Run:
+        """Move equal start values apart, unless the FMU does not play with what comes out."""
+        given, self._starts = self._starts, self._starts.apart()
+        run = self._play_fresh(1)
+        if run.status in _PLAYED or self._starts == given:
+            return run
+        self._starts = given
+        return self._play_fresh(1)
 
     def _compare_fresh_instances(self) -> None:
         again = self._play_fresh(0)
@@ -219,7 +252,7 @@ class Rehearsal:
             pool.close()
         if state is None:
             return None
-        return Sample(state, self._inputs[: self._steps], tuple(self._references))
+        return Sample(self._starts, state, self._inputs[: self._steps], tuple(self._references))
 
     def grade_sample(self) -> Grade:
         """Grade the episodes of an instance that begins with the state of the sample.

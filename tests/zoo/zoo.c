@@ -299,7 +299,7 @@ Animal *zoo_instantiate(const char *name, const char *token, const char *locatio
     me->shares = strcmp(token, "{zoo share}") == 0;
     const bool alone = strcmp(token, "{zoo alone}") == 0;
     if (take_parameters(me, token) != OK || (alone && instances > 0)) {
-        say(me, "all seats are taken");
+        say(me, "there is an instance already");
         free(me);
         return NULL;
     }
