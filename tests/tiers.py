@@ -29,16 +29,16 @@ EVERY = {
     "test_initial_states": 6,
     "test_licences": 12,
     "test_neighbours": 4,
-    "test_pool": 8,
+    "test_pool": 11,
     "test_slow_models": 3,
-    "test_quirks": 31,
+    "test_quirks": 83,
     "test_rehearsals": 3,
-    "test_words": 17,
-    "test_zoo": 29,
+    "test_words": 31,
+    "test_zoo": 59,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""
 
-EVERY_OF_OTHERS = 12
+EVERY_OF_OTHERS = 17
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
@@ -67,9 +67,13 @@ SLOW_TESTS = (
     "test_initial_states.py::TestSingle::test_drawn",
     "test_initial_states.py::TestSingle::test_native",
     "test_initial_states.py::TestSingle::test_other",
+    "test_initial_states.py::TestTrial::test_finds",
+    "test_initial_states.py::TestTrial::test_says",
     "test_initial_states.py::TestVector",
     "test_lab_recording.py::test_temporary_videos",
     "test_lab_sessions.py::TestNothingLeaks",
+    "test_licences.py::TestPace::test_of_several",
+    "test_licences.py::TestWaiting::test_in_a_reset",
     "test_lifecycle.py::TestManyLives",
     "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
@@ -79,7 +83,11 @@ SLOW_TESTS = (
     "test_process_pool.py::TestChoice",
     "test_quirks.py::TestVerdict::test_a_damaged_cache",
     "test_resources.py::test_linux_libraries",
+    "test_slow_models.py::TestProgress::test_is_not",
+    "test_slow_models.py::TestTime::test_of_a_trial",
     "test_specs.py::test_a_class_of_a_script",
+    "test_trial.py::TestSurvival::test_a_verdict",
+    "test_trial.py::TestSurvival::test_is_remembered",
 )
 """Others, by the beginning of their node ids."""
 
