@@ -34,6 +34,9 @@ TITLE = (
     "Tasks, one thread: time of a step of all environments; in brackets, how many times faster\n"
     "than by hand in numpy, without the time of the FMUs themselves"
 )
+_LEAST_SHARE = 0.1
+"""The smallest part of a step that is compared, if the rest is the time of the FMUs."""
+
 FMU, BY_HAND = "FMUs alone, in C", "by hand in numpy"
 MOST = {"SyncVectorEnv": 64, "AsyncVectorEnv": 8}
 """The largest sizes; larger ones would take longer and show nothing new."""
@@ -210,4 +213,6 @@ def _cell(name: str, samples: dict[str, list[Sample]], missing: dict[str, str]) 
     if name == FMU:
         return duration(own)
     fmus, hand = _median(samples[FMU]), _median(samples[BY_HAND])
-    return f"{duration(own)} ({times((hand - fmus) / max(own - fmus, 1e-9))})"
+    if own - fmus < _LEAST_SHARE * own:  # the difference would be noise
+        return duration(own)
+    return f"{duration(own)} ({times((hand - fmus) / (own - fmus))})"
