@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,7 +35,7 @@ Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 
-class ByHand:
+class ByHand(ABC):
     """N environments in the autoreset mode ``NEXT_STEP``, stepped by one thread.
 
     A task supplies ``_inputs``, ``_judge`` and ``_observe``.
@@ -98,17 +99,17 @@ class ByHand:
                 row[mask] = value
         self.pool.reset(self.parameters, self.values, mask)
 
+    @abstractmethod
     def _inputs(self, action: Any) -> Any:
         """The inputs of the FMUs, shape (k, N)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _judge(self, action: Any) -> tuple[Mask, Floats]:
         """Which episodes have ended, and the rewards."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _observe(self) -> Any:
         """The observations, with the environments on the first axis."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Close the pool."""

@@ -1,5 +1,6 @@
 """FMUs that need a licence for each instance."""
 
+import functools
 import itertools
 import logging
 import subprocess
@@ -127,7 +128,7 @@ class TestSeats:
 
     def test_no_trial_starts_if_more_are_asked_for_than_allowed(self, folder, seats):
         path = make_fmu(folder, "licensed")
-        make = lambda: DemandingEnv(path, max_instances=2)  # noqa: E731
+        make = functools.partial(DemandingEnv, path, max_instances=2)
         with pytest.raises(fmugym.ConfigError, match=r"3 environments need 3 .*allows 2"):
             fmugym.FMUVectorEnv(make, 3)
         with pytest.raises(fmugym.ConfigError, match=r"3 environments need 3 .*allows 2"):
@@ -260,7 +261,7 @@ class TestPace:
     def test_of_several(self, folder, seats, options):
         seats.limit(6)
         path = make_fmu(folder, "licensed")
-        make = lambda: DemandingEnv(path, max_initializations_per_second=20)  # noqa: E731
+        make = functools.partial(DemandingEnv, path, max_initializations_per_second=20)
         envs = fmugym.FMUVectorEnv(make, 6, **options)
         envs.reset(seed=0)
         envs.close()

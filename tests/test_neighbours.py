@@ -1,5 +1,6 @@
 """FMUs whose instances disturb each other only while they are initialized."""
 
+import functools
 import logging
 import sys
 
@@ -65,7 +66,7 @@ class TestOneInitializationAtATime:
     def test_serves_a_vector_environment(self, folder, caplog, options):
         caplog.set_level(logging.INFO, "fmugym")
         path = make_fmu(folder, "strtok")
-        make = lambda: DemandingEnv(path, gain=fmugym.Uniform(1.0, 2.0), log_level=20)  # noqa: E731
+        make = functools.partial(DemandingEnv, path, gain=fmugym.Uniform(1.0, 2.0), log_level=20)
         envs = fmugym.FMUVectorEnv(make, NUM_ENVS, autoreset_mode="Disabled", **options)
         for seed in range(4):
             _, infos = envs.reset(seed=seed)
