@@ -21,6 +21,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import Status
 from fmugym.pool import Backend, Paced
 from fmugym.registration import register
+from fmugym.single import Player as _Player  # noqa: F401  (it makes single steps compiled)
 from fmugym.tools.linearization import LinearModel, linearize
 from fmugym.vector import FMUVectorEnv
 

@@ -461,6 +461,20 @@ WIDE static void compute(uint16_t operation, const void *first, const void *seco
     }
 }
 
+/* The power of scalars, which is that of the C library in Python and in numpy. */
+static void power(uint16_t operation, size_t count, const Register *base, const Register *exponent,
+                  Register *to) {
+    if (operation == POWER_D) {
+        for (size_t j = 0; j < count; j++) {
+            to->doubles[j] = pow(base->doubles[j], exponent->doubles[j]);
+        }
+        return;
+    }
+    for (size_t j = 0; j < count; j++) {
+        to->floats[j] = powf(base->floats[j], exponent->floats[j]);
+    }
+}
+
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Register *registers, Notes *notes) {
     for (size_t place = 0; place < program->length; place++) {
@@ -504,6 +518,10 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
             break;
         case INTERPOLATE:
             interpolate(&program->tables[i.extra], first->doubles, count, to->doubles);
+            break;
+        case POWER_D:
+        case POWER_F:
+            power(i.operation, count, first, &registers[i.b], to);
             break;
         default:
             compute(i.operation, first, &registers[i.b], &registers[i.c], to);

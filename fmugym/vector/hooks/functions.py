@@ -63,6 +63,8 @@ def _into(out: Any, result: Symbols) -> Any:
 
 def _kind_of(value: Any) -> Any:
     """The type of an operand; the numbers of Python adapt to the other operands."""
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak
     return type(value) if type(value) in (int, float) else np.asarray(value).dtype
 
 
@@ -222,6 +224,8 @@ def _dummy(graph: Graph, value: Any) -> Any:
     """A number or array of the same type, of which numpy makes the same type of result."""
     if type(value) in (int, float, bool):
         return value
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak(1)
     return np.ones(1, as_symbols(graph, value).dtype)
 
 

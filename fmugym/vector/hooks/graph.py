@@ -47,7 +47,13 @@ class Cell:
 
 
 class Graph:
-    """The nodes of one program, equal ones once."""
+    """The nodes of one program, equal ones once.
+
+    Attributes:
+        array_type: The class of symbolic arrays, if it is not ``Symbols``.
+    """
+
+    array_type: Any = None
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []

@@ -35,7 +35,7 @@ from fmugym.vector.hooks.symbols import (
     spread,
 )
 
-__all__ = ["SeenArray", "TracedTask", "trace_hooks"]
+__all__ = ["SeenArray", "TracedTask", "placed", "rounded", "trace_hooks"]
 
 _MOST_TABLE: Final = 4096
 """The most elements of an attribute that hooks may look values up in."""
@@ -162,7 +162,7 @@ class _Tracer:
                 raise UntraceableError(f"it changes self.{changed}")
             return of(value)
         except Exception as error:  # hooks do with numbers what symbols cannot do
-            raise UntraceableError(_placed(self._env, name, error)) from error
+            raise UntraceableError(placed(self._env, name, error)) from error
 
     def _nodes(self, value: Any, shape: tuple[int, ...] | None, dtype: Any) -> npt.NDArray[Any]:
         """The nodes of a result, the environments last; one value stands for all environments."""
@@ -221,7 +221,7 @@ class _Tracer:
             rounded: Any = np.where(value >= 0.5, 1.0, 0.0)
             rounded = np.where(np.isfinite(value), rounded, value)
         elif variable.kind in {"integer", "enumeration"}:
-            rounded = _rounded(variable, value)
+            rounded = rounded(variable, value)
         else:
             limit = float(np.finfo(np.float32).max)
             rounded = np.where(np.absolute(value) <= limit, value, np.nan)
@@ -364,7 +364,7 @@ class _Tracer:
         seen.append(SeenArray(path, nodes.shape, dtype))
 
 
-def _rounded(variable: Any, value: Any) -> Any:
+def rounded(variable: Any, value: Any) -> Any:
     """The nearest integer, or the nearest item of an Enumeration; NaN outside of the range."""
     low, high = variable.integer_limits
     largest = 2.0**53
@@ -388,7 +388,7 @@ def _nearest(items: list[int], value: Any) -> Any:
     return np.where(inside, nearest, value)
 
 
-def _placed(env: FMUEnv, name: str, error: Exception) -> str:
+def placed(env: FMUEnv, name: str, error: Exception) -> str:
     """Say where a hook does what cannot be traced."""
     what = str(error) if isinstance(error, UntraceableError) else f"it fails on symbols: {error}"
     code = getattr(getattr(type(env), name), "__code__", None)
