@@ -112,6 +112,7 @@ class FMUEnv(Constructed):
     _player: Any = None
     _play: Callable[..., Any] | None = None
     _width = 0
+    _tells = False
 
     # Where these are not attributes of the environment, the pool keeps them.
     _values = LateReading()
@@ -197,6 +198,7 @@ class FMUEnv(Constructed):
         elif not pool.can_play or pool.num_instances > 1:
             obstacle = "the pool is not a native one of its own"
         if obstacle is None and self._way != "python" and self._player_type is not None:
+            self._play, self._width, self._tells = None, 0, False
             self._player = self._player_type(required=self._way == "compiled")
         if obstacle is not None and self._way == "compiled":
             name = type(self).__name__
@@ -297,11 +299,11 @@ class FMUEnv(Constructed):
             self._ended = True
             self._player.note_end(result[2])
         if self._has_info:
-            self._in_hooks = True
+            self._in_hooks = self._tells = True
             try:
                 result = (*result[:4], self._info())
             finally:
-                self._in_hooks = False
+                self._in_hooks = self._tells = False
         if self.render_mode is not None:
             self._note_for_picture(result[1])
         return result

@@ -76,7 +76,7 @@ class Player:
             task = trace_single(env, action)
             require_equal(env, task)
             self._prepare(env, task)
-            self._task = task
+            self._task, self._required = task, False
         except Exception as reason:  # hooks may raise anything
             env._player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
@@ -197,9 +197,13 @@ class Player:
         """Make an attribute that the environment does not have now.
 
         Episode variables may be written, so that the environment keeps everything itself again.
+        Only ``_get_info`` does not write them.
         """
         if name != "variables":
             return self._reading(env, name)
+        if env._tells and self._task is not None:
+            self._variables.update(self._updated(self._task, self._now))
+            return self._variables
         self.give_back(env)
         return vars(env)[name]
 
@@ -240,13 +244,12 @@ class Player:
             attributes.setdefault("variables", self._variables)
             self._variables = None
         if rows is not None and self._task is not None:
-            values = {n: self._value(self._task.variables[n], rows[n]) for n in self._task.updated}
-            env.variables.update(values)
+            env.variables.update(self._updated(self._task, rows))
 
-    def _value(self, kind: Kind, row: npt.NDArray[Any]) -> Any:
-        if kind.shape is not None:
-            return row.reshape(kind.shape).copy()
-        return row.item() if kind.python else row[0, 0]
+    @staticmethod
+    def _updated(task: SingleTask, rows: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+        """The values of the variables that ``_update`` writes."""
+        return {name: _value_of(task.variables[name], rows[name]) for name in task.updated}
 
     def go_back(self, env: FMUEnv) -> None:
         """Set what hooks read to what it is when the FMU has stepped, and nothing was judged."""
@@ -255,6 +258,12 @@ class Player:
         readings = {name: self._reading(env, name) for name in LATE}
         self.give_variables(env, self._before)
         vars(env).update(readings, _values=values, state=state, previous_state=state, done=False)
+
+
+def _value_of(kind: Kind, row: npt.NDArray[Any]) -> Any:
+    if kind.shape is not None:
+        return row.reshape(kind.shape).copy()
+    return row.item() if kind.python else row[0, 0]
 
 
 def _is_plain(env: FMUEnv, action: Any) -> bool:

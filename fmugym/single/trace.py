@@ -14,7 +14,9 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.single.watch import Watched, noting_reads, watched_in
 from fmugym.task.readings import Readings, reading
+from fmugym.task.results import FLOAT32_LIMIT
 from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import numpy_of
 from fmugym.vector.hooks.graph import Cell
@@ -22,7 +24,7 @@ from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
 from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
 from fmugym.vector.hooks.symbols import Symbols
-from fmugym.vector.hooks.trace import SeenArray, placed, rounded
+from fmugym.vector.hooks.trace import SeenArray, placed, rounded, tables_of
 
 __all__ = ["Kind", "SingleTask", "kind_of", "trace_single"]
 
@@ -132,7 +134,7 @@ class _Tracer:
         self._env, self._action = env, action
         self._parameters = dict(env.parameters)
         self._graph = ScalarGraph()
-        self._contents = Contents(env)
+        self._tables = dict(tables_of(env))
         self._variables: dict[str, Kind] = {}
         for name, value in env.variables.items():
             kind = kind_of(value)
@@ -173,6 +175,8 @@ class _Tracer:
 
     def _begin(self, judging: bool) -> None:
         self._graph = ScalarGraph()
+        for name, table in self._tables.items():
+            vars(self._env)[name] = lifted(self._graph, table)
         self._readings(judging).place_in(self._env)
         self._contents = Contents(self._env)
 
@@ -286,16 +290,24 @@ class _Tracer:
     def _see_one(
         self, path: tuple[str, ...], value: Any, space: Any, number: int
     ) -> tuple[SeenArray, list[Store]]:
-        is_array = isinstance(value, np.ndarray)
-        if not is_array or not isinstance(space, spaces.Box) or value.dtype != space.dtype:
-            raise UntraceableError("the observation is no array of the type of its space")
+        if not isinstance(value, np.ndarray) or not is_array_space(space):
+            raise UntraceableError("the observation is no array, or no dict of arrays")
         symbols = lifted(self._graph, value)
         if symbols.shape != space.shape or not symbols.shape:
             raise UntraceableError("the observation has another shape than its space")
         letter_of(symbols.dtype)
-        cells = symbols.cells.reshape(-1)
+        cells: Any = symbols.cells.reshape(-1)
+        if symbols.dtype == np.float64 and space.dtype == np.float32:
+            self._guard_large(cells)
         stores = [Store(c.node, None, (number, i, cells.size)) for i, c in enumerate(cells)]
         return SeenArray(path, symbols.shape, symbols.dtype), stores
+
+    def _guard_large(self, cells: Any) -> None:
+        """Leave numbers to Python that no float32 can hold: they are a fault."""
+        limit = self._constant(FLOAT32_LIMIT, np.float64)
+        for cell in cells:
+            size = self._graph.apply(np.absolute, (cell,), np.dtype(np.float64))
+            self._graph.guard(self._graph.apply(np.greater, (size, limit), np.dtype(np.bool_)))
 
     # What hooks read.
 

@@ -20,6 +20,7 @@ from fmugym.vector.hooks.program import UntraceableError, letter_of
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
+    Unboxed,
     as_symbols,
     each,
     handlers,
@@ -182,6 +183,8 @@ def _graph_of(*values: Any) -> Graph:
     for value in values:
         if isinstance(value, Symbols):
             return value.graph
+        if isinstance(value, Unboxed):
+            return value.symbols.graph
         if isinstance(value, list | tuple) and has_symbols(value):
             return _graph_of(*value)
     raise UntraceableError("it calls a function of numpy in a way that cannot be followed")
@@ -346,7 +349,7 @@ def look_up(table: Symbols, key: Any) -> Symbols:
     columns = rows.reshape(len(rows), -1)
     index = first.cast(np.int64).cells
     parts = [_column(table, columns[:, i], index) for i in range(columns.shape[1])]
-    cells = np.stack(parts, axis=-1).reshape(*index.shape, *rows.shape[1:])
+    cells = np.stack(parts, axis=-1).reshape((*index.shape, *rows.shape[1:]))
     return Symbols(graph, cells, table.dtype)
 
 
@@ -418,7 +421,7 @@ def _patched(function: Any, own: Callable[..., Any]) -> Callable[..., Any]:
         graph = getattr(_tracing, "graph", None)
         if graph is None:
             return function(*args, **keywords)
-        return own(graph, function, *args, **keywords)
+        return graph.patched(own, function, args, keywords)
 
     return functools.update_wrapper(call, function)
 

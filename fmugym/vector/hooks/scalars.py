@@ -70,6 +70,19 @@ class ScalarGraph(Graph):
             self.depth -= 1
         return result if self.depth or makes_arrays else unboxed(result)
 
+    def patched(self, own: Callable[..., Any], function: Any, args: Any, keywords: Any) -> Any:
+        """See ``Graph.patched``."""
+        args = tuple(map(_boxed, args))
+        makes_arrays = function.__name__ not in _PATCHED_SCALARS
+        return self.follow(makes_arrays, lambda: own(self, function, *args, **keywords))
+
+
+_PATCHED_SCALARS: Final = frozenset(
+    {"take", "sum", "prod", "mean", "std", "var", "any", "all", "max", "min", "amax", "amin"}
+    | {"ptp", "norm"}
+)
+"""Functions that return numbers instead of arrays without dimensions."""
+
 
 def unboxed(value: Any) -> Any:
     """Turn arrays without dimensions into scalars."""
@@ -235,11 +248,18 @@ def _call_function(graph: Any, function: Any, args: Any, keywords: Any) -> Any:
 
 def _boxed(value: Any) -> Any:
     """What the functions of symbolic arrays take: numbers of Python stay weak."""
+    if isinstance(value, list | tuple):
+        return type(value)(_boxless_part(part) for part in value)
     if not isinstance(value, Scalar):
         return value
     symbols = value.symbols.like(value.cell)
     symbols.weak = value.weak if value.weak in (int, float) else None
     return symbols
+
+
+def _boxless_part(part: Any) -> Any:
+    """An element of a list, which does not adapt to other types any more."""
+    return part.symbols.like(part.cell) if isinstance(part, Scalar) else _boxed(part)
 
 
 def _scalar(graph: Any, cell: Cell, dtype: np.dtype[Any], weak: Any) -> Scalar:

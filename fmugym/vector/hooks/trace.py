@@ -35,7 +35,7 @@ from fmugym.vector.hooks.symbols import (
     spread,
 )
 
-__all__ = ["SeenArray", "TracedTask", "placed", "rounded", "trace_hooks"]
+__all__ = ["SeenArray", "TracedTask", "placed", "rounded", "tables_of", "trace_hooks"]
 
 _MOST_TABLE: Final = 4096
 """The most elements of an attribute that hooks may look values up in."""
@@ -111,7 +111,7 @@ class _Tracer:
         self._graph = Graph()
         self._contents = Contents(env)
         self._left: dict[str, str] = {}
-        self._tables = dict(_tables(env))
+        self._tables = dict(tables_of(env))
         self._variables: dict[str, np.dtype[Any]] = {
             name: np.dtype(np.float64) for name in env.variables
         }
@@ -454,7 +454,7 @@ def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
     return loaded(graph, kind, names, space.dtype)
 
 
-def _tables(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+def tables_of(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """The arrays among the attributes that hooks may index with values."""
     for name, value in vars(env).items():
         is_table = type(value) is np.ndarray and value.dtype.kind in "biuf"
