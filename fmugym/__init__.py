@@ -18,6 +18,7 @@ from fmugym.errors import (
     FMULoadError,
     LicenceError,
     SimulationError,
+    TaskError,
 )
 from fmugym.fmi.status import Status
 from fmugym.pool import Backend, Paced
@@ -49,6 +50,7 @@ __all__ = [
     "Status",
     "Task",
     "TaskEnv",
+    "TaskError",
     "Uniform",
     "bundled_fmu",
     "envs",

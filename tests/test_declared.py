@@ -2,7 +2,9 @@
 
 import multiprocessing
 import pickle
+import re
 import textwrap
+import tomllib
 from functools import partial
 from pathlib import Path
 
@@ -13,9 +15,15 @@ from gymnasium.envs.registration import EnvSpec
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
+from fmugym.declared.declarations import BUILT_IN
+from fmugym.declared.expressions import CONSTANTS
+from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.task import KEYS
+from fmugym.declared.variables import VARIABLE_KEYS
 from fmugym.errors import TaskError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+DOCS = Path(__file__).parent.parent / "docs"
 
 TWINS = {
     "cart_pole": ("fmugym/CartPole-v0", 0.0),
@@ -434,6 +442,37 @@ def test_specs_of_files_and_dicts_are_text():
         env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
         env.reset(seed=0)
         env.close()
+
+
+def test_the_tasks_in_the_documentation_run():
+    text = (DOCS / "task-file.md").read_text(encoding="utf-8")
+    first, *others = re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)
+    base = tomllib.loads(first)
+    for other in [{}, *map(tomllib.loads, others)]:
+        env = fmugym.load({k: merged(base.get(k), other.get(k)) for k in base | other})
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+    assert len(others) > 2
+
+
+def merged(base, own):
+    return {**base, **own} if isinstance(base, dict) and isinstance(own, dict) else own or base
+
+
+@pytest.mark.parametrize(
+    ("heading", "names"),
+    [
+        ("Keys", KEYS),
+        ("Variables", [*VARIABLE_KEYS]),
+        ("Expressions", [*FUNCTIONS, "previous", *BUILT_IN, *CONSTANTS]),
+    ],
+)
+def test_the_tables_of_the_documentation_are_complete(heading, names):
+    text = (DOCS / "task-file.md").read_text(encoding="utf-8")
+    part = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.+?`) \|", part, re.M)
+    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(names)
 
 
 def test_the_id_needs_a_task():

@@ -17,6 +17,7 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.task.interface import checked, input_variable, output_variable
 
 __all__ = [
+    "VARIABLE_KEYS",
     "Record",
     "Records",
     "converted",
@@ -27,7 +28,8 @@ __all__ = [
     "start_value",
 ]
 
-_KEYS: Final = ("name", "unit", "min", "max", "levels", "description")
+VARIABLE_KEYS: Final = ("name", "unit", "min", "max", "levels", "description")
+"""The keys of a variable."""
 
 
 def number(entry: Entry) -> float:
@@ -153,7 +155,7 @@ class Records:
             output_variable(self._description, self[name].fmu_name)
 
     def _declared(self, entry: Entry) -> Record:
-        table, alias = entry.table(_KEYS), entry.name
+        table, alias = entry.table(VARIABLE_KEYS), entry.name
         if "name" not in table:
             return self._record(alias, entry, self._description.variables.get(alias))
         with table["name"].placing():
