@@ -184,6 +184,8 @@ class CompiledEngine(BatchEngine):
                 return self._parameters[name]
             case "step_count":
                 return self.env.step_count
+            case "attribute":
+                return self._columns[name]
         arrays = self._rows if kind == "variable" else self._before
         return arrays[name].reshape(-1, self._n)[index]
 
@@ -247,9 +249,7 @@ class CompiledEngine(BatchEngine):
         super()._assign(attributes)
         task: TracedTask | None = None
         try:
-            if self._columns:
-                raise UntraceableError("environments have attributes of their own")
-            task = trace_hooks(self.env)
+            task = trace_hooks(self.env, self._columns)
             require_same(self.env, Readings.of(self.env), task)
         except Exception as reason:  # as in find_programs
             logger.info("the hooks cannot be compiled any more: %s", reason)
