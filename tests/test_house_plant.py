@@ -1,5 +1,9 @@
 """The bundled house against balances written in another form, scipy and closed forms."""
 
+import csv
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -158,3 +162,55 @@ def test_the_cop_at_its_limits(outside, lift):
 def test_parameters_without_sense_are_refused(parameters, message):
     with pytest.raises(fmugym.SimulationError, match=message):
         simulate([], parameters)
+
+
+@pytest.fixture
+def year(monkeypatch):
+    """The module that makes the synthetic year."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "resources" / "House"))
+    import year
+
+    return year
+
+
+def test_the_year_is_made_anew(year):
+    with year.FILE.open(newline="") as file:
+        committed = list(csv.reader(file))
+    assert committed[0] == list(year.COLUMNS)
+    assert committed[1:] == [list(map(str, row)) for row in year.year()]
+    assert len(committed) == 1 + 8760
+
+
+@pytest.mark.parametrize(("day", "elevation"), [(171, 38 + 23.45), (354, 38 - 23.45), (80, 38)])
+def test_the_sun_at_noon(year, day, elevation):
+    """90 degrees minus the latitude, plus the declination: solstices and equinox."""
+    sun = year.sun_at(day, 12.0)
+    assert math.degrees(math.asin(sun.height)) == pytest.approx(elevation, abs=0.5)
+    assert sun.on_south == pytest.approx(math.cos(math.asin(sun.height)))
+
+
+def test_the_sun_over_the_day(year):
+    assert year.sun_at(80, 6.0).height == pytest.approx(0, abs=0.02)  # it rises at the equinox
+    assert year.sun_at(80, 9.0) == pytest.approx(year.sun_at(80, 15.0))
+    assert year.global_irradiance(0.0, 0.0) == 0
+    assert year.global_irradiance(1.0, 0.0) == pytest.approx(1098 * math.exp(-0.057))
+    assert year.global_irradiance(0.5, 1.0) == pytest.approx(
+        0.25 * year.global_irradiance(0.5, 0.0)
+    )
+
+
+@pytest.mark.parametrize("clearness", [0.22, 0.8])
+def test_the_diffuse_share_is_continuous(year, clearness):
+    shares = [year.diffuse_share(1367.0 * k, 1.0) for k in (clearness - 1e-9, clearness + 1e-9)]
+    assert shares[0] == pytest.approx(shares[1], abs=5e-3)
+
+
+def test_beam_and_wall(year):
+    """All light on the ground and half of the sky's on the wall, where the sun is behind it."""
+    behind = year.Sun(height=0.5, on_south=-0.3)
+    ground = year.global_irradiance(0.5, 0.0)
+    diffuse = ground * year.diffuse_share(ground, 0.5)
+    assert year.irradiance_on_south(behind, 0.0) == pytest.approx(0.5 * diffuse + 0.1 * ground)
+    low = year.Sun(height=0.5, on_south=math.sqrt(0.75))
+    beam = (ground - diffuse) * math.sqrt(3)
+    assert year.irradiance_on_south(low, 0.0) == pytest.approx(beam + 0.5 * diffuse + 0.1 * ground)
