@@ -116,8 +116,8 @@ class CompiledEngine(BatchEngine):
         self._prepared = False
         if task is None or not _can_draw(task, plan):
             return
-        self._names, self._left = plan.drawn_names, task.left
-        self._drawn_shape = len(self._names), self._n
+        self._left = task.left
+        self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
         reads_actions = task.judgement.loads("load_action") or task.loads("load_previous_action")
@@ -228,9 +228,9 @@ class CompiledEngine(BatchEngine):
                 for name, start in env._start_inputs
             ),
             "drawn_variables": tuple(
-                (flat[name][0], number)
-                for number, name in enumerate(plan.drawn_names)
-                if name in flat
+                (flat[draw.name][draw.element or 0], number)
+                for number, draw in enumerate(plan.draws)
+                if draw.name in flat
             ),
             "variable_starts": tuple(
                 (row, np.array(value, row.dtype).tobytes())
@@ -270,7 +270,7 @@ class CompiledEngine(BatchEngine):
         seen, drawn = self._new_seen(), self._draw_ahead(mask)
         self.has_moved = True
         troubled = self._start(mask, seen, drawn)
-        infos: dict[str, Any] = _start_infos(self._names, drawn, mask)
+        infos: dict[str, Any] = _start_infos(self.env._plan, drawn, mask)
         observations = seen
         if self._layout.has_own:
             observations, own = self._layout.divided(seen, self._n)
@@ -344,7 +344,7 @@ class CompiledEngine(BatchEngine):
         self.any_ended = ended > begun
         infos: dict[str, Any] = {}
         if resetting is not None:
-            infos = _start_infos(self._names, drawn, resetting)
+            infos = _start_infos(self.env._plan, drawn, resetting)
         elif begun:
             infos = LateDict.of(self._infos_at_ends, drawn, last, started)
         result: StepResult = _make_tuple(StepResult, (seen, *judged, infos))
@@ -368,7 +368,7 @@ class CompiledEngine(BatchEngine):
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
         final = final_infos(objects, restricted(infos, started), started)
-        return _start_infos(self._names, drawn, started) | final
+        return _start_infos(self.env._plan, drawn, started) | final
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -524,9 +524,9 @@ def _with(result: StepResult, observations: Any, infos: dict[str, Any]) -> StepR
     return replaced
 
 
-def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return {"drawn": LateDict.of(_told, names, drawn, mask), "_drawn": mask}  # rarely read
+def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
 
 
-def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(dict(zip(names, drawn, strict=True)), mask)
+def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return coded(plan.named(drawn), mask)
