@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fmugym.archive.fmu import FMU
     from fmugym.archive.safe_zip import ArchiveLimits
     from fmugym.config import EnvConfig
+    from fmugym.declared import Task, TaskEnv, load
     from fmugym.distributions import Choice, LogUniform, Normal, Uniform
     from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
     from fmugym.errors import (
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         FMULoadError,
         LicenceError,
         SimulationError,
+        TaskError,
     )
     from fmugym.fmi.status import Status
     from fmugym.pool import Backend, Paced
@@ -52,10 +54,14 @@ __all__ = [
     "Paced",
     "SimulationError",
     "Status",
+    "Task",
+    "TaskEnv",
+    "TaskError",
     "Uniform",
     "bundled_fmu",
     "envs",
     "linearize",
+    "load",
     "register",
 ]
 
@@ -64,11 +70,12 @@ _MODULES = {
     "archive.fmu": ["FMU"],
     "archive.safe_zip": ["ArchiveLimits"],
     "config": ["EnvConfig"],
+    "declared": ["Task", "TaskEnv", "load"],
     "distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
     "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"],
     "errors": [
         *("ConfigError", "ContractError", "FMUGymError"),
-        *("FMULoadError", "LicenceError", "SimulationError"),
+        *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),
     ],
     "fmi.status": ["Status"],
     "pool": ["Backend", "Paced"],
@@ -76,7 +83,7 @@ _MODULES = {
     "vector": ["FMUVectorEnv"],
 }
 _ROOMS = [
-    *("archive", "checks", "config", "distributions", "env", "envs", "errors", "fmi"),
+    *("archive", "checks", "config", "declared", "distributions", "env", "envs", "errors", "fmi"),
     *("identification", "lab", "pool", "registration", "rendering", "sb3", "task", "testing"),
     *("tools", "trial", "vector"),
 ]

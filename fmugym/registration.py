@@ -71,6 +71,7 @@ def register_bundled() -> None:
     """Register the environments that come with the package, without importing them."""
     for name, spec in _BUNDLED.items():
         register(f"fmugym/{name}-v0", f"fmugym.envs:{name}Env", **spec)
+    register("fmugym/FMU-v0", "fmugym.declared:load")
 
 
 def _entry_point(env: Any) -> Any:
