@@ -90,7 +90,7 @@ class TestInfo:
     def test_says_what_the_fmu_is(self, info, model, fmi_version):
         text = info(fmugym.bundled_fmu(model, fmi_version))
         assert text.startswith(f"{model} (FMI {fmi_version})\n")
-        inputs = 2 if model == "DoublePendulum" else 1
+        inputs = {"DoublePendulum": 2, "House": 4}.get(model, 1)
         for heading in (f"Inputs ({inputs})", "Outputs (", "Parameters ("):
             assert heading in text
         assert "Locals" not in text
