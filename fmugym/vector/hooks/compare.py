@@ -75,6 +75,8 @@ class _Comparison:
                 return np.asarray(env.parameters[name], np.float64)
             case "step_count":
                 return env.step_count
+            case "attribute":
+                return getattr(env, name)
         return self._before[name].reshape(-1, self._count)[index]
 
     def compare_inputs(self) -> None:

@@ -84,11 +84,14 @@ class TracedTask:
         return self.inputs.loads(kind) or self.judgement.loads(kind)
 
 
-def trace_hooks(env: FMUEnv) -> TracedTask:
+def trace_hooks(
+    env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
+) -> TracedTask:
     """Trace the hooks of an environment.
 
     Args:
         env: A prototype whose actions make an array.
+        attributes: Those that have one number for each environment, by name.
 
     Raises:
         UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
@@ -97,7 +100,7 @@ def trace_hooks(env: FMUEnv) -> TracedTask:
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
     with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
-        return _Tracer(env).task()
+        return _Tracer(env, attributes).task()
 
 
 class _Tracer:
@@ -105,10 +108,11 @@ class _Tracer:
 
     Args:
         env: The prototype.
+        attributes: Those that have one number for each environment.
     """
 
-    def __init__(self, env: FMUEnv) -> None:
-        self._env = env
+    def __init__(self, env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]]) -> None:
+        self._env, self._attributes = env, attributes
         self._graph = Graph()
         self._contents = Contents(env)
         self._left: dict[str, str] = {}
@@ -150,6 +154,9 @@ class _Tracer:
         self._graph = Graph()
         for name, table in self._tables.items():
             vars(self._env)[name] = lift(self._graph, table)
+        for name, row in self._attributes.items():
+            names = _names((), "attribute", name)
+            vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
         symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
         self._contents = Contents(self._env)
 
