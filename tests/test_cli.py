@@ -449,7 +449,9 @@ class TestCommand:
 
     def test_output_fits_the_narrowest_console(self, make_fmu):
         path = make_fmu(INPUT, OUTPUT, description="25 \u00b0C")
-        environment = {"PYTHONIOENCODING": "ascii:strict"}
-        for command in (["info", path], ["info", path, "--json"], ["skeleton", path]):
-            done = run(*command, env={**os.environ, **environment})
-            assert done.returncode == 0, done.stderr
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
+        commands = [["info", str(path)], ["info", str(path), "--json"], ["skeleton", str(path)]]
+        program = f"from fmugym.tools.cli import main\nassert not any(map(main, {commands}))"
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr

@@ -9,6 +9,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import building
 import fmu_tools
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ def busy_xml(flags=""):
 
 def busy_fmu(folder, *options, flags=""):
     files = {"modelDescription.xml": busy_xml(flags)}
-    files[fmu_tools.library_name(2, "Busy")] = fmu_tools.compiled("busy.c", "-O2", *options)
+    files[fmu_tools.library_name(2, "Busy")] = building.library("busy.c", flags=("-O2", *options))
     return fmu_tools.write_fmu(folder / "Busy.fmu", files)
 
 
