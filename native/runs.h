@@ -4,6 +4,7 @@
 #ifndef FMUGYM_RUNS_H
 #define FMUGYM_RUNS_H
 
+#include "bundles.h"
 #include "pool.h"
 #include "steps.h"
 
@@ -15,6 +16,7 @@ typedef struct {
     const Call *call;
     int operation;
     const Snapshot *snapshot; /* the snapshot to restore */
+    const States *states;     /* or the serialized states */
     bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
