@@ -21,6 +21,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import Status
 from fmugym.pool import Backend, Paced
 from fmugym.registration import register
+from fmugym.task.snapshot import Snapshot
 from fmugym.tools.linearization import LinearModel, linearize
 from fmugym.vector import FMUVectorEnv
 
@@ -45,6 +46,7 @@ __all__ = [
     "Normal",
     "Paced",
     "SimulationError",
+    "Snapshot",
     "Status",
     "Uniform",
     "bundled_fmu",

@@ -48,6 +48,7 @@ __all__ = [
     "Outcome",
     "Request",
     "Stage",
+    "content_of",
     "examine",
     "known_resuming",
     "known_verdict",
@@ -535,11 +536,15 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     return f"{_content_key(candidate.path)}-{asked}"
 
 
+def content_of(path: Path) -> str:
+    """The SHA-256 of a file; it is read again only when it has changed."""
+    status = path.stat()
+    return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
+
+
 def _content_key(path: Path) -> str:
     """The scope of a verdict: this content, this platform, and this version of the package."""
-    status = path.stat()
-    content = _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
-    return _digest(f"{content} {fmpy.platform_tuple} {_version()}".encode())
+    return _digest(f"{content_of(path)} {fmpy.platform_tuple} {_version()}".encode())
 
 
 @functools.lru_cache(maxsize=256)
