@@ -86,9 +86,7 @@ def play_vector(envs, index, actions=ACTIONS):
         ended = ends[0] | ends[1]
         if ended.any():
             observations, infos = envs.reset(options={"reset_mask": ended})
-            drawn = tuple(
-                values[index] for name, values in infos["drawn"].items() if name[0] != "_"
-            )
+            values = {n: v for n, v in infos["drawn"].items() if n[0] != "_"}.values()
             if ended[index]:
                 rows.append((observations[index].tobytes(), tuple(v[index] for v in values)))
     return rows
