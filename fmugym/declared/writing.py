@@ -35,7 +35,7 @@ def as_toml(document: Mapping[str, Any]) -> str:
         for name, value in items.items():
             table.add(name, _item(value, (key, name)))
         written.add(key, table)
-    return tomlkit.dumps(written)
+    return str(tomlkit.dumps(written))
 
 
 def _item(value: Any, keys: tuple[str, ...]) -> Any:
