@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     )
     from fmugym.fmi.status import Status
     from fmugym.pool import Backend, Paced
+    from fmugym.task.snapshot import Snapshot
     from fmugym.tools.linearization import LinearModel, linearize
     from fmugym.vector import FMUVectorEnv
 
@@ -53,6 +54,7 @@ __all__ = [
     "Normal",
     "Paced",
     "SimulationError",
+    "Snapshot",
     "Status",
     "Task",
     "TaskEnv",
@@ -79,6 +81,7 @@ _MODULES = {
     ],
     "fmi.status": ["Status"],
     "pool": ["Backend", "Paced"],
+    "task.snapshot": ["Snapshot"],
     "tools.linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
 }
