@@ -5,9 +5,11 @@
    first step.
    "stubborn": a reset does nothing from the start.
    "noise": every step adds a random number if the environment variable TIRES_NOISE is set.
+   "crash": the process ends if the first step of all instances has an input of 1.
    "fails": instead of another value, the step returns Error.
    y' = gain u. Reals: 0 "u" (input), 1 "y" (output), 2 "gain" (parameter). */
 
+#include <signal.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
@@ -24,7 +26,7 @@ typedef struct {
     char token[60];
 } Model;
 
-static int instances;
+static int instances, has_stepped;
 
 static int is(const Model *me, const char *word) {
     return strstr(me->token, word) != NULL;
@@ -65,6 +67,10 @@ int fmi2ExitInitializationMode(Model *me) {
 int fmi2DoStep(Model *me, double time, double step_size, int no_set_state) {
     double *v = me->values;
 
+    if (is(me, "crash") && !has_stepped && v[U] == 1.0) {
+        raise(SIGSEGV);
+    }
+    has_stepped = 1;
     if (is(me, "noise")) {
         struct timespec now;
         clock_gettime(CLOCK_MONOTONIC, &now);

@@ -22,6 +22,7 @@ from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.mark import END, RESET, STEP, Mark, calling
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.slot import Slot, Snapshot
 from fmugym.pool.spec import ResetMethod
@@ -41,6 +42,7 @@ class PythonPool(AttendedPool):
         num_instances: N.
         log: The logger that gets the FMU's messages.
         counts: Gets the counts of ``health``, shape (N, HEALTH_COUNTS).
+        mark: Where a crash inside the FMU is noted.
 
     Raises:
         FMULoadError: If the FMU cannot be loaded or instantiated.
@@ -54,6 +56,7 @@ class PythonPool(AttendedPool):
         log: logging.Logger,
         *,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -64,13 +67,17 @@ class PythonPool(AttendedPool):
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
-        self._library = Library(fmu, log)
+        self._mark = mark
+        self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
+        with self._resetting:
+            self._library = Library(fmu, log)
         pacer = Pacer(spec)
         try:
-            self._slots = [
-                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
-                for i in range(num_instances)
-            ]
+            with self._resetting:
+                self._slots = [
+                    Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
+                    for i in range(num_instances)
+                ]
             raise_caught()
         except BaseException:
             self._library.close()
@@ -91,9 +98,10 @@ class PythonPool(AttendedPool):
     def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
-        for index, slot in enumerate(self._slots):
-            if mask is None or mask[index]:
-                self._note(index, slot.reset(variables, values[:, index]))
+        with self._resetting:
+            for index, slot in enumerate(self._slots):
+                if mask is None or mask[index]:
+                    self._note(index, slot.reset(variables, values[:, index]))
         raise_caught()
         self._note_reset(variables, values, mask)
 
@@ -106,9 +114,10 @@ class PythonPool(AttendedPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        for index, slot in enumerate(self._slots):
-            if skip is None or not skip[index]:
-                self._note(index, slot.step())
+        with self._stepping:
+            for index, slot in enumerate(self._slots):
+                if skip is None or not skip[index]:
+                    self._note(index, slot.step())
         if observations is not None:
             np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
         raise_caught()
@@ -212,7 +221,8 @@ class PythonPool(AttendedPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._library.close()
+        with calling(self._mark, END):
+            self._library.close()
         restore_arithmetic()
         raise_caught()
 
