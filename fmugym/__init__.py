@@ -8,6 +8,7 @@ from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.config import EnvConfig
+from fmugym.declared import Task, TaskEnv, load
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
 from fmugym.errors import (
@@ -17,6 +18,7 @@ from fmugym.errors import (
     FMULoadError,
     LicenceError,
     SimulationError,
+    TaskError,
 )
 from fmugym.fmi.status import Status
 from fmugym.pool import Backend, Paced
@@ -46,9 +48,13 @@ __all__ = [
     "Paced",
     "SimulationError",
     "Status",
+    "Task",
+    "TaskEnv",
+    "TaskError",
     "Uniform",
     "bundled_fmu",
     "envs",
     "linearize",
+    "load",
     "register",
 ]

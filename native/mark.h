@@ -1,7 +1,7 @@
 /* Marks: pages of files in which a crash inside an FMU leaves its signal and the call.
  *
- * The file outlives the process, so a later process can read why this one ended. A signal handler
- * writes the page. It passes the signal on to the handler that was there before. Only on Linux. */
+ * The file outlives the process, so a later process can read why this one ended. The signal handler
+ * of crash.c writes the page. Only on Linux. */
 
 #ifndef FMUGYM_MARK_H
 #define FMUGYM_MARK_H
@@ -30,7 +30,7 @@ typedef struct {
 
 enum { MARK_EXIT = 255 }; /* in the place of a signal: the FMU has ended the process by exit */
 
-/* Maps a page of an open file, and prepares the process and this thread. Returns whether that
+/* Maps a page of an open file, and prepares this thread. Returns whether that
  * worked; if not, errno says why. */
 bool mark_open(Mark *mark, int file);
 void mark_close(Mark *mark);

@@ -7,16 +7,6 @@
 #include "instances.h"
 #include "starts.h"
 
-void write_observation(const Pool *pool, size_t index, float *observations) {
-    const Settings *s = &pool->settings;
-    const double *value = s->output_values + index;
-    float *row = observations + index * s->num_observed;
-
-    for (size_t i = 0; i < s->num_observed; i++, value += s->count) {
-        row[i] = (float)*value;
-    }
-}
-
 static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
     const size_t index = index_of(task->pool, me);
 
@@ -30,15 +20,6 @@ static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
     }
     instance_count_from(me, task->snapshot->steps[index]);
     return instance_read_outputs(task->pool, me, scratch);
-}
-
-size_t note_status(Task *task, size_t index, Status status) {
-    task->pool->settings.status[index] = (int8_t)status;
-    if (status <= STATUS_WARNING) {
-        return 0;
-    }
-    health_count_fault(task->pool, &task->pool->instances[index], status);
-    return 1;
 }
 
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {

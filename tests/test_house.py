@@ -20,7 +20,7 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification"},
-    {"registration", "testing", "sb3"},
+    {"registration", "testing", "sb3", "declared"},
     {"envs", "tools"},
     {"__init__", "__main__", "clock"},
 ]

@@ -7,9 +7,10 @@ import subprocess
 import sys
 import time
 
+import building
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv, compiled, edited_fmu, library_name, write_fmu
+from fmu_tools import PlainEnv, edited_fmu, library_name, write_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
@@ -43,7 +44,7 @@ def make_fmu(tmp_path_factory):
     def make(token="", **add):
         files = {
             "modelDescription.xml": XML.format(token=token),
-            library_name(2, "Mortal"): compiled("mortal.c"),
+            library_name(2, "Mortal"): building.library("mortal.c"),
         }
         return write_fmu(folder / token.replace(" ", "_") / "Mortal.fmu", files | add)
 

@@ -31,10 +31,10 @@ EVERY = {
     "test_neighbours": 4,
     "test_pool": 11,
     "test_slow_models": 3,
-    "test_quirks": 83,
-    "test_rehearsals": 3,
+    "test_quirks": 113,
+    "test_rehearsals": 6,
     "test_words": 31,
-    "test_zoo": 59,
+    "test_zoo": 97,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""
 
@@ -82,6 +82,8 @@ SLOW_TESTS = (
     "test_lab_recording.py::test_temporary_videos",
     "test_lab_sessions.py::TestNothingLeaks",
     "test_licences.py::TestPace::test_of_several",
+    "test_licences.py::TestRefusal::test_in_a_later_reset",
+    "test_licences.py::TestSeats::test_the_trial_says",
     "test_licences.py::TestWaiting::test_in_a_reset",
     "test_lifecycle.py::TestManyLives",
     "test_native_helpers.py::test_a_busy",
@@ -92,12 +94,17 @@ SLOW_TESTS = (
     "test_process_pool.py::TestChoice",
     "test_quirks.py::TestVerdict::test_a_damaged_cache",
     "test_rehearsals.py::test_a_spare",
+    "test_rehearsals.py::test_a_step_that_fails",
+    "test_rehearsals.py::test_what_a_pool_cannot",
     "test_resources.py::test_linux_libraries",
     "test_slow_models.py::TestProgress::test_is_not",
     "test_slow_models.py::TestTime::test_of_a_trial",
     "test_specs.py::test_a_class_of_a_script",
+    "test_trial.py::TestDeath::test_before_a_vector",
+    "test_trial.py::TestIsolated",
     "test_trial.py::TestSurvival::test_a_verdict",
     "test_trial.py::TestSurvival::test_is_remembered",
+    "test_trial.py::TestSurvival::test_without_a_place",
 )
 """Others, by the beginning of their node ids."""
 

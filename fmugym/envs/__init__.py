@@ -31,3 +31,5 @@ for name, steps, threshold in (
         steps,
         reward_threshold=threshold,
     )
+
+register("fmugym/FMU-v0", "fmugym.declared:load")

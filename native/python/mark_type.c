@@ -2,6 +2,7 @@
 
 #include "python.h"
 
+#include "crash.h"
 #include "inside.h"
 
 PyTypeObject *mark_type;
@@ -19,6 +20,7 @@ static PyObject *mark_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
         PyErr_SetFromErrno(PyExc_OSError);
         Py_CLEAR(self);
     }
+    crash_watch();
     return (PyObject *)self;
 }
 

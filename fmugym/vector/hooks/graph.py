@@ -47,12 +47,18 @@ class Cell:
 
 
 class Graph:
-    """The nodes of one program, equal ones once."""
+    """The nodes of one program, equal ones once.
+
+    Attributes:
+        tables: The values to look up.
+        is_inexact: Whether the last bits of results may differ from those of hooks on arrays.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
         self.tables: dict[Hashable, npt.NDArray[Any]] = {}
+        self.is_inexact = False
 
     def node(self, cell: Cell) -> Node:
         """The node of a cell."""
