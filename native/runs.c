@@ -340,7 +340,7 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
     Verdict verdict = {.ended = 0};
     size_t troubled = 0, started = 0;
 
-    play_open(turn, end - begin, &registers);
+    play_open(turn, &registers);
     for (size_t first = begin; first < end; first += RUN) {
         const size_t count = length_of_run(first, end);
         play_prepare(turn, first, count, &registers);

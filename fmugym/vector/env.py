@@ -41,6 +41,8 @@ __all__ = ["FMUVectorEnv"]
 
 logger = logging.getLogger(__name__)
 
+_DISABLED, _SAME_STEP = AutoresetMode.DISABLED, AutoresetMode.SAME_STEP  # each look-up takes time
+
 
 class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     """N environments of one class, whose FMU instances step in one call.
@@ -279,7 +281,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._is_ready or self.closed or self._background.is_pending:
             self._refuse_step(method)
         engine = self._engine
-        if engine.any_ended and self.autoreset_mode is AutoresetMode.DISABLED:
+        if engine.any_ended and self.autoreset_mode is _DISABLED:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
@@ -287,7 +289,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         engine = self._engine
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
-            if engine.any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            if engine.any_ended and self.autoreset_mode is _SAME_STEP:
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment
             self._interrupt()
