@@ -6,6 +6,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.bundled import is_bundled
@@ -20,10 +21,12 @@ from fmugym.pool.mark import Mark, Remains, remains_of
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
+from fmugym.pool.saving import SavingPool, offers_states
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
+from fmugym.trial.resuming import do_states_work, known_to_work
 from fmugym.trial.trial import (
     Candidate,
     examine,
@@ -107,7 +110,9 @@ def make_pool(
             _note_crash(fmu, spec, starts, verdict, how, log)
 
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
-            pool = _open(fmu, spec, num_instances, log, completed, call_timeout, note_crash)
+            trust = _Trust.of(fmu, spec, starts, completed)
+            pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
+        pool.trust_states_if(trust.do_states_work)
         if rehearse and reset_method is None:
             _rehearse(pool, fmu, spec, starts, verdict, completed, log)
         return pool
@@ -124,7 +129,7 @@ def _open(
     plan: _Plan,
     call_timeout: float | None,
     note_crash: Callable[[str], None],
-) -> Pool:
+) -> SavingPool:
     spec = replace(
         spec,
         reset_method=plan.method,
@@ -190,6 +195,33 @@ def _rehearse(
         revise(candidate, tried, starts, found)
 
     pool.rehearse_with(Repetition(candidate, spec, verdict, plan.native, keep, log))
+
+
+@dataclass(frozen=True)
+class _Trust:
+    """Whether serialized states work, as far as known when a pool is opened.
+
+    Attributes:
+        spec: What the pool does; records are kept until it is known that states work.
+        do_states_work: Finds it out.
+    """
+
+    spec: PoolSpec
+    do_states_work: Callable[[], bool]
+
+    @classmethod
+    def of(cls, fmu: FMU, spec: PoolSpec, starts: Starts | None, plan: _Plan) -> _Trust:
+        """Look up what earlier trials have shown."""
+        candidate, tried = Candidate.of(fmu), _tried(spec)
+        if not offers_states(fmu.description, replace(spec, reset_method=plan.method)):
+            return cls(spec, bool)
+        known: bool | None = is_bundled(fmu.path)
+        if not known:
+            known = False if candidate.exempt else known_to_work(candidate, tried, starts)
+        if known is not None:
+            return cls(replace(spec, records=not known), partial(bool, known))
+        ask = partial(do_states_work, candidate, tried, starts)
+        return cls(replace(spec, records=True), ask)
 
 
 def _tried(spec: PoolSpec) -> PoolSpec:
