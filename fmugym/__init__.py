@@ -6,30 +6,8 @@ Everything else is imported when it is first used.
 
 from typing import TYPE_CHECKING
 
-from fmugym import envs
-from fmugym.archive.bundled import bundled_fmu
-from fmugym.archive.fmu import FMU
-from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.config import EnvConfig
-from fmugym.declared import Task, TaskEnv, load
-from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
-from fmugym.errors import (
-    ConfigError,
-    ContractError,
-    FMUGymError,
-    FMULoadError,
-    LicenceError,
-    SimulationError,
-    TaskError,
-)
-from fmugym.fmi.status import Status
 from fmugym.lazy import lazily
-from fmugym.pool import Backend, Paced
 from fmugym.registration import register, register_bundled
-from fmugym.task.snapshot import Snapshot
-from fmugym.tools.linearization import LinearModel, linearize
-from fmugym.vector import FMUVectorEnv
 
 if TYPE_CHECKING:
     from fmugym import envs
@@ -51,6 +29,7 @@ if TYPE_CHECKING:
     )
     from fmugym.fmi.status import Status
     from fmugym.pool import Backend, Paced
+    from fmugym.task.snapshot import Snapshot
     from fmugym.tools.linearization import LinearModel, linearize
     from fmugym.vector import FMUVectorEnv
 
@@ -102,6 +81,7 @@ _MODULES = {
     ],
     "fmi.status": ["Status"],
     "pool": ["Backend", "Paced"],
+    "task.snapshot": ["Snapshot"],
     "tools.linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
 }
