@@ -15,7 +15,10 @@ if sysconfig.get_config_var("Py_GIL_DISABLED"):
     sys.exit("fmugym needs Python with the GIL: free-threaded Python is not supported")
 
 WINDOWS = sys.platform == "win32"
-REQUIRED = os.environ.get("FMUGYM_REQUIRE_NATIVE", "0") not in ("", "0")
+WISH = os.environ.get("FMUGYM_REQUIRE_NATIVE", "")
+if WISH not in ("", "0", "1"):
+    sys.exit(f"FMUGYM_REQUIRE_NATIVE must be 0 or 1, not {WISH!r}")
+REQUIRED = WISH == "1"
 
 # One wheel for all versions of Python from 3.11 on, the first to have buffers in its stable ABI.
 # Results must not depend on the compiler: no contraction, no relaxed floating-point arithmetic.
@@ -27,7 +30,7 @@ native = Extension(
     define_macros=[("Py_LIMITED_API", "0x030B0000")],
     extra_compile_args=["/std:c11", "/fp:precise"]
     if WINDOWS
-    else ["-std=gnu11", "-O3", "-ffp-contract=off", "-fvisibility=hidden"],
+    else ["-std=gnu11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"],
     libraries=[] if WINDOWS else ["m", "pthread", "dl"],
     py_limited_api=True,
     optional=not REQUIRED,

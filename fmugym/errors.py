@@ -4,7 +4,8 @@
 
     FMUGymError
     ├── ConfigError       a name, number or type that the user gave does not fit the FMU
-    │   └── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
+    │   ├── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
+    │   └── TaskError     a declared task has a mistake; the text says where
     ├── FMULoadError      an archive, a model description or a library cannot be used
     ├── SimulationError   an FMI call failed, or a method was called out of order
     │   └── LicenceError  an FMU got no licence; it is a ``FMULoadError``, too
@@ -28,6 +29,7 @@ __all__ = [
     "FMULoadError",
     "LicenceError",
     "SimulationError",
+    "TaskError",
     "printable",
     "reason",
     "shown",
@@ -78,6 +80,10 @@ class ArgumentError(ConfigError, TypeError):
 
     It is a ``TypeError`` for callers that try arguments, as Stable-Baselines3 does.
     """
+
+
+class TaskError(ConfigError):
+    """A declared task has a mistake. The text begins with the file, the line and the keys."""
 
 
 class FMULoadError(FMUGymError):

@@ -4,25 +4,9 @@
 #ifndef FMUGYM_RUNS_H
 #define FMUGYM_RUNS_H
 
-#include "pool.h"
-#include "steps.h"
+#include "task.h"
 
 enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
-
-/* What a call does; all threads that work on it write to its last fields. */
-typedef struct {
-    Pool *pool;
-    const Call *call;
-    int operation;
-    const Snapshot *snapshot; /* the snapshot to restore */
-    bool listed;              /* items are places in pool->chosen, otherwise instances */
-    bool measured;
-    _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
-    Atomic ended;                         /* episodes that have ended, when playing */
-    Atomic outside;                       /* threads that saw an index outside of a table */
-    Atomic started;                       /* those of them whose next episode has started */
-    Atomic time;                          /* total ns of all threads, if measured */
-} Task;
 
 static inline bool is_in(Mask mask, size_t index) {
     return mask.data != NULL && mask.data[(ptrdiff_t)index * mask.stride] != 0;
@@ -39,11 +23,5 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);
 size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch);
 /* This one does the same and runs the programs before and after: */
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch);
-
-/* Keeps the status of an instance. Returns 1 if it is worse than a warning. */
-size_t note_status(Task *task, size_t index, Status status);
-
-/* Writes the first outputs of an instance. */
-void write_observation(const Pool *pool, size_t index, float *observations);
 
 #endif

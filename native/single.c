@@ -8,11 +8,6 @@
 
 enum { DONE, TRUNCATED, REWARD };
 
-void single_prepare(const Single *single) {
-    program_prepare(&single->inputs, true, single->input_registers);
-    program_prepare(&single->judgement, true, single->judgement_registers);
-}
-
 static Source source_of(const Single *s, const char *actions, const char *previous) {
     return (Source){.actions = actions,
                     .previous_actions = previous,
@@ -57,15 +52,15 @@ static bool fits_observation(const Pool *pool, const Single *s) {
 
 static bool judge(const Pool *pool, const Single *s, SingleResult *result) {
     const Source source = source_of(s, s->current, s->previous);
-    const Register *registers = s->judgement_registers;
+    const void **places = s->judgement_registers->places;
     const uint16_t *results = s->judgement.results;
     Notes notes = {.outside = false};
 
     program_run(&s->judgement, &source, 0, 1, s->judgement_registers, &notes);
-    result->terminated = registers[results[DONE]].flags[0] != 0;
-    result->truncated =
-        registers[results[TRUNCATED]].flags[0] != 0 || *s->step_count >= s->limit;
-    result->reward = registers[results[REWARD]].doubles[0];
+    result->terminated = *(const uint8_t *)places[results[DONE]] != 0;
+    result->truncated = *(const uint8_t *)places[results[TRUNCATED]] != 0 ||
+                        *s->step_count >= s->limit;
+    result->reward = *(const double *)places[results[REWARD]];
     return !notes.outside && notes.not_finite[0] == 0 && fabs(result->reward) <= DBL_MAX &&
            fits_observation(pool, s);
 }

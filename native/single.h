@@ -17,7 +17,7 @@ typedef struct {
 typedef struct {
     Program inputs;    /* from the next action to the wanted inputs */
     Program judgement; /* its results are done, truncated, reward; it stores the rest */
-    Register *input_registers, *judgement_registers; /* from single_prepare on they hold constants */
+    Registers *input_registers, *judgement_registers;
     char *next, *current, *previous; /* actions: of this step, of the last, of the one before */
     size_t elements, size;           /* of an action; bytes of an element */
     double *wanted, *inputs_row;     /* inputs that were not checked yet, and those of the pool */
@@ -40,8 +40,6 @@ typedef struct {
     bool terminated, truncated;
     double reward;
 } SingleResult;
-
-void single_prepare(const Single *single);
 
 /* Steps the instance. The result only counts if it is SINGLE_DONE. */
 SingleOutcome single_step(Pool *pool, const Single *single, const Call *call,

@@ -3,7 +3,7 @@
 #ifndef FMUGYM_STARTS_H
 #define FMUGYM_STARTS_H
 
-#include "runs.h"
+#include "task.h"
 
 /* A run of a step that plays. */
 typedef struct {

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 RESOURCES = Path(__file__).resolve().parent
-MODELS = ("CartPole", "Pendulum", "DoublePendulum")
+MODELS = ("CartPole", "Pendulum", "DoublePendulum", "House")
 FMI_VERSIONS = ("1.0", "2.0", "3.0")
 
 

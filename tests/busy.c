@@ -64,7 +64,8 @@ int fmi2Reset(Busy *me) {
 int fmi2DoStep(Busy *me, double time, double step_size, int no_set_state) {
 #if defined CRASH_IN_HELPER
     if (syscall(SYS_gettid) != getpid()) {
-        *(volatile int *)8 = 1;
+        volatile int *volatile nowhere = NULL;
+        *nowhere = 1;
     }
 #endif
     work(me->values[WORK]);

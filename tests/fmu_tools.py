@@ -1,15 +1,12 @@
 """FMUs for tests: the bundled ones with edits, and ``probe.c``, which obeys its parameters."""
 
-import functools
 import re
-import subprocess
-import sys
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
+import building
 import fmpy
 
 import fmugym
@@ -148,25 +145,9 @@ def probe_xml(version):
     return _tag("fmiModelDescription", _head(version), inside)
 
 
-@functools.cache
-def compiled(source, *flags):
-    """The shared library that a C file of this folder makes; once a session, in about a second.
-
-    Args:
-        source: The name of the file.
-        flags: More arguments of the compiler.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / f"library{fmpy.sharedLibraryExtension}"
-        command = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0"]
-        command += ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", *flags]
-        subprocess.run([*command, str(HERE / source), "-o", str(library), "-lm"], check=True)
-        return library.read_bytes()
-
-
 def probe_library(version):
     """The compiled probe."""
-    return compiled("probe.c", f"-DFMI_VERSION={version}")
+    return building.library("probe.c", flags=(f"-DFMI_VERSION={version}",))
 
 
 def stubs(version, prefix, source):
@@ -191,12 +172,18 @@ def library_name(version, identifier="Probe"):
     return f"binaries/{platform_folder(version)}/{identifier}{fmpy.sharedLibraryExtension}"
 
 
-def write_fmu(path, files):
-    """Write an archive; files are text or bytes by name."""
+def write_fmu(path, files, level=1):
+    """Write an archive; equal files make equal archives.
+
+    Args:
+        path: Its file.
+        files: Text or bytes by name.
+        level: Of compression; 9 takes most time.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(path, "w") as archive:
         for name, content in files.items():
-            archive.writestr(name, content)
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED, level)
     return path
 
 

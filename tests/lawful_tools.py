@@ -1,11 +1,10 @@
 """An FMU that notes illegal calls (``lawful.c``), and the file where it notes them."""
 
-import functools
 import mmap
 import struct
-import tempfile
 from pathlib import Path
 
+import building
 import fmu_tools
 
 CALLS = (
@@ -17,7 +16,7 @@ CALLS = (
 WARNING, DISCARD, ERROR, FATAL, NOT_A_NUMBER, STOP = range(1, 7)
 _SIZE, _PLAN, _FIRST = 4096, 16, 16 + 8 * 16
 _PREFIXES = {1: "Lawful_fmi", 2: "fmi2", 3: "fmi3"}
-_SOURCE = Path(__file__).parent / "lawful.c"
+_SOURCE = "lawful.c"
 
 
 class Record:
@@ -53,14 +52,10 @@ class Record:
         return struct.unpack("ii", self._map[4:12])
 
 
-@functools.cache
 def library(version):
-    """The compiled library; made once a session, in about a second."""
-    stubs = fmu_tools.stubs(version, _PREFIXES[version], _SOURCE)
-    with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "stubs.h").write_text(stubs)
-        flags = f"-DFMI_VERSION={version}", f"-I{folder}", '-DSTUBS="stubs.h"'
-        return fmu_tools.compiled(_SOURCE.name, *flags)
+    """The compiled library."""
+    stubs = fmu_tools.stubs(version, _PREFIXES[version], building.HERE / _SOURCE)
+    return building.library(_SOURCE, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
 
 
 _PARAMETER = 'causality="parameter" variability="fixed"'

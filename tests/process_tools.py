@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import building
 import fmu_tools
 
 import fmugym
@@ -57,7 +58,7 @@ def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
     )
     files = {
         "modelDescription.xml": xml,
-        fmu_tools.library_name(2, "Faulty"): fmu_tools.compiled("faulty.c"),
+        fmu_tools.library_name(2, "Faulty"): building.library("faulty.c"),
     }
     return fmu_tools.write_fmu(Path(folder) / "Faulty.fmu", files)
 

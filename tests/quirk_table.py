@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import fmu_tools
-import zoo_tools
+import model_tools
 
 OUTPUTS = ("y", "clock", "calls")
 VARIABLES = (
@@ -152,17 +152,17 @@ QUIRKS = (
 
 def quirk_fmu(folder, version, token):
     """Write an FMU."""
-    files = {
-        "modelDescription.xml": zoo_tools.describe(version, token, VARIABLES),
-        fmu_tools.library_name(version, "Zoo"): zoo_tools.library(version, model="quirks"),
-        "resources/tables/offset.txt": "0.25",
-    }
+    add = {"resources/tables/offset.txt": "0.25"}
     if token == "needs its directory":
         library = Path(fmu_tools.library_name(version, "Zoo"))
-        files[library.with_name("Zoo.txt").as_posix()] = "beside the library"
+        add[library.with_name("Zoo.txt").as_posix()] = "beside the library"
+    path = Path(folder) / "Quirks.fmu"
+    model_tools.model_fmu(path, "quirks", version, token, VARIABLES, add=add)
     if token == "reads a table":
+        files = fmu_tools.read_fmu(path)
         files = {name.replace("/", "\\"): content for name, content in files.items()}
-    return fmu_tools.write_fmu(Path(folder) / "Quirks.fmu", files)
+        fmu_tools.write_fmu(path, files)
+    return path
 
 
 def markdown():

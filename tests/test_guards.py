@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 
+import building
 import gymnasium as gym
 import lawful_tools
 import numpy as np
@@ -195,7 +196,7 @@ class TestArithmetic:
         """As the start-up code of -ffast-math turns them off."""
         library = tmp_path / "fast.so"
         code = "#include <xmmintrin.h>\nvoid off(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }"
-        command = [*zoo_tools.compiler(), "-shared", "-fPIC", "-x", "c", "-", "-o", library]
+        command = [*building.compiler(), "-shared", "-fPIC", "-x", "c", "-", "-o", library]
         subprocess.run(command, input=code, text=True, check=True)
         ctypes.CDLL(library).off()
         off = 0.5 * sys.float_info.min == 0.0

@@ -10,7 +10,7 @@ import fmugym
 PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
-    {"errors", "_native"},
+    {"errors", "lazy", "_native"},
     {"checks"},
     {"archive", "distributions", "rendering"},
     {"fmi"},
@@ -20,7 +20,7 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification"},
-    {"registration", "single", "testing", "sb3"},
+    {"registration", "single", "testing", "sb3", "declared"},
     {"envs", "tools"},
     {"__init__", "__main__", "clock"},
 ]

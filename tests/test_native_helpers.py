@@ -1,7 +1,6 @@
 """How the native pool's work is divided among helper threads: shown by counters, not by times."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -20,72 +19,91 @@ import numpy as np
 from fmugym import _native
 from test_native_pool import NativePool, make
 
-threads, n, work, rest, rounds = (int(argument) for argument in sys.argv[2:])
-pool = make(NativePool, sys.argv[1], ["work"], ["steps"], n, threads=threads)
-pool.reset((), np.zeros((0, n)))
-inputs = np.full((1, n), float(work))
-for _ in range(20):  # until the cost is known, and all helpers are there
-    pool.step_into(inputs)
-before = _native.statistics()
-for _ in range(rounds):
-    time.sleep(rest / 1e3)  # helpers go to sleep
-    pool.step_into(inputs)
-after = _native.statistics()
-print(json.dumps({name: after[name] - before[name] for name in after}))
+def count(threads, n, work, rest, rounds):
+    pool = make(NativePool, sys.argv[1], ["work"], ["steps"], n, threads=threads)
+    pool.reset((), np.zeros((0, n)))
+    inputs = np.full((1, n), float(work))
+    for _ in range(20):  # until the cost is known, and all helpers are there
+        pool.step_into(inputs)
+    before = _native.statistics()
+    for _ in range(rounds):
+        time.sleep(rest / 1e3)  # helpers go to sleep
+        pool.step_into(inputs)
+    after = _native.statistics()
+    pool.close()
+    return {name: after[name] - before[name] for name in after}
+
+print(json.dumps([count(*job) for job in json.loads(sys.argv[2])]))
 """
+JOBS = {
+    "for one thread": (64, 2, 1),
+    "short": (64, 12, 1),
+    "of two": (2, 2, 200),
+    "of many": (4, 400, 5),
+    "long": (3, 100, 20),
+}
+"""The number of threads, that of instances, and the work of each in us."""
+
+
+def count(folder, jobs, rest=2, rounds=50, program=COUNT):
+    """Count what helpers do in rounds of steps: in a process of its own, where no other pools are.
+
+    Args:
+        folder: Where to put the FMU.
+        jobs: As in ``JOBS``.
+        rest: Between two rounds, in ms.
+        rounds: How many there are.
+        program: The text of the Python program.
+    """
+    jobs = [(*job, rest, rounds) for job in jobs]
+    done = run_python("-c", program, str(busy_fmu(folder)), json.dumps(jobs))
+    assert done.returncode == 0, done.stderr
+    return [counted | {"rounds": rounds} for counted in json.loads(done.stdout)]
 
 
 @pytest.fixture(scope="module")
-def count(tmp_path_factory):
-    """Count what helpers do in rounds of steps of N instances, some us of work each."""
-    path = busy_fmu(tmp_path_factory.mktemp("busy"))
-
-    def run(threads, n, work, rest=2, rounds=50):
-        numbers = map(str, (threads, n, work, rest, rounds))
-        done = run_python("-c", COUNT, str(path), *numbers)
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout) | {"rounds": rounds}
-
-    return run
+def counted(tmp_path_factory):
+    """What helpers do in each of the jobs."""
+    counts = count(tmp_path_factory.mktemp("busy"), JOBS.values())
+    return dict(zip(JOBS, counts, strict=True))
 
 
 @needs_native
-def test_work_for_one_thread_is_no_job(count):
-    assert count(64, 2, 1)["jobs"] == 0
+def test_work_for_one_thread_is_no_job(counted):
+    assert counted["for one thread"]["jobs"] == 0
 
 
 @needs_native
-def test_a_short_job_wakes_few_of_many_helpers(count):
+def test_a_short_job_wakes_few_of_many_helpers(counted):
     """Work of some 20 us is for two or three threads, whatever the number of threads is."""
-    counted = count(64, 12, 1)
-    assert counted["jobs"] == counted["rounds"]
-    assert 0 < counted["wakes"] <= 8 * counted["rounds"]
+    short = counted["short"]
+    assert short["jobs"] == short["rounds"]
+    assert 0 < short["wakes"] <= 8 * short["rounds"]
 
 
 @needs_native
-@pytest.mark.parametrize(("threads", "n", "work"), [(64, 12, 1), (2, 2, 200), (4, 400, 5)])
-def test_the_caller_does_its_first_chunk_before_it_wakes_any_helper(count, threads, n, work):
-    counted = count(threads, n, work)
-    assert counted["wakes"] > 0
-    assert counted["early_wakes"] == 0
+@pytest.mark.parametrize("job", ["short", "of two", "of many"])
+def test_the_caller_does_its_first_chunk_before_it_wakes_any_helper(counted, job):
+    assert counted[job]["wakes"] > 0
+    assert counted[job]["early_wakes"] == 0
 
 
 @needs_native
-def test_a_long_job_wakes_no_more_helpers_than_there_are(count):
-    counted = count(3, 100, 20, rounds=20)
-    assert 0 < counted["wakes"] <= 2 * counted["rounds"]
+def test_a_long_job_wakes_no_more_helpers_than_there_are(counted):
+    long = counted["long"]
+    assert 0 < long["wakes"] <= 2 * long["rounds"]
 
 
 @on_linux
 @needs_native
-def test_a_busy_machine_does_not_shrink_chunks(count, monkeypatch):
+def test_a_busy_machine_does_not_shrink_chunks(tmp_path):
     """Samples of the cost that other work has made too high do not count."""
-    quiet = count(2, 400, 1, rest=0, rounds=100)
+    options = {"jobs": [(2, 400, 1)], "rest": 0, "rounds": 100}
+    (quiet,) = count(tmp_path, **options)
     crowd = "import subprocess, sys, time\n"
     crowd += "[subprocess.Popen([sys.executable, '-c', 'import time\\nend = time.time() + 8\\n"
     crowd += "while time.time() < end: pass']) for _ in range(4)]\n"
-    monkeypatch.setattr(sys.modules[__name__], "COUNT", crowd + COUNT)
-    loaded = count(2, 400, 1, rest=0, rounds=100)
+    (loaded,) = count(tmp_path, program=crowd + COUNT, **options)
     assert loaded["chunks"] < 3 * quiet["chunks"]
     assert loaded["chunks"] < 400 * loaded["jobs"] / 4
 

@@ -9,6 +9,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import building
 import fmu_tools
 import numpy as np
 import pytest
@@ -35,9 +36,11 @@ INTERFACES = {
     "CartPole": (["f"], ["x", "theta", "x_dot", "theta_dot"], ["theta_0", "m_pole", "solver"]),
     "Pendulum": (["tau"], ["theta_dot", "theta"], ["q_0", "max_step"]),
     "DoublePendulum": (["tau2", "tau1"], ["q2_dot", "q1"], ["q1_0", "P1"]),
+    "House": (["u", "T_out"], ["T_air", "T_w"], ["T_w_0", "H_w"]),
 }
 START_VALUES = {"theta_0": (1.5, 1.6), "m_pole": (1.0, 2.0), "solver": (1, 3), "q_0": (0.1, 3.0)}
 START_VALUES |= {"max_step": (0.01, 0.05), "q1_0": (-1.0, 3.0), "P1": (7e-4, 9e-4)}
+START_VALUES |= {"T_w_0": (293.0, 313.0), "H_w": (20.0, 60.0)}
 
 
 def make(cls, path, inputs, outputs, count=1, time_step=0.05, **options):
@@ -86,7 +89,7 @@ def busy_xml(flags=""):
 
 def busy_fmu(folder, *options, flags=""):
     files = {"modelDescription.xml": busy_xml(flags)}
-    files[fmu_tools.library_name(2, "Busy")] = fmu_tools.compiled("busy.c", "-O2", *options)
+    files[fmu_tools.library_name(2, "Busy")] = building.library("busy.c", flags=("-O2", *options))
     return fmu_tools.write_fmu(folder / "Busy.fmu", files)
 
 

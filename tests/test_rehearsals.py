@@ -1,16 +1,11 @@
 """Episodes of the training are played again by a spare instance, and what follows from it."""
 
-import functools
 import logging
-import subprocess
 import sys
-import tempfile
-from pathlib import Path
 
+import model_tools
 import numpy as np
 import pytest
-import zoo_tools
-from fmu_tools import library_name, write_fmu
 
 import fmugym
 from fmugym.pool import tape
@@ -20,16 +15,6 @@ from fmugym.trial.trial import known_verdict
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
 STEP = 0.5
-SOURCE = Path(__file__).parent / "tires.c"
-XML = """<fmiModelDescription fmiVersion="2.0" modelName="Tires" guid="{token}">
-<CoSimulation modelIdentifier="Tires" canGetAndSetFMUstate="{states}"/>
-<ModelVariables>
-<ScalarVariable name="u" valueReference="0" causality="input">
-<Real start="0" min="-1" max="1"/></ScalarVariable>
-<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
-<ScalarVariable name="gain" valueReference="2" causality="parameter" variability="fixed">
-<Real start="1"/></ScalarVariable>
-</ModelVariables><ModelStructure/></fmiModelDescription>"""
 WAYS = {
     "native": {"backend": "native"},
     "python": {"backend": "python"},
@@ -38,27 +23,9 @@ WAYS = {
 all_ways = pytest.mark.parametrize("way", WAYS)
 
 
-@functools.cache
-def library():
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "Tires.so"
-        flags = ["-shared", "-fPIC", "-O1", "-Wall", "-Wno-unused-parameter"]
-        subprocess.run([*zoo_tools.compiler(), *flags, SOURCE, "-o", path], check=True)
-        return path.read_bytes()
-
-
-class TiringEnv(fmugym.FMI2CSEnv):
-    def __init__(self, path, gain=1.0, backend=None, isolation=None, **config):
-        config = {
-            "model_input_names": "u",
-            "model_output_names": "y",
-            "model_parameters": {"gain": gain},
-            "time_step": STEP,
-        } | config
-        super().__init__(path, config, logging.INFO, backend=backend, isolation=isolation)
-
-    def _is_done(self):
-        return self.state[0] > 1e9
+class TiringEnv(model_tools.GainEnv):
+    def __init__(self, path, gain=1.0, **config):
+        super().__init__(path, gain, logging.INFO, **{"time_step": STEP} | config)
 
 
 @pytest.fixture(autouse=True)
@@ -74,11 +41,14 @@ def often(monkeypatch, tmp_path):
 def make_fmu(tmp_path):
     def make(token, states=None):
         able = "restore" in token if states is None else states
-        files = {
-            "modelDescription.xml": XML.format(token=token, states=str(able).lower()),
-            library_name(2, "Tires"): library(),
-        }
-        return write_fmu(tmp_path / "Tires.fmu", files)
+        return model_tools.model_fmu(
+            tmp_path / "Tires.fmu",
+            "tires",
+            2,
+            token,
+            model_tools.GAIN_VARIABLES,
+            flags=model_tools.STATES[2] if able else "",
+        )
 
     return make
 
@@ -247,3 +217,21 @@ def test_how_often(monkeypatch):
         assert count * 2 * tape.TAPE_ROWS <= 1e-3 * 8 * steps
         rehearsals.count += 1
     assert 8 * steps < 11 * 2**24
+
+
+def test_a_spare_that_crashes(make_fmu, caplog):
+    """The training has survived by luck; later environments do not depend on it."""
+    path = make_fmu("crash")
+    env = TiringEnv(path, **WAYS["native"])
+    env.reset()
+    env.step(np.full(1, 0.5, np.float32))
+    play(env, 40)
+    env.close()
+    found = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert (
+        len([text for text in found if "with signal SIGSEGV in a step when it played" in text]) == 1
+    )
+    env = TiringEnv(path, **WAYS["native"])
+    assert type(env._pool).__name__ == "ProcessPool"
+    env.close()
+    assert "harms its process: in a rehearsal, a worker process ended with" in caplog.text

@@ -225,7 +225,7 @@ class TestAttributes:
 
     def test_readings_may_be_set(self):
         one, other = (with_hooks(Counting, hooks) for hooks in ("compiled", "python"))
-        action = np.zeros(2, np.float32)
+        action = np.zeros(1, np.float32)
         for env in (one, other):
             env.reset(seed=2)
             env.step(action)

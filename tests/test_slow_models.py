@@ -38,15 +38,15 @@ def step_once(env):
 
 
 class TestTime:
-    """An initialization may take ten times as long as other calls; here it takes 1.5 s."""
+    """An initialization may take ten times as long as other calls; here it takes 0.75 s."""
 
     def test_is_given_in_a_trial(self, folder):
-        fmu = fmugym.FMU(make_fmu(folder, "slower"), probe_timeout=1.0)
+        fmu = fmugym.FMU(make_fmu(folder, "slower"), probe_timeout=0.5)
         trial.meet(fmu)
         assert trial.known_verdict(fmu).complete
 
     def test_is_given_in_worker_processes(self, folder):
-        config = {"isolation": "process", "call_timeout": 1.0, "probe_timeout": None}
+        config = {"isolation": "process", "call_timeout": 0.5, "probe_timeout": None}
         env = DemandingEnv(make_fmu(folder, "slower"), **config)
         assert step_once(env) == EXPECTED
         env.close()

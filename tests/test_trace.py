@@ -118,8 +118,8 @@ def branch(self):
     return self.state[0] > 1.0 if self.state[0] > 0 else False
 
 
-def matrix(self):
-    return np.ones((1, 4)) @ self.state > 1.0
+def solved(self):
+    return np.linalg.solve(np.eye(4), self.state)[0] > 1.0
 
 
 def remembered(self):
@@ -145,7 +145,10 @@ def mixed(self):
 
 
 def indexed(self):
-    return np.arange(3.0)[self.action] > 1.0
+    return TABLES["levels"][self.action] > 1.0
+
+
+TABLES = {"levels": np.arange(3.0)}
 
 
 def selected(self):
@@ -156,14 +159,14 @@ def selected(self):
     ("hook", "reason"),
     [
         (branch, "branches on a value"),
-        (matrix, "uses numpy.matmul: the order of its sums"),
+        (solved, "uses numpy.linalg.solve"),
         (remembered, "changes self.worst"),
         (number, "a flag is no Boolean"),
         (array, "operands could not be broadcast|shape mismatch"),
         (wide, "uses numpy.sort"),
         (mixed, "mixes the values of several environments"),
-        (indexed, "use numpy.take"),
-        (selected, "indexes an array with values"),
+        (indexed, "needs numpy.take"),
+        (selected, "that a condition selects: use numpy.where"),
     ],
 )
 def test_what_cannot_be_compiled_says_what_and_where(hook, reason):

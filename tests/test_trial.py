@@ -7,9 +7,10 @@ import subprocess
 import sys
 import time
 
+import building
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv, compiled, edited_fmu, library_name, write_fmu
+from fmu_tools import PlainEnv, edited_fmu, library_name, write_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
@@ -43,7 +44,7 @@ def make_fmu(tmp_path_factory):
     def make(token="", **add):
         files = {
             "modelDescription.xml": XML.format(token=token),
-            library_name(2, "Mortal"): compiled("mortal.c"),
+            library_name(2, "Mortal"): building.library("mortal.c"),
         }
         return write_fmu(folder / token.replace(" ", "_") / "Mortal.fmu", files | add)
 
@@ -213,6 +214,19 @@ class TestExemptions:
     def test_by_environment(self, make_fmu, started, monkeypatch, value):
         monkeypatch.setenv("FMUGYM_PROBE", value)
         assert step_once(make_fmu()) == [1.0]
+        assert started == []
+
+    @pytest.mark.parametrize(("value", "count"), [("", 1), ("on", 1), ("TRUE ", 1), ("No", 0)])
+    def test_by_other_values(self, make_fmu, started, monkeypatch, value, count):
+        monkeypatch.setenv("FMUGYM_PROBE", value)
+        assert step_once(make_fmu()) == [1.0]
+        assert len(started) == count
+
+    @pytest.mark.parametrize("value", ["offf", "2", "none"])
+    def test_not_by_unknown_values(self, make_fmu, started, monkeypatch, value):
+        monkeypatch.setenv("FMUGYM_PROBE", value)
+        with pytest.raises(ConfigError, match=f"variable FMUGYM_PROBE '{value}'; .*'o"):
+            step_once(make_fmu())
         assert started == []
 
     def test_reading_is_no_meeting(self, make_fmu, started):

@@ -4,10 +4,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from vector_tools import CART_POLE, Drawing, each_way, require_equal, run_side_by_side
+from vector_tools import (
+    CART_POLE,
+    Drawing,
+    each_way,
+    require_equal,
+    run_side_by_side,
+    sampled_actions,
+)
 
 from fmugym import ConfigError, Uniform
+from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.engines.batch import BatchEngine
 
 
 def cart_pole_with(attributes=None, **parameters):
@@ -37,6 +46,34 @@ def test_attributes_for_each_environment(backend, hooks):
     assert run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 100) > 5
     vector.close()
     theirs.close()
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="hooks are compiled for the native pool")
+@pytest.mark.parametrize("values", [[0.5, 1.5, -2.0], [1, 2, 3], [True, False, True], [2.0] * 3])
+def test_hooks_stay_compiled_with_attributes_for_each_environment(values, monkeypatch):
+    """They ran on arrays until now. The program reads the values as it reads a parameter's."""
+
+    class Weighted(Drawing):
+        weight = 1.0
+
+        def _reward_policy(self):
+            return self.weight * self.state[0] + (self.weight > 1)
+
+    ways = [FMUVectorEnv(Weighted, 3, hooks=hooks) for hooks in ("compiled", "array")]
+    for vector in ways:
+        vector.reset(seed=1)
+    for now in ([4.0, 5.0, 6.0], values):
+        for vector in ways:
+            vector.set_attr("weight", now)
+        for actions in sampled_actions(ways[0], 5):
+            first, second = (vector.step(actions) for vector in ways)
+            require_equal(first[1], second[1])
+        for vector in ways:
+            assert vector.get_attr("weight") == tuple(now)
+    monkeypatch.setattr(BatchEngine, "step", None)
+    ways[0].step(ways[0].action_space.sample())
+    for vector in ways:
+        vector.close()
 
 
 @each_way

@@ -35,7 +35,7 @@ def by_gymnasium(infos):
     return result
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=70, deadline=None)
 @given(INFOS)
 def test_gathered_as_gymnasium_does(infos):
     ours, theirs = gathered(infos, COUNT), by_gymnasium(infos)
@@ -43,7 +43,7 @@ def test_gathered_as_gymnasium_does(infos):
     require_same_infos(ours, theirs)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=70, deadline=None)
 @given(INFOS)
 def test_handed_out_again(infos):
     into = [{} for _ in range(COUNT)]

@@ -1,78 +1,26 @@
-"""An FMU that says why it fails (``words.c``), and an environment over it."""
+"""An FMU that says why it fails (``zoo/words.c``), and an environment over it."""
 
-import functools
-import subprocess
-import tempfile
 from pathlib import Path
 
-import fmpy
-import fmu_tools
-import zoo_tools
+import model_tools
 
 import fmugym
 
-SOURCE = Path(__file__).parent / "words.c"
 CATEGORIES = ("logEvents", "logStatusError", "logStatusDiscard", "logAll")
 STEP = 0.5
-
-
-@functools.cache
-def library(version):
-    """The compiled library; made once a session."""
-    flags = ["-shared", "-fPIC", "-O1", "-g0", "-Wall", "-Wextra", "-Wno-unused-parameter"]
-    prefix = "Words_fmi" if version == 1 else f"fmi{version}"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"Words{fmpy.sharedLibraryExtension}"
-        stub = "#define STUB(name) int name(void) { return 3; }\n"
-        (path.parent / "stubs.h").write_text(stub + fmu_tools.stubs(version, prefix, SOURCE))
-        command = [*zoo_tools.compiler(), *flags, f"-DFMI_VERSION={version}", f"-I{folder}"]
-        subprocess.run([*command, '-DSTUBS="stubs.h"', SOURCE, "-o", path], check=True)
-        return path.read_bytes()
+VARIABLES = (
+    ("u", "input", 'start="0"'),
+    ("y", "output", ""),
+    ("at", "parameter", 'start="0"'),
+    ("asked", "output", ""),
+)
 
 
 def words_fmu(folder, version, token, categories=CATEGORIES):
     """Write an FMU; see ``words.c`` for the tokens."""
-    files = {
-        "modelDescription.xml": _description(version, token, categories),
-        fmu_tools.library_name(version, "Words"): library(version),
-    }
-    return fmu_tools.write_fmu(Path(folder) / "Words.fmu", files)
-
-
-def _description(version, token, categories):
-    head = f'fmiVersion="{version}.0" modelName="Words"'
-    head += f' {"instantiationToken" if version == 3 else "guid"}="{token}"'
-    listed = "".join(f'<Category name="{name}"/>' for name in categories)
-    listed = f"<LogCategories>{listed}</LogCategories>" if categories else ""
-    variables = "".join(_variables(version))
-    middle = f"<ModelVariables>{variables}</ModelVariables>"
-    if version == 1:
-        head += ' modelIdentifier="Words" numberOfContinuousStates="0" numberOfEventIndicators="0"'
-        end = "<Implementation><CoSimulation_StandAlone><Capabilities/>"
-        inside = f"{middle}{end}</CoSimulation_StandAlone></Implementation>"
-    else:
-        interface = '<CoSimulation modelIdentifier="Words"/>'
-        inside = f"{interface}{listed}{middle}<ModelStructure/>"
-    return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
-
-
-def _variables(version):
-    parameter = 'causality="parameter" variability="fixed"'
-    if version == 1:
-        parameter = 'causality="internal" variability="parameter"'
-    rows = {
-        "u": 'causality="input"',
-        "y": 'causality="output"',
-        "at": parameter,
-        "asked": 'causality="output"',
-    }
-    for index, (name, rest) in enumerate(rows.items()):
-        start = "" if "output" in rest else 'start="0"'
-        common = f'name="{name}" valueReference="{index}" {rest}'
-        if version == 3:
-            yield f"<Float64 {common} {start}/>"
-        else:
-            yield f"<ScalarVariable {common}><Real {start}/></ScalarVariable>"
+    description = {"flags": "", "categories": categories}
+    path = Path(folder) / "Words.fmu"
+    return model_tools.model_fmu(path, "words", version, token, VARIABLES, **description)
 
 
 class WordsEnv(fmugym.FMUEnv):

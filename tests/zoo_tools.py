@@ -2,22 +2,16 @@
 
 import contextlib
 import ctypes
-import functools
 import logging
 import os
-import shutil
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 
-import fmpy
 import fmu_tools
+import model_tools
 import numpy as np
 
 import fmugym
 
-FOLDER = Path(__file__).parent / "zoo"
 CALLS = (
     *("nowhere", "instantiate", "setup", "enter", "exit", "set", "step", "get", "reset"),
     *("get_state", "set_state", "terminate", "free"),
@@ -50,41 +44,17 @@ FINE = ("fine", "")
 
 # The FMUs
 
-
-def compiler():
-    """The command of a C compiler: the system's, which is faster, or else zig's."""
-    return ["cc"] if shutil.which("cc") else [sys.executable, "-m", "ziglang", "cc"]
-
-
-@functools.cache
-def library(version, *definitions, model="zoo"):
-    """The compiled library of an FMI version; made once a session, in a tenth of a second.
-
-    Args:
-        version: Of FMI.
-        definitions: For the compiler.
-        model: The C file in ``FOLDER`` without its ending.
-    """
-    flags = ["-shared", "-fPIC", "-O1", "-g0", "-Wall", "-Wextra", "-Wno-unused-parameter"]
-    macros = [f"-D{name}" for name in (f"FMI_VERSION={version}", *definitions)]
-    shim = FOLDER / f"fmi{version}.c"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"Zoo{fmpy.sharedLibraryExtension}"
-        prefix = "Zoo_fmi" if version == 1 else f"fmi{version}"
-        (path.parent / "stubs.h").write_text(fmu_tools.stubs(version, prefix, shim))
-        command = [*compiler(), *flags, *macros, f"-I{folder}", '-DSTUBS="stubs.h"']
-        command += [FOLDER / f"{model}.c", shim, "-o", path, "-lm", "-lpthread"]
-        subprocess.run(command, check=True)
-        return path.read_bytes()
+VARIABLES = (
+    ("u", "input", 'start="0"'),
+    ("y", "output", ""),
+    *((name, "parameter", 'start="0"') for name in PARAMETERS),
+)
 
 
 def zoo_fmu(folder, version, token="{zoo}", *definitions):
     """Write an FMU; see ``zoo.c`` for the tokens."""
-    files = {
-        "modelDescription.xml": _description(version, token),
-        fmu_tools.library_name(version, "Zoo"): library(version, *definitions),
-    }
-    return fmu_tools.write_fmu(Path(folder) / "Zoo.fmu", files)
+    path = Path(folder) / "Zoo.fmu"
+    return model_tools.model_fmu(path, "zoo", version, token, VARIABLES, definitions)
 
 
 def spoil(path, how):
@@ -99,45 +69,6 @@ def spoil(path, how):
     if what == "short":
         files[name] = content[:5000]
     fmu_tools.write_fmu(path, files)
-
-
-def _description(version, token):
-    variables = [("u", "input", 'start="0"'), ("y", "output", "")]
-    variables += [(name, "parameter", 'start="0"') for name in PARAMETERS]
-    return describe(version, token, variables)
-
-
-def describe(version, token, variables):
-    """A model description.
-
-    Args:
-        version: Of FMI.
-        token: The instantiation token.
-        variables: Names, causalities and further attributes, in the order of value references.
-    """
-    head = f'fmiVersion="{version}.0" modelName="Zoo"'
-    head += f' {"instantiationToken" if version == 3 else "guid"}="{token}"'
-    interface = '<CoSimulation modelIdentifier="Zoo" canGetAndSetFMU{}tate="true"/>'
-    if version == 1:
-        head += ' modelIdentifier="Zoo" numberOfContinuousStates="0" numberOfEventIndicators="0"'
-        interface, end = "", "<Implementation><CoSimulation_StandAlone><Capabilities/>"
-        end += "</CoSimulation_StandAlone></Implementation>"
-    else:
-        interface, end = interface.format("s" if version == 2 else "S"), "<ModelStructure/>"
-    elements = [_element(version, index, *row) for index, row in enumerate(variables)]
-    inside = f"{interface}<ModelVariables>{''.join(elements)}</ModelVariables>{end}"
-    return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
-
-
-def _element(version, index, name, causality, attributes):
-    kind = f'causality="{causality}"'
-    if causality == "parameter":
-        kind = 'causality="internal" variability="parameter"' if version == 1 else kind
-        kind += "" if version == 1 else ' variability="fixed"'
-    common = f'name="{name}" valueReference="{index}" {kind}'
-    if version == 3:
-        return f"<Float64 {common} {attributes}/>"
-    return f"<ScalarVariable {common}><Real {attributes}/></ScalarVariable>"
 
 
 # The environments

@@ -16,6 +16,7 @@ _VERSIONS = {
     "CartPole": FMI_VERSIONS,
     "Pendulum": FMI_VERSIONS,
     "DoublePendulum": ("2.0", "3.0"),
+    "House": ("2.0", "3.0"),
 }
 
 MODELS = tuple(_VERSIONS)
@@ -34,8 +35,8 @@ def bundled_fmu(model: str, fmi_version: str | float = "2.0") -> Path:
 
     Args:
         model: One of ``MODELS``.
-        fmi_version: One of ``FMI_VERSIONS``, as text or number. The double pendulum has only "2.0"
-            and "3.0".
+        fmi_version: One of ``FMI_VERSIONS``, as text or number. The double pendulum and
+            the house have only "2.0" and "3.0".
 
     Returns:
         The path of the FMU.

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final
 
 from fmpy.validation import validate_model_description
 
-from fmugym.archive.description import Capabilities, ModelDescription, Variable
+from fmugym.archive.description import Capabilities, ModelDescription, Unit, Variable
 from fmugym.errors import FMULoadError, reason
 
 __all__ = ["convert"]
@@ -19,6 +20,7 @@ _POSITIVE: Final = {"tolerance", "stepSize", "fixedInternalStepSize"}
 _IDENTIFIER: Final = re.compile(r"[^/\\:]{1,200}")
 _OF_ERRORS: Final = re.compile("error|fatal|discard|warning", re.IGNORECASE)
 _MOST_CATEGORIES: Final = 32
+_BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
@@ -61,7 +63,43 @@ def convert(source: Any, root: Any) -> ModelDescription:
         state_derivatives=_state_derivatives(source),
         findings=_findings(source),
         error_categories=_error_categories(root),
+        units=_units(root),
     )
+
+
+def _units(root: Any) -> dict[str, Unit]:
+    """Read the unit definitions; those with numbers that cannot be used are left out."""
+    units: dict[str, Unit] = {}
+    for element in root.findall("UnitDefinitions/*"):
+        name = element.get("unit" if element.tag == "BaseUnit" else "name")
+        with suppress(ValueError):
+            units[name or ""] = _unit(element)
+    return units
+
+
+def _unit(element: Any) -> Unit:
+    base = element.find("BaseUnit")
+    displays = {
+        display.get("displayUnit") or display.get("name") or "": _display_unit(display)
+        for display in element.findall("DisplayUnit") + element.findall("DisplayUnitDefinition")
+        if display.get("inverse") not in {"true", "1"}  # one over the value: not linear
+    }
+    if base is None:
+        return Unit(display_units=displays)
+    dimension = tuple(int(base.get(name, "0")) for name in _BASE_UNITS)
+    return Unit(dimension, *_linear(base, "factor"), displays)
+
+
+def _display_unit(element: Any) -> tuple[float, float]:
+    """Factor and offset; FMI 1.0 calls the factor a gain."""
+    return _linear(element, "gain" if element.tag == "DisplayUnitDefinition" else "factor")
+
+
+def _linear(element: Any, factor: str) -> tuple[float, float]:
+    numbers = float(element.get(factor, "1")), float(element.get("offset", "0"))
+    if not all(map(math.isfinite, numbers)) or numbers[0] == 0:
+        raise ValueError(f"{numbers} is no conversion")
+    return numbers
 
 
 def _error_categories(root: Any) -> tuple[str, ...]:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import fmpy
 
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["Capabilities", "ModelDescription", "Variable"]
+__all__ = ["Capabilities", "ModelDescription", "Unit", "Variable"]
 
 _KINDS = {
     "Real": "real",
@@ -121,6 +121,25 @@ class Capabilities:
 
 
 @dataclass(frozen=True)
+class Unit:
+    """A unit that the model description defines.
+
+    Attributes:
+        dimension: The exponents of kg, m, s, A, K, mol, cd and rad; None where the FMU does not
+            give them, as in FMI 1.0.
+        factor, offset: A value in this unit times ``factor``, plus ``offset``, is the value in the
+            SI unit of this dimension.
+        display_units: Factor and offset by name: a value in this unit times the factor, plus the
+            offset, is the value in the display unit.
+    """
+
+    dimension: tuple[int, ...] | None = None
+    factor: float = 1.0
+    offset: float = 0.0
+    display_units: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class ModelDescription:
     """The part of a model description that an environment needs.
 
@@ -135,6 +154,7 @@ class ModelDescription:
             derivative.
         findings: Rules of the standard that the file breaks, as texts.
         error_categories: The declared log categories of errors and warnings.
+        units: The units that the XML defines, by name.
     """
 
     fmi_version: str
@@ -154,6 +174,7 @@ class ModelDescription:
     state_derivatives: Mapping[str, str]
     findings: tuple[str, ...]
     error_categories: tuple[str, ...] = ()
+    units: Mapping[str, Unit] = field(default_factory=dict)
 
     @cached_property
     def fmi_major_version(self) -> int:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping
 from inspect import getattr_static
 from math import prod
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,15 +17,13 @@ from fmugym.errors import ConfigError
 from fmugym.single.compare import require_equal
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
 from fmugym.task.readings import LATE, LateReading
+from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.hooks.program import Row, UntraceableError
 
 __all__ = ["Player"]
 
 logger = logging.getLogger(__name__)
-
-_STEPS_BEFORE: Final = 1000
-"""After so many steps in Python, compiling the hooks is worth its time."""
 
 
 class Player:
@@ -40,8 +38,8 @@ class Player:
 
     def __init__(self, required: bool) -> None:
         self._required = required
-        self._pause = 0 if required else _STEPS_BEFORE
-        self._wait = self._pause
+        self._pause = STEPS_BEFORE // 2
+        self._wait = 0
         self._task: SingleTask | None = None
         self._variables: Any = None
         self._ended_by_task = False
@@ -56,11 +54,13 @@ class Player:
         """
         attributes = vars(env)
         if self._task is not None and not self._task.still_holds(attributes):
-            self._task, self._pause = None, 2 * self._pause + 1
+            self._task, self._pause = None, 2 * self._pause
             self._wait = self._pause
         if self._task is None:
-            self._wait -= 1
-            if self._wait > 0 or not _is_plain(env, action):
+            if self._wait > 0:
+                self._wait -= 1
+                return None
+            if not _is_plain(env, action):
                 return None
             self._compile(env, action)
         if self._task is None or not self._take_over(env, self._task):
@@ -281,6 +281,3 @@ def _require_late(env: FMUEnv) -> None:
     for name in (*LATE, "variables"):
         if not isinstance(getattr_static(type(env), name), LateReading):
             raise UntraceableError(f"the class has an attribute {name!r} of its own")
-
-
-FMUEnv._player_type = Player

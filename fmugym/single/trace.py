@@ -18,12 +18,13 @@ from fmugym.task.results import FLOAT32_LIMIT
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.functions import numpy_of
+from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Cell
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
 from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
 from fmugym.vector.hooks.symbols import Symbols
+from fmugym.vector.hooks.tables import tables_in
 from fmugym.vector.hooks.trace import SeenArray, placed, rounded, tables_of
 
 __all__ = ["Kind", "SingleTask", "kind_of", "trace_single"]
@@ -115,7 +116,13 @@ def trace_single(env: FMUEnv, action: Any) -> SingleTask:
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
     attributes = dict(vars(env))
-    with borrowed(env), reading(env, Readings.of(env)), noting_reads(env) as names:
+    with (
+        exclusive(),
+        borrowed(env),
+        tables_in(env),
+        reading(env, Readings.of(env)),
+        noting_reads(env) as names,
+    ):
         parts = _Tracer(env, action).parts()
     watched = watched_in(attributes, names)
     inherited = frozenset(name for name in names if name not in attributes)
@@ -188,7 +195,10 @@ class _Tracer:
                 changed = self._contents.changed()
                 if changed is not None:
                     raise UntraceableError(f"it changes self.{changed}")
-                return of(value)
+                cells = of(value)
+                if self._graph.is_inexact:
+                    raise UntraceableError("it multiplies arrays, and the library's sums differ")
+                return cells
         except Exception as error:  # hooks do with numbers what symbols cannot do
             raise UntraceableError(placed(self._env, name, error)) from error
 

@@ -42,6 +42,8 @@ POOL_OPTIONS: Final = ("threads", "private_libraries", "isolation", "workers", "
 
 _ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode", "hooks")
 
+_BOOL: Final = np.dtype(np.bool_)
+
 _LEAST_BYTES_PER_ENV: Final = 1024
 """An FMU instance and its columns of the arrays take more than this."""
 
@@ -207,9 +209,9 @@ def checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """
     if mask is None:
         return np.ones(num_envs, np.bool_)
-    if type(mask) is np.ndarray and mask.dtype == np.bool_ and mask.shape == (num_envs,):
+    if type(mask) is np.ndarray and mask.dtype == _BOOL and mask.shape == (num_envs,):
         copy: MaskArray = mask.copy()  # first, because the caller's array may change
-        if np.count_nonzero(copy):
+        if b"\x01" in copy.tobytes():  # a fifth of the time of any()
             return copy
     try:
         array = np.array(mask)

@@ -30,7 +30,8 @@ typedef struct {
     KeptRow *rows;
     Watched *watched;
     size_t number_of_watched;
-    Register *registers;
+    Register *memory;
+    Registers input_registers, judgement_registers;
     PyObject *action_type; /* the class of actions, in addition to int */
     PyObject *copies, *names; /* make the observation: functions, and names or None */
     bool is_integer;
@@ -59,7 +60,7 @@ static void prepared_free(Prepared *p) {
     free(p->row_buffers);
     free(p->rows);
     free(p->watched);
-    free(p->registers);
+    free(p->memory);
     release_program(&p->inputs);
     release_program(&p->judgement);
     Py_XDECREF(p->action_type);
@@ -220,19 +221,21 @@ static bool take_memory(const PyPool *self, Prepared *p, PyObject *wanted, PyObj
     return true;
 }
 
-/* The registers of both programs. The compiler expects their alignment. */
+/* The compiler expects registers to be aligned. */
 static bool take_registers(Prepared *p) {
-    const size_t first = p->inputs.program.registers, all = first + p->judgement.program.registers;
-    char *memory = malloc((all + 1) * sizeof(Register));
+    const Program *inputs = &p->inputs.program, *judgement = &p->judgement.program;
+    char *memory = malloc((inputs->registers + judgement->registers + 1) * sizeof(Register));
 
-    p->registers = (Register *)(void *)memory;
+    p->memory = (Register *)(void *)memory;
     if (memory == NULL) {
         PyErr_NoMemory();
         return false;
     }
     Register *aligned = (Register *)(void *)(memory + (64 - (uintptr_t)memory % 64) % 64);
-    p->single.input_registers = aligned;
-    p->single.judgement_registers = aligned + first;
+    program_prepare(inputs, aligned, &p->input_registers);
+    program_prepare(judgement, aligned + inputs->registers, &p->judgement_registers);
+    p->single.input_registers = &p->input_registers;
+    p->single.judgement_registers = &p->judgement_registers;
     return true;
 }
 
@@ -295,7 +298,6 @@ PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs) 
         prepared_free(p);
         return NULL;
     }
-    single_prepare(&p->single);
     self->single = capsule;
     Py_XDECREF(before);
     Py_RETURN_NONE;

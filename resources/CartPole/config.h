@@ -43,6 +43,7 @@
 
 #define FIRST_STATE VR_x
 #define NUMBER_OF_STATES 4
+#define MODEL_ORDER 2
 
 enum { CYLINDER_WITH_POINT_MASS = 1, UNIFORM_ROD = 2 };
 

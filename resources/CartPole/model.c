@@ -73,7 +73,7 @@ void model_derivatives(const Reals *r, const Constants *k, const double *state,
 /* The cart-pole has no limits. */
 void model_limit_state(const Reals *, double *) {}
 
-void model_outputs(Reals *r) {
+void model_outputs(Reals *r, const Constants *) {
     r->theta = PI / 2.0 - r->phi;
     r->theta_dot = 0.0 - r->phi_dot; /* unlike -phi_dot no negative zero at rest */
 }

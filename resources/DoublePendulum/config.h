@@ -48,6 +48,7 @@
 
 #define FIRST_STATE VR_q1
 #define NUMBER_OF_STATES 4
+#define MODEL_ORDER 2
 
 /* Values that depend on parameters only. */
 typedef struct {

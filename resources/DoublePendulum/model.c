@@ -86,7 +86,7 @@ void model_limit_state(const Reals *r, double *state) {
 }
 
 /* All outputs are states. */
-void model_outputs(Reals *) {}
+void model_outputs(Reals *, const Constants *) {}
 
 /* M d(q_ddot) = d(f) - d(M) q_ddot, with the accelerations in r up to date. */
 void model_tangent(const Reals *r, const Constants *, Reals *d) {

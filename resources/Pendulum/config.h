@@ -41,6 +41,7 @@
 
 #define FIRST_STATE VR_theta
 #define NUMBER_OF_STATES 2
+#define MODEL_ORDER 2
 
 enum { POINT_MASS = 1, UNIFORM_ROD = 2 };
 

@@ -52,7 +52,7 @@ void model_limit_state(const Reals *r, double *state) {
     state[1] = clip(state[1], r->theta_dot_max);
 }
 
-void model_outputs(Reals *r) {
+void model_outputs(Reals *r, const Constants *) {
     r->q = r->theta + PI;
     r->q_dot = r->theta_dot;
 }

@@ -1,8 +1,11 @@
 /* What a model provides to the FMI functions: its variables (config.h) and its equations (model.c).
  *
- * Models are second-order systems. The states are contiguous Reals in pairs of a position and its
- * velocity; the last Reals are the accelerations, one for each pair. Every model has the Reals
- * "time" and "max_step" and the enumeration "solver". All members of Constants are doubles. */
+ * The states are contiguous Reals, and the last Reals are their derivatives. In a model with
+ * MODEL_ORDER 2, the states come in pairs of a position and its velocity, and only the velocities
+ * have derivatives of their own. In a model with MODEL_ORDER 1, every state has one. Outputs that
+ * depend directly on inputs stand before the derivatives, from FIRST_FEEDTHROUGH on, if the model
+ * defines that. Every model has the Reals "time" and "max_step" and the enumeration "solver". All
+ * members of Constants are doubles. */
 
 #ifndef MODEL_H
 #define MODEL_H
@@ -19,8 +22,14 @@
 enum { MODEL_REALS(REAL_REFERENCE) NUMBER_OF_REALS };
 enum { MODEL_ENUMERATIONS(ENUMERATION_INDEX) NUMBER_OF_ENUMERATIONS };
 enum {
-    NUMBER_OF_ACCELERATIONS = NUMBER_OF_STATES / 2,
-    FIRST_ACCELERATION = NUMBER_OF_REALS - NUMBER_OF_ACCELERATIONS
+    NUMBER_OF_DERIVATIVES = NUMBER_OF_STATES / MODEL_ORDER,
+    FIRST_DERIVATIVE = NUMBER_OF_REALS - NUMBER_OF_DERIVATIVES,
+#ifdef FIRST_FEEDTHROUGH
+    FIRST_ON_DEMAND = FIRST_FEEDTHROUGH,
+#else
+    FIRST_ON_DEMAND = FIRST_DERIVATIVE,
+#endif
+    HAS_FEEDTHROUGH = FIRST_ON_DEMAND < FIRST_DERIVATIVE
 };
 
 /* All Reals of an instance: by name for the equations, by value reference for FMI. */
@@ -45,9 +54,9 @@ void model_derivatives(const Reals *r, const Constants *k, const double *state,
 void model_limit_state(const Reals *r, double *state);
 
 /* Computes the outputs that are not states. */
-void model_outputs(Reals *r);
+void model_outputs(Reals *r, const Constants *k);
 
-/* Differentiates outputs and accelerations in a direction. The states and inputs of d hold the
+/* Differentiates outputs and derivatives in a direction. The states and inputs of d hold the
  * direction; the results go to the other members of d. */
 void model_tangent(const Reals *r, const Constants *k, Reals *d);
 

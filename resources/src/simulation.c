@@ -86,7 +86,7 @@ static Status initialize(Instance *instance, const char *function) {
     }
     if (problem == NULL) {
         model_initial_state(&s->reals);
-        model_outputs(&s->reals);
+        model_outputs(&s->reals, &s->constants);
         if (!all_finite(&s->reals.values[FIRST_STATE], NUMBER_OF_STATES)) {
             problem = "the initial state must be finite";
         }
@@ -118,8 +118,11 @@ Status refresh(Instance *instance, const char *function) {
         return STATUS_ERROR;
     }
     model_derivatives(&s->reals, &s->constants, &s->reals.values[FIRST_STATE], derivative);
-    for (int i = 0; i < NUMBER_OF_ACCELERATIONS; i++) {
-        s->reals.values[FIRST_ACCELERATION + i] = derivative[2 * i + 1];
+    for (int i = 0; i < NUMBER_OF_DERIVATIVES; i++) {
+        s->reals.values[FIRST_DERIVATIVE + i] = derivative[MODEL_ORDER * (i + 1) - 1];
+    }
+    if (HAS_FEEDTHROUGH) {
+        model_outputs(&s->reals, &s->constants);
     }
     s->stale = false;
     return STATUS_OK;
@@ -176,7 +179,9 @@ static Status advance(Instance *instance, const char *function, double time, dou
         s->reals.values[FIRST_STATE + i] = state[i];
     }
     s->reals.time = time + step;
-    model_outputs(&s->reals);
+    if (!HAS_FEEDTHROUGH) {
+        model_outputs(&s->reals, &s->constants);
+    }
     s->stale = true;
     return STATUS_OK;
 }

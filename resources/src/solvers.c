@@ -56,7 +56,7 @@ APART static void step_rk4(const Reals *r, const Constants *k, double step, doub
 APART static void integrate_otherwise(const Reals *r, const Constants *k, int32_t solver,
                                       double step, int32_t number, double *state) {
     for (int32_t i = 0; i < number; i++) {
-        if (solver == SEMI_IMPLICIT_EULER) {
+        if (MODEL_ORDER == 2 && solver == SEMI_IMPLICIT_EULER) {
             step_semi_implicit_euler(r, k, step, state);
         } else {
             step_rk4(r, k, step, state);

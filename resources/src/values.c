@@ -71,9 +71,9 @@ Status get_reals(Instance *instance, const char *function, const uint32_t refere
     if (status != STATUS_OK) {
         return status;
     }
-    /* After initialization only the accelerations are computed on demand. */
+    /* After initialization, only derivatives and what depends on inputs are computed on demand. */
     const uint32_t ready =
-        instance->simulation.phase == PHASE_INITIALIZATION ? 0 : FIRST_ACCELERATION;
+        instance->simulation.phase == PHASE_INITIALIZATION ? 0 : FIRST_ON_DEMAND;
     for (size_t i = 0; i < number; i++) {
         if (references[i] >= ready) {
             return get_any_reals(instance, function, references, number, values);

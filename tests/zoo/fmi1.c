@@ -10,11 +10,15 @@ typedef struct {
 void *Zoo_fmiInstantiateSlave(const char *name, const char *token, const char *location,
                               const char *type, double timeout, char visible, char interactive,
                               Callbacks callbacks, char logging) {
-    return zoo_instantiate(name, token, location, callbacks.logger, NULL);
+    return zoo_instantiate(&(Birth){name, token, location, callbacks.logger, NULL, logging});
 }
 
 void Zoo_fmiFreeSlaveInstance(Animal *me) {
     zoo_free(me);
+}
+
+int Zoo_fmiSetDebugLogging(Animal *me, char on) {
+    return zoo_listen(me, on, 0, NULL);
 }
 
 int Zoo_fmiInitializeSlave(Animal *me, double start, char stop_defined, double stop) {

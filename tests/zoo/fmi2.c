@@ -9,11 +9,16 @@ typedef struct {
 
 void *fmi2Instantiate(const char *name, int type, const char *token, const char *location,
                       const Callbacks *callbacks, int visible, int logging) {
-    return zoo_instantiate(name, token, location, callbacks->logger, callbacks->environment);
+    return zoo_instantiate(&(Birth){name, token, location, callbacks->logger,
+                                    callbacks->environment, logging});
 }
 
 void fmi2FreeInstance(Animal *me) {
     zoo_free(me);
+}
+
+int fmi2SetDebugLogging(Animal *me, int on, size_t count, const char *const *categories) {
+    return zoo_listen(me, on, count, categories);
 }
 
 int fmi2SetupExperiment(Animal *me, int tolerance_defined, double tolerance, double start,
@@ -64,6 +69,18 @@ int fmi2SetFMUstate(Animal *me, void *state) {
 
 int fmi2FreeFMUstate(Animal *me, void **state) {
     return zoo_free_state(state);
+}
+
+int fmi2SerializedFMUstateSize(Animal *me, void *state, size_t *size) {
+    return zoo_size_of_bytes(me, state, size);
+}
+
+int fmi2SerializeFMUstate(Animal *me, void *state, char *bytes, size_t size) {
+    return zoo_to_bytes(me, state, bytes, size);
+}
+
+int fmi2DeSerializeFMUstate(Animal *me, const char *bytes, size_t size, void **state) {
+    return zoo_from_bytes(me, bytes, size, state);
 }
 
 const char *fmi2GetVersion(void) {

@@ -6,11 +6,15 @@ void *fmi3InstantiateCoSimulation(const char *name, const char *token, const cha
                                   bool visible, bool logging, bool event_mode, bool early_return,
                                   const unsigned *intermediate, size_t intermediate_count,
                                   void *environment, Logger logger, void *intermediate_update) {
-    return zoo_instantiate(name, token, resources, logger, environment);
+    return zoo_instantiate(&(Birth){name, token, resources, logger, environment, logging});
 }
 
 void fmi3FreeInstance(Animal *me) {
     zoo_free(me);
+}
+
+int fmi3SetDebugLogging(Animal *me, bool on, size_t count, const char *const *categories) {
+    return zoo_listen(me, on, count, categories);
 }
 
 int fmi3EnterInitializationMode(Animal *me, bool tolerance_defined, double tolerance, double start,

@@ -89,12 +89,11 @@ static bool refuses(const Animal *me) {
            (is(me, "changes directory") && chdir(me->folder) != 0);
 }
 
-Animal *zoo_instantiate(const char *name, const char *token, const char *location, Logger logger,
-                        void *environment) {
+Animal *zoo_instantiate(const Birth *birth) {
     Animal *me = calloc(1, sizeof *me);
-    const char *path = strncmp(location, "file://", 7) == 0 ? location + 7 : location;
+    const char *path = birth->location + (strncmp(birth->location, "file://", 7) == 0 ? 7 : 0);
 
-    snprintf(me->token, sizeof me->token, "%s", token);
+    snprintf(me->token, sizeof me->token, "%s", birth->token);
     snprintf(me->folder, sizeof me->folder, "%s%s", path, FMI_VERSION == 1 ? "/resources" : "");
     if (refuses(me)) {
         free(me);
@@ -111,14 +110,6 @@ void zoo_free(Animal *me) {
     in_use--;
     free(me->numbers);
     free(me);
-}
-
-int zoo_call(Animal *me, enum call call) {
-    return OK;
-}
-
-int zoo_enter(Animal *me) {
-    return OK;
 }
 
 /* As old readers of tables do it: not safe in threads. */
@@ -165,10 +156,6 @@ int zoo_exit(Animal *me) {
         me->values[Y] = me->x;
     }
     return prepared ? OK : ERROR;
-}
-
-int zoo_initialize(Animal *me) {
-    return zoo_exit(me);
 }
 
 /* The gain as it is found in each step. */
@@ -314,11 +301,5 @@ int zoo_set_state(Animal *me, void *state) {
     } else if (is(me, "restore keeps the time")) {
         me->values[CLOCK] += 1.0;
     }
-    return OK;
-}
-
-int zoo_free_state(void **state) {
-    free(*state);
-    *state = NULL;
     return OK;
 }

@@ -287,15 +287,15 @@ static int take_parameters(Animal *me, const char *token) {
 /* Tokens: "{zoo}"; "{zoo alone}" for one instance at a time; "{zoo share}" for y in a global
    variable; "{zoo FAULT CALL STATUS}" for a fault in a call before parameters are set. An
    instantiation with another status than OK gives NULL. */
-Animal *zoo_instantiate(const char *name, const char *token, const char *location, Logger logger,
-                        void *environment) {
+Animal *zoo_instantiate(const Birth *birth) {
+    const char *token = birth->token;
     Animal *me = calloc(1, sizeof *me);
     if (me == NULL) {
         return NULL;
     }
-    snprintf(me->name, sizeof me->name, "%s", name);
-    me->logger = logger;
-    me->environment = FMI_VERSION == 1 ? me : environment;
+    snprintf(me->name, sizeof me->name, "%s", birth->name);
+    me->logger = birth->logger;
+    me->environment = FMI_VERSION == 1 ? me : birth->environment;
     me->shares = strcmp(token, "{zoo share}") == 0;
     const bool alone = strcmp(token, "{zoo alone}") == 0;
     if (take_parameters(me, token) != OK || (alone && instances > 0)) {
@@ -333,10 +333,6 @@ int zoo_exit(Animal *me) {
 int zoo_initialize(Animal *me) {
     const int status = zoo_enter(me);
     return is_fine(status) ? zoo_exit(me) : status;
-}
-
-bool zoo_stops(const Animal *me) {
-    return false;
 }
 
 int zoo_step(Animal *me, double step_size, bool no_set_state) {
@@ -386,10 +382,4 @@ int zoo_set_state(Animal *me, void *state) {
         me->talking = false;
     }
     return status;
-}
-
-int zoo_free_state(void **state) {
-    free(*state);
-    *state = NULL;
-    return OK;
 }

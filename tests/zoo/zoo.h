@@ -1,7 +1,8 @@
 /* What fmi1.c, fmi2.c and fmi3.c, the interfaces of an FMU for FMI 1.0, 2.0 and 3.0, ask of a model.
 
-   There are two models: zoo.c does wrong what its parameters say, quirks.c is useful but breaks one
-   promise. */
+   The models: zoo.c does wrong what its parameters say; quirks.c is useful but breaks one promise;
+   demanding.c wants a licence or time; tires.c stops to begin anew; words.c says why it fails.
+   usual.c does what a model leaves out. */
 
 #include <stdbool.h>
 #include <stddef.h>
@@ -33,25 +34,36 @@ typedef void (*Logger)(void *environment, const char *name, int status, const ch
 
 typedef struct Animal Animal;
 
-/* NULL where the token asks for a refusal. The location is the folder of the FMU for FMI 1.0, and
-   that of its resources for the others; a URI or a path. */
-Animal *zoo_instantiate(const char *name, const char *token, const char *location, Logger logger,
-                        void *environment);
-void zoo_free(Animal *me);
+/* What an instantiation gets. The location is the folder of the FMU for FMI 1.0, and that of its
+   resources for the others; a URI or a path. */
+typedef struct {
+    const char *name, *token, *location;
+    Logger logger;
+    void *environment;
+    bool logging;
+} Birth;
 
-/* Do what is asked for in a call, and return its status. */
-int zoo_call(Animal *me, enum call call);
-int zoo_enter(Animal *me); /* SETUP and ENTER */
-int zoo_exit(Animal *me);
-int zoo_initialize(Animal *me); /* all three */
+/* Every model has these. Where the token asks for a refusal, zoo_instantiate returns NULL. */
+Animal *zoo_instantiate(const Birth *birth);
+void zoo_free(Animal *me);
 int zoo_step(Animal *me, double step_size, bool no_set_state);
-bool zoo_stops(const Animal *me); /* whether it has asked for the end */
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values);
 int zoo_set(Animal *me, const unsigned *references, size_t count, const double *values);
 int zoo_reset(Animal *me);
+
+/* usual.c has these for models that leave them out. */
+int zoo_call(Animal *me, enum call call); /* does what is asked for in a call: nothing */
+int zoo_enter(Animal *me);                /* SETUP and ENTER */
+int zoo_exit(Animal *me);
+int zoo_initialize(Animal *me);   /* all three */
+bool zoo_stops(const Animal *me); /* whether it has asked for the end */
+int zoo_listen(Animal *me, bool on, size_t count, const char *const *categories);
 int zoo_get_state(Animal *me, void **state);
 int zoo_set_state(Animal *me, void *state);
 int zoo_free_state(void **state);
+int zoo_size_of_bytes(Animal *me, void *state, size_t *size);
+int zoo_to_bytes(Animal *me, void *state, char *bytes, size_t size);
+int zoo_from_bytes(Animal *me, const char *bytes, size_t size, void **state);
 
 /* What the standard has besides; STUBS is a file with one line each. */
 #define STUB(name)                                                                                 \

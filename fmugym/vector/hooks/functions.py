@@ -9,28 +9,27 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.vector.hooks import products, tables
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.program import UntraceableError, letter_of
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
-    Unboxed,
     as_symbols,
     each,
+    graph_of,
     handlers,
     has_symbols,
     lift,
 )
 
-__all__ = ["numpy_of"]
-
-_MATRIX: Final = "the order of its sums depends on the linear algebra library: write them out"
+__all__ = ["exclusive", "numpy_of"]
 
 # Functions element by element.
 
@@ -39,11 +38,13 @@ def call_ufunc(
     graph: Graph, ufunc: Any, method: str, inputs: tuple[Any, ...], keywords: dict[str, Any]
 ) -> Any:
     """Do what numpy's ``__array_ufunc__`` asks for."""
-    if ufunc in {np.matmul, np.vecdot, getattr(np, "matvec", None), getattr(np, "vecmat", None)}:
-        raise UntraceableError(f"it uses numpy.{ufunc.__name__}: {_MATRIX}")
     out = keywords.pop("out", None)
-    if method == "__call__":
-        result = _applied(graph, ufunc, inputs, **keywords)
+    if ufunc in products.UFUNCS and method == "__call__":
+        result = products.UFUNCS[ufunc](*inputs, **keywords)
+    elif ufunc in _PAIRS and method == "__call__" and out is None:
+        return _PAIRS[ufunc](graph, *inputs, **keywords)
+    elif method == "__call__":
+        result = _applied(graph, ufunc, inputs, out, **keywords)
     elif method == "reduce":
         result = _reduced(graph, ufunc, *inputs, **keywords)
     elif method == "accumulate":
@@ -84,6 +85,7 @@ def _applied(
     graph: Graph,
     ufunc: Any,
     inputs: tuple[Any, ...],
+    out: Any = None,
     dtype: Any = None,
     casting: Any = "same_kind",
     where: Any = True,
@@ -91,8 +93,6 @@ def _applied(
 ) -> Symbols:
     if ufunc.nout != 1:
         raise UntraceableError(f"it uses numpy.{ufunc.__name__}, which has two results")
-    if where is not True:
-        raise UntraceableError("it uses the argument where of a function")
     inputs = tuple(_symbols_of(graph, value) for value in inputs)
     kinds = tuple(_kind_of(value) for value in inputs)
     signature = {} if dtype is None else {"signature": (*(None for _ in inputs), np.dtype(dtype))}
@@ -100,7 +100,33 @@ def _applied(
     letter_of(result)
     cells = [_operand(graph, value, t) for value, t in zip(inputs, types, strict=True)]
     combined = each(lambda *operands: graph.apply(ufunc, operands, result), *cells)
-    return Symbols(graph, combined, result)
+    values = Symbols(graph, combined, result)
+    return values if where is True else _where_else(ufunc, where, values, out)
+
+
+def _where_else(ufunc: Any, where: Any, values: Symbols, out: Any) -> Symbols:
+    """The values where a condition holds; what was in the output array elsewhere."""
+    if out is None or out[0] is None:
+        raise UntraceableError(f"it uses numpy.{ufunc.__name__} with where, but without out")
+    if not np.can_cast(values.dtype, out[0].dtype, "same_kind"):
+        raise UntraceableError(f"it writes {values.dtype} to an array of {out[0].dtype}")
+    return _where(where, values.cast(out[0].dtype), out[0])
+
+
+def _modf(graph: Graph, x: Any) -> tuple[Any, Any]:
+    dtype = np.modf(np.ones(1, as_symbols(graph, x).dtype))[0].dtype
+    value = as_symbols(graph, x).cast(dtype)
+    whole: Any = np.trunc(value)
+    rest = np.where(np.isinf(value), dtype.type(0), value - whole)
+    return np.copysign(rest, value), whole
+
+
+def _divmod(graph: Graph, x: Any, y: Any) -> tuple[Any, Any]:
+    return np.floor_divide(x, y), np.remainder(x, y)
+
+
+_PAIRS: Final[Mapping[Any, Callable[..., tuple[Any, Any]]]] = {np.modf: _modf, np.divmod: _divmod}
+"""Functions with two results."""
 
 
 def _reduced(
@@ -115,8 +141,6 @@ def _reduced(
 ) -> Symbols:
     """Combine the elements along some axes in their order."""
     symbols = as_symbols(graph, array)
-    if where is not True or ufunc.nout != 1:
-        raise UntraceableError(f"it uses an argument of numpy.{ufunc.__name__}.reduce")
     sample = ufunc.reduce(np.ones(1, symbols.dtype), dtype=dtype)
     axes = range(symbols.ndim) if axis is None else (axis,) if np.ndim(axis) == 0 else axis
     places = sorted(np.atleast_1d(np.arange(symbols.ndim)[list(axes)]).tolist())
@@ -125,7 +149,12 @@ def _reduced(
     rest = cells.shape[len(places) :]
     terms = [symbols.like(row) for row in cells.reshape(-1, *rest)]
     start = _START.get(ufunc) if initial is None or initial is np._NoValue else initial
-    total = _folded(ufunc, terms, start, np.dtype(sample.dtype))
+    masks: list[Any] = [True] * len(terms)
+    if where is not True:
+        mask = as_symbols(graph, where)
+        shaped = np.broadcast_to(mask.cells, symbols.shape).transpose(order)
+        masks = [mask.like(row) for row in shaped.reshape(-1, *rest)]
+    total = _folded(ufunc, terms, masks, start, np.dtype(sample.dtype))
     if not keepdims:
         return total
     lengths = [1 if i in places else n for i, n in enumerate(symbols.shape)]
@@ -141,13 +170,16 @@ _START: Final[Mapping[Any, Any]] = {
 """What numpy starts a reduction with; others start with the first element."""
 
 
-def _folded(ufunc: Any, terms: list[Symbols], start: Any, dtype: np.dtype[Any]) -> Symbols:
-    if start is None and not terms:
-        raise ValueError("zero-size array to reduction operation which has no identity")
+def _folded(
+    ufunc: Any, terms: list[Symbols], masks: list[Any], start: Any, dtype: np.dtype[Any]
+) -> Symbols:
+    if start is None and not (terms and masks[0] is True):
+        raise ValueError("reduction operation has no identity: it needs a term, or initial")
     terms = [term.cast(np.bool_ if dtype == np.bool_ else dtype) for term in terms]
     total: Any = terms[0] if start is None else np.asarray(start, dtype)
-    for term in terms[start is None :]:
-        total = ufunc(total, term)
+    for term, mask in list(zip(terms, masks, strict=True))[start is None :]:
+        longer = ufunc(total, term)
+        total = longer if mask is True else _where(mask, longer, total)
     return total if isinstance(total, Symbols) else np.zeros_like(terms[0]) + total
 
 
@@ -174,26 +206,13 @@ def call_function(function: Any, args: tuple[Any, ...], keywords: dict[str, Any]
         return _rearranged(function, args, keywords)
     if function in _COMPOSED:
         return function._implementation(*args, **keywords)
-    name = f"{function.__module__}.{function.__name__}"
-    reason = f"it uses {name}"
-    raise UntraceableError(f"{reason}: {_MATRIX}" if function in _MATRICES else reason)
-
-
-def _graph_of(*values: Any) -> Graph:
-    for value in values:
-        if isinstance(value, Symbols):
-            return value.graph
-        if isinstance(value, Unboxed):
-            return value.symbols.graph
-        if isinstance(value, list | tuple) and has_symbols(value):
-            return _graph_of(*value)
-    raise UntraceableError("it calls a function of numpy in a way that cannot be followed")
+    raise UntraceableError(f"it uses {function.__module__}.{function.__name__}")
 
 
 def _rearranged(function: Any, args: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
     """Apply a function that moves elements without a look at them."""
     first, *rest = args
-    graph = _graph_of(first)
+    graph = graph_of(first)
     is_list = isinstance(first, list | tuple)
     parts = [as_symbols(graph, part) for part in first] if is_list else [as_symbols(graph, first)]
     dtype = parts[0].dtype
@@ -207,14 +226,14 @@ def _rearranged(function: Any, args: tuple[Any, ...], keywords: dict[str, Any]) 
 
 
 def _broadcast_arrays(*arrays: Any, subok: bool = False) -> Any:
-    graph = _graph_of(*arrays)
+    graph = graph_of(*arrays)
     symbols = [as_symbols(graph, array) for array in arrays]
     shaped = np.broadcast_arrays(*(one.cells for one in symbols))
     return tuple(one.like(cells) for one, cells in zip(symbols, shaped, strict=True))
 
 
 def _where(condition: Any, first: Any, second: Any) -> Symbols:
-    graph = _graph_of(condition, first, second)
+    graph = graph_of(condition, first, second)
     dummies = [_dummy(graph, value) for value in (first, second)]
     dtype = np.where(np.ones(1, np.bool_), *dummies).dtype
     letter_of(dtype)
@@ -233,7 +252,7 @@ def _dummy(graph: Graph, value: Any) -> Any:
 
 
 def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
-    graph = _graph_of(condlist, choicelist, default)
+    graph = graph_of(condlist, choicelist, default)
     values = [*choicelist, default]
     dtype = np.result_type(*(_dummy(graph, value) for value in values))
     result: Any = as_symbols(graph, default).cast(dtype)
@@ -244,17 +263,19 @@ def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
 
 def _clip(a: Any, a_min: Any = None, a_max: Any = None, out: Any = None, **keywords: Any) -> Any:
     low, high = keywords.pop("min", a_min), keywords.pop("max", a_max)
-    graph = _graph_of(a, low, high)
+    graph = graph_of(a, low, high)
     symbols = as_symbols(graph, a)
-    if keywords or out is not None:
+    if keywords:
         raise UntraceableError("it uses an argument of numpy.clip")
     if low is None and high is None:
-        return symbols.copy()
-    if low is None:
-        return np.minimum(symbols, high)
-    if high is None:
-        return np.maximum(symbols, low)
-    return np._core.umath.clip(symbols, low, high)  # type: ignore[attr-defined]
+        result: Any = symbols.copy()
+    elif low is None:
+        result = np.minimum(symbols, high)
+    elif high is None:
+        result = np.maximum(symbols, low)
+    else:
+        result = np._core.umath.clip(symbols, low, high)  # type: ignore[attr-defined]
+    return result if out is None else _into(out, result)
 
 
 def _filled(value: Any) -> Callable[..., Symbols]:
@@ -268,7 +289,7 @@ def _filled(value: Any) -> Callable[..., Symbols]:
 
 
 def _full_like(a: Any, fill_value: Any, dtype: Any = None, **_: Any) -> Symbols:
-    graph = _graph_of(a, fill_value)
+    graph = graph_of(a, fill_value)
     like = as_symbols(graph, a)
     wanted = like.dtype if dtype is None else np.dtype(dtype)
     result = lift(graph, np.zeros(like.shape, wanted))
@@ -289,98 +310,109 @@ def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> 
     return np.sqrt(add.reduce(symbols * symbols, axis=axis, keepdims=keepdims))
 
 
+def _arg_extreme(is_better: Any) -> Callable[..., Symbols]:
+    """The index of the first extreme value, or of the first NaN."""
+
+    def find(a: Any, axis: Any = None, out: Any = None, *, keepdims: Any = False) -> Any:
+        symbols = as_symbols(graph_of(a), a)
+        if axis is None or out is not None:
+            raise UntraceableError("it looks for an extreme value without an axis")
+        rows = [symbols.like(row) for row in np.moveaxis(symbols.cells, axis, 0)]
+        best: Any = rows[0]
+        index: Any = np.zeros_like(best, np.intp)
+        for number, row in enumerate(rows[1:], 1):
+            better = (is_better(row, best) | (row != row)) & (best == best)
+            best, index = np.where(better, row, best), np.where(better, np.intp(number), index)
+        return np.expand_dims(index, axis) if keepdims is True else index
+
+    return find
+
+
+def _piecewise(x: Any, condlist: Any, funclist: Any, *args: Any, **kw: Any) -> Any:
+    """Call all functions with all values, where numpy calls each with those that it is for."""
+    value = as_symbols(graph_of(x, condlist), x)
+    is_single = not isinstance(condlist, list | tuple) and np.ndim(condlist) == value.ndim
+    conditions = [condlist] if is_single else list(condlist)
+    if len(funclist) == len(conditions) + 1:
+        others = np.logical_not(functools.reduce(np.logical_or, conditions))
+        conditions = [*conditions, others]
+    result: Any = np.zeros_like(value)
+    for condition, function in zip(conditions, funclist, strict=True):
+        part = function(value, *args, **kw) if callable(function) else function
+        result = _where(condition, as_symbols(value.graph, part).cast(value.dtype), result)
+    return result
+
+
+def _isin(
+    element: Any, test_elements: Any, assume_unique: Any = False, invert: Any = False, **_: Any
+) -> Any:
+    value = as_symbols(graph_of(element), element)
+    flat = np.asarray(test_elements).reshape(-1)
+    if has_symbols(test_elements) or flat.size > _MOST_TESTED:
+        raise UntraceableError("numpy.isin has values to look for that are many or not constant")
+    found: Any = np.zeros_like(value, np.bool_)
+    for one in flat:
+        found = found | (value == one)
+    return np.logical_not(found) if invert else found
+
+
+_MOST_TESTED: Final = 64
+"""The most values that ``numpy.isin`` may look for."""
+
+
+def _nan_to_num(
+    x: Any, copy: bool = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None
+) -> Any:
+    value = as_symbols(graph_of(x), x)
+    if value.dtype.kind != "f":
+        return value.copy()
+    limits: Any = np.finfo(value.dtype)
+    numbers = (
+        nan,
+        limits.max if posinf is None else posinf,
+        limits.min if neginf is None else neginf,
+    )
+    for condition, number in zip(
+        (value != value, value == np.inf, value == -np.inf), numbers, strict=True
+    ):
+        value = _where(condition, as_symbols(value.graph, number).cast(value.dtype), value)
+    return value
+
+
+def _putmask(a: Any, mask: Any, values: Any) -> None:
+    if np.ndim(values):
+        raise UntraceableError("it puts several values where a condition holds")
+    _copyto(a, values, where=mask)
+
+
 def _copyto(dst: Any, src: Any, casting: Any = "same_kind", where: Any = True) -> None:
-    graph = _graph_of(dst)
+    graph = graph_of(dst)
     dst[...] = src if where is True else _where(where, as_symbols(graph, src).cast(dst.dtype), dst)
 
 
-# Tables.
-
-
-def _interp(
-    x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None
-) -> Symbols:
-    if period is not None or has_symbols((xp, fp, left, right)):
-        raise UntraceableError("numpy.interp has a period, or a table that is not constant")
-    graph = _graph_of(x)
-    xs, ys = (np.asarray(part, np.float64) for part in (xp, fp))
-    if xs.ndim != 1 or xs.shape != ys.shape or not xs.size:
-        raise ValueError("fp and xp are not of the same length")
-    ends = [ys[0] if left is None else left, ys[-1] if right is None else right]
-    table = np.concatenate([xs, ys, np.array(ends, np.float64)])
-    number = _place_table(graph, table)
-    floats = as_symbols(graph, x).cast(np.float64)
-
-    def fold(values: Any) -> Any:
-        return np.interp(values, xs, ys, left, right)
-
-    cells = each(
-        lambda cell: graph.compute("interpolate", number, (cell,), np.dtype(np.float64), fold),
-        floats.cells,
-    )
-    return Symbols(graph, cells, np.float64)
-
-
-def _place_table(graph: Graph, table: npt.NDArray[Any]) -> Any:
-    key = table.dtype.char, table.tobytes()
-    graph.tables.setdefault(key, table)
-    return key
-
-
-def _take(a: Any, indices: Any, axis: Any = None, out: Any = None, mode: Any = "raise") -> Any:
-    graph = _graph_of(a, indices)
-    table = as_symbols(graph, a)
-    if not has_symbols(indices):
-        return table.like(np.take(table.cells, indices, axis))
-    if out is not None or mode != "raise":
-        raise UntraceableError("it uses an argument of numpy.take")
-    if axis is None:
-        return look_up(table.like(table.cells.ravel()), indices)
-    return np.moveaxis(look_up(np.moveaxis(table, axis, 0), indices), 0, axis)
-
-
-def look_up(table: Symbols, key: Any) -> Symbols:
-    """Index an array with a value: a table of constants along its first axis."""
-    keys = key if isinstance(key, tuple) else (key,)
-    first = keys[0]
-    if not isinstance(first, Symbols) or first.dtype.kind not in "iu" or has_symbols(keys[1:]):
-        raise UntraceableError("it indexes an array with values in a way that cannot be followed")
-    graph, rows = table.graph, table.cells[(slice(None), *keys[1:])]
-    columns = rows.reshape(len(rows), -1)
-    index = first.cast(np.int64).cells
-    parts = [_column(table, columns[:, i], index) for i in range(columns.shape[1])]
-    cells = np.stack(parts, axis=-1).reshape((*index.shape, *rows.shape[1:]))
-    return Symbols(graph, cells, table.dtype)
-
-
-def _column(table: Symbols, column: npt.NDArray[Any], index: npt.NDArray[Any]) -> Any:
-    graph = table.graph
-    values = [graph.value(cell) for cell in column]
-    if any(value is None for value in values):
-        raise UntraceableError("it chooses between values by an index: use numpy.where or select")
-    constants = np.array(values, table.dtype)
-    number = _place_table(graph, constants)
-    fold: Any = constants.__getitem__
-    return each(lambda cell: graph.compute("take", number, (cell,), table.dtype, fold), index)
-
-
-handlers.update(ufunc=call_ufunc, function=call_function, index=look_up)
+handlers.update(ufunc=call_ufunc, function=call_function)
 
 _OWN: Final[Mapping[Any, Callable[..., Any]]] = {
+    **tables.FUNCTIONS,
+    **products.FUNCTIONS,
     np.where: _where,
     np.select: _select,
     np.clip: _clip,
-    np.interp: _interp,
-    np.take: _take,
     np.copyto: _copyto,
+    np.putmask: _putmask,
+    np.argmax: _arg_extreme(np.greater),
+    np.argmin: _arg_extreme(np.less),
+    np.piecewise: _piecewise,
+    np.isin: _isin,
+    np.nan_to_num: _nan_to_num,
     np.linalg.norm: _norm,
     np.zeros_like: _filled(0),
     np.empty_like: _filled(0),
     np.ones_like: _filled(1),
     np.full_like: _full_like,
     np.broadcast_arrays: _broadcast_arrays,
-    np.shape: lambda a: as_symbols(_graph_of(a), a).shape,
-    np.ndim: lambda a: as_symbols(_graph_of(a), a).ndim,
+    np.shape: lambda a: as_symbols(graph_of(a), a).shape,
+    np.ndim: lambda a: as_symbols(graph_of(a), a).ndim,
     np.size: lambda a, axis=None: a.size if axis is None else a.shape[axis],
     np.copy: lambda a, order="K", subok=False: a.copy(),
     np.result_type: lambda *values: np.result_type(
@@ -402,13 +434,19 @@ _REARRANGING: Final = frozenset(
 
 _COMPOSED: Final = frozenset(
     {np.sum, np.prod, np.mean, np.std, np.var, np.any, np.all, np.max, np.min, np.amax, np.amin}
-    | {np.round, np.around, np.cumsum, np.cumprod, np.ptp, np.diff, np.polyval}
+    | {np.round, np.around, np.cumsum, np.cumprod, np.ptp, np.diff, np.polyval, np.isclose}
+    | {
+        np.sinc,
+        np.average,
+        getattr(np, "trapezoid", None),
+        np.gradient,
+        np.append,
+        np.angle,
+        np.count_nonzero,
+    }
+    | {np.fix, np.real_if_close}
 )
 """Functions that numpy composes of others."""
-
-_MATRICES: Final = frozenset(
-    {np.dot, np.vdot, np.inner, np.outer, np.einsum, np.tensordot, np.cross, np.linalg.multi_dot}
-)
 
 # Functions that do not ask their arguments.
 
@@ -430,7 +468,7 @@ def _array(
     graph: Graph, function: Any, value: Any, dtype: Any = None, *args: Any, **kw: Any
 ) -> Any:
     if not has_symbols(value):
-        return function(value, dtype, *args, **kw)
+        return _as_table(function(value, dtype, *args, **kw))
     symbols = as_symbols(graph, value)
     wanted = symbols.dtype if dtype is None else np.dtype(dtype)
     is_new = function is _array_function or symbols.dtype != wanted
@@ -448,10 +486,18 @@ def _made(graph: Graph, function: Any, shape: Any, *args: Any, **keywords: Any) 
     return lift(graph, array) if is_of_all else array
 
 
-def _taken(graph: Graph, function: Any, a: Any, indices: Any, *args: Any, **keywords: Any) -> Any:
-    if has_symbols((a, indices)):
-        return _take(a, indices, *args, **keywords)
-    return function(a, indices, *args, **keywords)
+def _as_table(array: Any) -> Any:
+    return array.view(tables.Table) if tables.is_table(array) and array.ndim else array
+
+
+def _counted(graph: Graph, function: Any, *args: Any, **keywords: Any) -> Any:
+    return _as_table(function(*args, **keywords))
+
+
+def _looked_up(graph: Graph, function: Any, *args: Any, **keywords: Any) -> Any:
+    if has_symbols(args) or has_symbols(list(keywords.values())):
+        return tables.FUNCTIONS[function](*args, **keywords)
+    return function(*args, **keywords)
 
 
 _array_function, _full_function, _empty_function = np.array, np.full, np.empty
@@ -465,10 +511,12 @@ def _of_list(graph: Graph, function: Any, a: Any, *args: Any, **keywords: Any) -
 _OVERRIDING: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("array", "asarray", "asanyarray", "ascontiguousarray"), _array),
     **dict.fromkeys(("zeros", "ones", "full", "empty"), _made),
-    "take": _taken,
+    **dict.fromkeys(("linspace", "arange"), _counted),
+    **{function.__name__: _looked_up for function in tables.FUNCTIONS},
     **dict.fromkeys(("sum", "prod", "mean", "std", "var", "any", "all", "max", "min"), _of_list),
     **dict.fromkeys(("amax", "amin", "cumsum", "cumprod", "diff", "ptp", "moveaxis"), _of_list),
     **dict.fromkeys(("transpose", "reshape", "ravel", "flip", "roll", "sort"), _of_list),
+    **dict.fromkeys(("argmax", "argmin", "average", "dot", "cross", "inner"), _of_list),
 }
 
 _PATCHES: Final = [
@@ -476,6 +524,11 @@ _PATCHES: Final = [
     (np.linalg, "norm", _patched(np.linalg.norm, _of_list)),
 ]
 _ORIGINALS: Final = [(module, name, getattr(module, name)) for module, name, _ in _PATCHES]
+
+
+def exclusive() -> AbstractContextManager[Any]:
+    """Keep other threads from tracing. They would find what stands in the place of tables."""
+    return _lock
 
 
 @contextmanager

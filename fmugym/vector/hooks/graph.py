@@ -50,6 +50,8 @@ class Graph:
     """The nodes of one program, equal ones once.
 
     Attributes:
+        tables: The values to look up.
+        is_inexact: Whether the last bits of results may differ from those of hooks on arrays.
         array_type: The class of symbolic arrays, if it is not ``Symbols``.
     """
 
@@ -59,6 +61,7 @@ class Graph:
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
         self.tables: dict[Hashable, npt.NDArray[Any]] = {}
+        self.is_inexact = False
 
     def node(self, cell: Cell) -> Node:
         """The node of a cell."""

@@ -79,7 +79,7 @@ class ScalarGraph(Graph):
 
 _PATCHED_SCALARS: Final = frozenset(
     {"take", "sum", "prod", "mean", "std", "var", "any", "all", "max", "min", "amax", "amin"}
-    | {"ptp", "norm"}
+    | {"ptp", "norm", "look_up"}
 )
 """Functions that return numbers instead of arrays without dimensions."""
 

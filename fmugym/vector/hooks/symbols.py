@@ -23,6 +23,7 @@ __all__ = [
     "Unboxed",
     "as_symbols",
     "each",
+    "graph_of",
     "handlers",
     "has_symbols",
     "lift",
@@ -154,24 +155,44 @@ class Symbols(np.ndarray[Any, Any]):
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, key: Any) -> Any:
-        if has_symbols(key):
-            return handlers["index"](self, key)
-        return self.like(self.cells[key])
+        if not has_symbols(key):
+            return self.like(self.cells[key])
+        if _is_mask(key):
+            place, mask = self._masked(key)
+            return Selected(self.like(place), mask)
+        return handlers["index"](self, key)
 
     def __setitem__(self, key: Any, value: Any) -> None:
         if not self._writeable:
             raise UntraceableError("it changes an array in place that it may only read")
-        new = as_symbols(self._graph, value).cast(self.dtype)
         if not has_symbols(key):
+            new = as_symbols(self._graph, value).cast(self.dtype)
             self.cells[key] = new.cells if new.ndim else new.cells[()]
             return
-        if new.size != 1 or not isinstance(key, Symbols) or key.dtype != np.bool_:
+        if not _is_mask(key):
             raise UntraceableError("it assigns to elements that a value selects")
-        chosen: Any = np.where(key, new.reshape(()), self)
-        self.cells[...] = chosen.cells
+        place, mask = self._masked(key)
+        chosen: Any = np.where(
+            mask, _to_assign(self._graph, value, mask, self.dtype), self.like(place)
+        )
+        place[...] = chosen.cells
+
+    def _masked(self, key: Any) -> tuple[npt.NDArray[Any], Symbols]:
+        """The part of the cells that a mask refers to, and the mask in its shape."""
+        keys = key if isinstance(key, tuple) else (key,)
+        place: npt.NDArray[Any] = self.cells[keys[:-1]]
+        mask: Any = keys[-1]
+        if keys[:-1] and mask.ndim == 1 and place.ndim > 1:
+            mask = mask.like(np.broadcast_to(mask.cells, place.shape))
+        if mask.shape != place.shape or not np.shares_memory(place, self.cells):
+            raise UntraceableError("it selects elements by a condition of another shape")
+        return place, mask
 
     def _copy(self, *_: Any, **__: Any) -> Symbols:
         return Symbols(self._graph, self.cells.copy(), self.dtype)
+
+    def _fill(self, value: Any) -> None:
+        self[...] = value
 
     def _take(self, indices: Any, axis: Any = None, **_: Any) -> Any:
         return np.take(self, indices, axis)
@@ -224,6 +245,11 @@ _METHODS: Final[Mapping[str, Any]] = {
     "__copy__": Symbols._copy,
     "take": Symbols._take,
     "round": Symbols._round,
+    "fill": Symbols._fill,
+    "dot": lambda self, b, out=None: np.dot(self, b, out),
+    "argmax": lambda self, *args, **keywords: np.argmax(self, *args, **keywords),
+    "argmin": lambda self, *args, **keywords: np.argmin(self, *args, **keywords),
+    "searchsorted": lambda self, *args, **keywords: np.searchsorted(self, *args, **keywords),
     "item": Symbols._item,
     "tolist": Symbols._item,
 }
@@ -235,6 +261,59 @@ for _name in dir(np.ndarray):
     elif _name not in _KEPT and _name not in vars(Symbols):
         is_method = callable(getattr(np.ndarray, _name))
         setattr(Symbols, _name, _refusing(_name) if is_method else property(_refusing(_name)))
+
+
+def _is_mask(key: Any) -> bool:
+    """Whether a key is a condition, perhaps behind keys for the axes before its own."""
+    *others, last = key if isinstance(key, tuple) else (key,)
+    if not isinstance(last, Symbols) or last.dtype != np.bool_:
+        return False
+    return all(isinstance(other, int | slice) or other is Ellipsis for other in others)
+
+
+class Selected(np.lib.mixins.NDArrayOperatorsMixin):
+    """The elements of an array where a condition holds: ``x[x > 0]``.
+
+    How many there are differs between the calls of a hook. So hooks may only compute with them,
+    element by element, and assign them to where the same condition holds.
+
+    Args:
+        values: The array.
+        mask: The condition.
+    """
+
+    def __init__(self, values: Symbols, mask: Symbols) -> None:
+        self._values, self._mask = values, mask
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **keywords: Any) -> Any:
+        targets = keywords.pop("out", ())  # of an operator such as +=: the selection itself
+        if method != "__call__" or keywords or any(one is not self for one in targets):
+            self._refuse()
+        return Selected(ufunc(*(self.of(one, self._mask) for one in inputs)), self._mask)
+
+    @classmethod
+    def of(cls, value: Any, mask: Symbols) -> Any:
+        """The whole array to which a selection by this mask belongs, or a single value."""
+        if isinstance(value, cls):
+            if [c.node for c in value._mask.cells.flat] != [c.node for c in mask.cells.flat]:
+                raise UntraceableError("it mixes values that different conditions select")
+            return value._values
+        if np.size(value) != 1:
+            raise UntraceableError("it mixes values that a condition selects with whole arrays")
+        return value
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise UntraceableError("it uses the values that a condition selects: use numpy.where")
+
+    __array__ = __bool__ = __len__ = __iter__ = __getitem__ = __float__ = __int__ = _refuse
+    __getattr__ = __array_function__ = _refuse
+
+
+def _to_assign(graph: Graph, value: Any, mask: Symbols, dtype: Any) -> Symbols:
+    """What to assign where a condition holds."""
+    is_single = not isinstance(value, Selected)
+    new = as_symbols(graph, Selected.of(value, mask)).cast(dtype)
+    return new.like(new.cells.reshape(())) if is_single else new
 
 
 def each(function: Callable[..., Cell], *cells: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -252,6 +331,22 @@ def has_symbols(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return any(map(has_symbols, value))
     return isinstance(value, Symbols | Unboxed)
+
+
+def graph_of(*values: Any) -> Graph:
+    """The graph of the first symbols among some values.
+
+    Raises:
+        UntraceableError: If there are none.
+    """
+    for value in values:
+        if isinstance(value, Symbols):
+            return value.graph
+        if isinstance(value, Unboxed):
+            return value.symbols.graph
+        if isinstance(value, list | tuple) and has_symbols(value):
+            return graph_of(*value)
+    raise UntraceableError("it calls a function of numpy in a way that cannot be followed")
 
 
 def as_symbols(graph: Graph, value: Any) -> Symbols:
@@ -282,7 +377,8 @@ def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
         return array
     if NOWHERE in array.shape:
         raise UntraceableError(
-            "it gives values to a function of numpy that cannot be followed. To index a table, use "
+            "it gives values to a function of numpy that cannot be followed. A method such as "
+            "numpy.maximum.reduce needs numpy.array around a list; a table in another object needs "
             "numpy.take(table, index)"
         )
     if array.dtype.kind not in "biuf":

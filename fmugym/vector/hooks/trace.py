@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from fmugym.env import FMUEnv
 from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.functions import numpy_of
+from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
@@ -34,11 +34,9 @@ from fmugym.vector.hooks.symbols import (
     same_for_all,
     spread,
 )
+from fmugym.vector.hooks.tables import is_table, tables_in
 
 __all__ = ["SeenArray", "TracedTask", "placed", "rounded", "tables_of", "trace_hooks"]
-
-_MOST_TABLE: Final = 4096
-"""The most elements of an attribute that hooks may look values up in."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +67,8 @@ class TracedTask:
         updated: The names of the variables that ``_update`` writes.
         left: The hooks that cannot be traced, and why. They run on arrays; no other hook needs
             what they return.
+        is_inexact: Whether the last bits may differ from those of hooks on arrays, because there
+            are products of matrices.
     """
 
     inputs: Program
@@ -77,17 +77,21 @@ class TracedTask:
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
     left: Mapping[str, str]
+    is_inexact: bool = False
 
     def loads(self, kind: str) -> bool:
         """Whether one of the programs loads values of this kind."""
         return self.inputs.loads(kind) or self.judgement.loads(kind)
 
 
-def trace_hooks(env: FMUEnv) -> TracedTask:
+def trace_hooks(
+    env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
+) -> TracedTask:
     """Trace the hooks of an environment.
 
     Args:
         env: A prototype whose actions make an array.
+        attributes: Those that have one number for each environment, by name.
 
     Raises:
         UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
@@ -95,8 +99,8 @@ def trace_hooks(env: FMUEnv) -> TracedTask:
     """
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
-    with borrowed(env), reading(env, Readings.of(env)):
-        return _Tracer(env).task()
+    with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+        return _Tracer(env, attributes).task()
 
 
 class _Tracer:
@@ -104,10 +108,11 @@ class _Tracer:
 
     Args:
         env: The prototype.
+        attributes: Those that have one number for each environment.
     """
 
-    def __init__(self, env: FMUEnv) -> None:
-        self._env = env
+    def __init__(self, env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]]) -> None:
+        self._env, self._attributes = env, attributes
         self._graph = Graph()
         self._contents = Contents(env)
         self._left: dict[str, str] = {}
@@ -131,6 +136,7 @@ class _Tracer:
     def _traced(self) -> TracedTask:
         self._left = {}
         inputs = self._trace_inputs()
+        has_inexact_inputs = self._graph.is_inexact
         self._begin(judging=True)
         stores, updated = self._trace_update()
         done = int(self._call("_is_done", self._flag_node))
@@ -141,14 +147,16 @@ class _Tracer:
         results.append(self._or_left("_reward_policy", self._reward_node, np.float64(0.0)))
         seen, more = self._trace_seen()
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
-        return TracedTask(
-            inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
-        )
+        parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
+        return TracedTask(*parts, has_inexact_inputs or self._graph.is_inexact)
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
         for name, table in self._tables.items():
             vars(self._env)[name] = lift(self._graph, table)
+        for name, row in self._attributes.items():
+            names = _names((), "attribute", name)
+            vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
         symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
         self._contents = Contents(self._env)
 
@@ -455,9 +463,8 @@ def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
 
 
 def tables_of(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """The arrays among the attributes that hooks may index with values."""
-    for name, value in vars(env).items():
-        is_table = type(value) is np.ndarray and value.dtype.kind in "biuf"
-        is_table = is_table and value.dtype.itemsize <= 8 and 0 < value.size <= _MOST_TABLE
-        if is_table and not name.startswith("_") and name not in READINGS:
+    """The arrays among the attributes, of the class too, that hooks may index with values."""
+    of_classes = {name: v for cls in reversed(type(env).__mro__) for name, v in vars(cls).items()}
+    for name, value in (of_classes | vars(env)).items():
+        if is_table(value) and not name.startswith("_") and name not in READINGS:
             yield name, value

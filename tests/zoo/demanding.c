@@ -1,4 +1,4 @@
-/* A useful FMU of FMI 2.0 that demands something: what is in its token.
+/* Useful FMUs that demand something: the instantiation token says what.
 
    x' = gain u - x, y = x, by explicit Euler with internal steps of 1 ms.
    Reals: 0 "u" (input), 1 "y" (output), 2 "gain" (parameter).
@@ -6,6 +6,9 @@
    The environment variable SEATS names a file that has the process of each licence in use, and
    SEATS_LIMIT says how many there may be. SEATS.most gets the most that were in use at once,
    SEATS.calls the time of each instantiation and initialization. */
+
+#define _GNU_SOURCE
+#include "zoo.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -18,29 +21,23 @@
 #include <time.h>
 #include <unistd.h>
 
-#define OWN_SERIALIZATION
-#include "fmi2_stubs.h"
-
 enum { U, Y, GAIN, VALUES, MOST_SEATS = 64 };
 
-typedef struct {
-    void (*logger)(void *, const char *, int, const char *, const char *, ...);
-} Callbacks;
-
-typedef struct {
+struct Animal {
     double values[VALUES];
     char token[40];
     char name[80];
-    const Callbacks *callbacks;
-    int seated;
-} Model;
+    Logger logger;
+    void *environment;
+    bool seated;
+};
 
-static int is_licensed(void) {
+static bool is_licensed(void) {
     const char *seats = getenv("SEATS");
     return seats != NULL && *seats != '\0';
 }
 
-static void note(const char *suffix, double value, int append) {
+static void note(const char *suffix, double value, bool append) {
     char path[400];
     snprintf(path, sizeof path, "%s.%s", getenv("SEATS"), suffix);
     FILE *file = fopen(path, append ? "a" : "w");
@@ -53,7 +50,7 @@ static void note_call(void) {
 
     if (is_licensed()) {
         clock_gettime(CLOCK_MONOTONIC, &now);
-        note("calls", (double)now.tv_sec + 1e-9 * (double)now.tv_nsec, 1);
+        note("calls", (double)now.tv_sec + 1e-9 * (double)now.tv_nsec, true);
     }
 }
 
@@ -71,14 +68,14 @@ static int read_seats(int file, pid_t *seats) {
 }
 
 /* Adds a seat of this process, or takes one away; returns whether that was possible. */
-static int change_seats(int taken) {
+static bool change_seats(bool taken) {
     static int most;
     pid_t seats[MOST_SEATS + 1];
     const int file = open(getenv("SEATS"), O_RDWR | O_CREAT, 0600);
 
     flock(file, LOCK_EX);
     int count = read_seats(file, seats);
-    const int possible = !taken || count < atoi(getenv("SEATS_LIMIT"));
+    const bool possible = !taken || count < atoi(getenv("SEATS_LIMIT"));
     if (taken && possible) {
         seats[count++] = getpid();
     }
@@ -90,7 +87,7 @@ static int change_seats(int taken) {
     }
     if (count > most) {
         most = count;
-        note("most", most, 1);
+        note("most", most, true);
     }
     ftruncate(file, 0);
     pwrite(file, seats, count * sizeof *seats, 0);
@@ -98,15 +95,15 @@ static int change_seats(int taken) {
     return possible;
 }
 
-static int take_seat(Model *me) {
+static bool take_seat(Animal *me) {
     if (!is_licensed() || me->seated) {
-        return 1;
+        return true;
     }
-    me->seated = change_seats(1);
+    me->seated = change_seats(true);
     if (!me->seated) {
-        me->callbacks->logger(NULL, me->name, 3, "error",
-                              "FLEXlm error -4: checkout of Demanding failed, all %s seats taken",
-                              getenv("SEATS_LIMIT"));
+        me->logger(me->environment, me->name, ERROR, "error",
+                   "FLEXlm error -4: checkout of Demanding failed, all %s seats taken",
+                   getenv("SEATS_LIMIT"));
     }
     return me->seated;
 }
@@ -118,23 +115,23 @@ static void sleep_for(double seconds) {
     nanosleep(&time, NULL);
 }
 
-static int is(const Model *me, const char *token) {
+static bool is(const Animal *me, const char *token) {
     return strcmp(me->token, token) == 0;
 }
 
-static void set_start(Model *me) {
+static void set_start(Animal *me) {
     memset(me->values, 0, sizeof me->values);
     me->values[GAIN] = 1.0;
 }
 
-void *fmi2Instantiate(const char *name, int type, const char *token, const char *resources,
-                      const Callbacks *callbacks, int visible, int logging) {
-    Model *me = calloc(1, sizeof *me);
+Animal *zoo_instantiate(const Birth *birth) {
+    Animal *me = calloc(1, sizeof *me);
 
     note_call();
-    snprintf(me->token, sizeof me->token, "%s", token);
-    snprintf(me->name, sizeof me->name, "%s", name);
-    me->callbacks = callbacks;
+    snprintf(me->token, sizeof me->token, "%s", birth->token);
+    snprintf(me->name, sizeof me->name, "%s", birth->name);
+    me->logger = birth->logger;
+    me->environment = birth->environment;
     set_start(me);
     if (!is(me, "licensed at initialization") && !take_seat(me)) {
         if (is(me, "licensed or dead")) {
@@ -146,19 +143,14 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
     return me;
 }
 
-void fmi2FreeInstance(Model *me) {
+void zoo_free(Animal *me) {
     if (me->seated) {
-        change_seats(0);
+        change_seats(false);
     }
     free(me);
 }
 
-int fmi2SetupExperiment(Model *me, int tolerance_defined, double tolerance, double start,
-                        int stop_defined, double stop) {
-    return 0;
-}
-
-/* Reads a table as JModelica's weather models do: not safe in threads. */
+/* Reads a table as JAnimalica's weather models do: not safe in threads. */
 static int read_table(void) {
     int rows = 0;
     char table[400] = "";
@@ -170,26 +162,22 @@ static int read_table(void) {
         rows++;
         usleep(20);
     }
-    return rows == 40 ? 0 : 3;
+    return rows == 40 ? OK : ERROR;
 }
 
-int fmi2EnterInitializationMode(Model *me) {
-    return 0;
-}
-
-int fmi2ExitInitializationMode(Model *me) {
+int zoo_exit(Animal *me) {
     note_call();
     if (!take_seat(me)) {
-        return 3;
+        return ERROR;
     }
     if (strncmp(me->token, "slow", 4) == 0) {
-        me->callbacks->logger(NULL, me->name, 3, "info", "solving %d equations", 4711);
-        sleep_for(is(me, "slow for ever") ? 3600.0 : is(me, "slower") ? 1.5 : 0.3);
+        me->logger(me->environment, me->name, ERROR, "info", "solving %d equations", 4711);
+        sleep_for(is(me, "slow for ever") ? 3600.0 : is(me, "slower") ? 0.75 : 0.15);
     }
-    return is(me, "strtok") ? read_table() : 0;
+    return is(me, "strtok") ? read_table() : OK;
 }
 
-int fmi2DoStep(Model *me, double time, double step_size, int no_set_state) {
+int zoo_step(Animal *me, double step_size, bool no_set_state) {
     double *v = me->values;
     const int steps = (int)(step_size * 1000.0 + 0.5);
 
@@ -205,43 +193,39 @@ int fmi2DoStep(Model *me, double time, double step_size, int no_set_state) {
             v[Y] += 0.001 * (v[GAIN] * v[U] - v[Y]);
         }
     }
-    return 0;
+    return OK;
 }
 
-int fmi2GetReal(Model *me, const unsigned *vr, size_t count, double *values) {
+int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
     for (size_t i = 0; i < count; i++) {
-        values[i] = me->values[vr[i]];
+        values[i] = me->values[references[i]];
     }
-    return 0;
+    return OK;
 }
 
-int fmi2SetReal(Model *me, const unsigned *vr, size_t count, const double *values) {
+int zoo_set(Animal *me, const unsigned *references, size_t count, const double *values) {
     for (size_t i = 0; i < count; i++) {
-        me->values[vr[i]] = values[i];
+        me->values[references[i]] = values[i];
     }
-    return 0;
+    return OK;
 }
 
-int fmi2Terminate(Model *me) {
-    return 0;
-}
-
-int fmi2Reset(Model *me) {
+int zoo_reset(Animal *me) {
     set_start(me);
-    return 0;
+    return OK;
 }
 
-int fmi2GetFMUstate(Model *me, void **state) {
+int zoo_get_state(Animal *me, void **state) {
     if (*state == NULL) {
         *state = malloc(sizeof *me);
     }
     memcpy(*state, me, sizeof *me);
-    return 0;
+    return OK;
 }
 
-int fmi2SetFMUstate(Model *me, void *state) {
-    memcpy(me->values, ((Model *)state)->values, sizeof me->values);
-    return 0;
+int zoo_set_state(Animal *me, void *state) {
+    memcpy(me->values, ((Animal *)state)->values, sizeof me->values);
+    return OK;
 }
 
 typedef struct {
@@ -249,22 +233,22 @@ typedef struct {
     pid_t process;
 } Bytes;
 
-int fmi2SerializedFMUstateSize(Model *me, void *state, size_t *size) {
+int zoo_size_of_bytes(Animal *me, void *state, size_t *size) {
     *size = sizeof(Bytes);
-    return is(me, "slow, serializes nothing") ? 3 : 0;
+    return is(me, "slow, serializes nothing") ? ERROR : OK;
 }
 
-int fmi2SerializeFMUstate(Model *me, void *state, char *bytes, size_t size) {
+int zoo_to_bytes(Animal *me, void *state, char *bytes, size_t size) {
     Bytes content;
 
     memset(&content, 0, sizeof content);
-    memcpy(content.values, ((Model *)state)->values, sizeof content.values);
+    memcpy(content.values, ((Animal *)state)->values, sizeof content.values);
     content.process = strchr(me->token, ',') == NULL ? 0 : getpid();
     memcpy(bytes, &content, size);
-    return 0;
+    return OK;
 }
 
-int fmi2DeSerializeFMUstate(Model *me, const char *bytes, size_t size, void **state) {
+int zoo_from_bytes(Animal *me, const char *bytes, size_t size, void **state) {
     Bytes content;
 
     memcpy(&content, bytes, sizeof content);
@@ -272,18 +256,12 @@ int fmi2DeSerializeFMUstate(Model *me, const char *bytes, size_t size, void **st
         abort();
     }
     if (is(me, "slow, refuses elsewhere") && content.process != getpid()) {
-        return 3;
+        return ERROR;
     }
-    fmi2GetFMUstate(me, state);
-    memcpy(((Model *)*state)->values, content.values, sizeof content.values);
+    zoo_get_state(me, state);
+    memcpy(((Animal *)*state)->values, content.values, sizeof content.values);
     if (is(me, "slow, differs elsewhere") && content.process != getpid()) {
-        ((Model *)*state)->values[GAIN] += 1e-9;
+        ((Animal *)*state)->values[GAIN] += 1e-9;
     }
-    return 0;
-}
-
-int fmi2FreeFMUstate(Model *me, void **state) {
-    free(*state);
-    *state = NULL;
-    return 0;
+    return OK;
 }

@@ -1,0 +1,195 @@
+"""The values of a task, each of which knows where it stands in its file."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
+
+from fmugym.checks import check_flag, check_mapping, check_text
+from fmugym.errors import ConfigError, TaskError, shown, unknown_name
+
+__all__ = ["Entry", "Source"]
+
+_Value = TypeVar("_Value")
+
+_KEY: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
+_KEYS: Final = rf"{_KEY}(?:\s*\.\s*{_KEY})*"
+_HEADER: Final = re.compile(rf"\s*\[\[?\s*({_KEYS})\s*\]")
+_ASSIGNMENT: Final = re.compile(rf"\s*({_KEYS})\s*=")
+
+
+class Source(NamedTuple):
+    """A file, or a dict of the caller, that gives values of a task.
+
+    Attributes:
+        path: The file; None for a dict.
+        folder: Where relative paths start.
+        text: The text of the file.
+        document: Its values.
+    """
+
+    path: Path | None
+    folder: Path
+    text: str
+    document: Mapping[str, Any]
+
+    def has(self, keys: Sequence[str]) -> bool:
+        """Whether there is a value under these keys."""
+        value: Any = self.document
+        for key in keys:
+            if not isinstance(value, Mapping) or key not in value:
+                return False
+            value = value[key]
+        return True
+
+    def place(self, keys: Sequence[str]) -> str:
+        """Say where a value stands, as far as that is known."""
+        if self.path is None:
+            return ".".join(keys)
+        line = self._line(keys)
+        parts = [self.path.name, f"line {line}" if line else "", ".".join(keys)]
+        return ", ".join(filter(None, parts))
+
+    def _line(self, keys: Sequence[str]) -> int | None:
+        """The first line that leads furthest along the keys."""
+        found: tuple[int, int | None] = (0, None)
+        for number, path in _paths(self.text):
+            if len(path) > found[0] and list(path) == list(keys[: len(path)]):
+                found = len(path), number
+        return found[1]
+
+
+def _paths(text: str) -> Iterator[tuple[int, tuple[str, ...]]]:
+    """The keys that each line of a TOML file sets, with the number of the line."""
+    table: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), 1):
+        header, assignment = _HEADER.match(line), _ASSIGNMENT.match(line)
+        if header:
+            table = _split(header[1])
+            yield number, table
+        elif assignment:
+            yield number, table + _split(assignment[1])
+
+
+def _split(dotted: str) -> tuple[str, ...]:
+    keys, value = [], tomllib.loads(f"{dotted} = 0")
+    while isinstance(value, dict):
+        (key, value) = next(iter(value.items()))
+        keys.append(key)
+    return tuple(keys)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A value of a task, and where it stands.
+
+    Attributes:
+        value: The value.
+        keys: The keys that lead to it.
+        sources: The files that the task is made of; the first that has the value counts.
+    """
+
+    value: Any
+    keys: tuple[str, ...]
+    sources: tuple[Source, ...]
+
+    @property
+    def name(self) -> str:
+        """The last of its keys."""
+        return self.keys[-1]
+
+    @property
+    def source(self) -> Source:
+        """The file that gives the value, or that should give it."""
+        for length in range(len(self.keys), 0, -1):
+            for source in self.sources:
+                if source.has(self.keys[:length]):
+                    return source
+        return self.sources[0]
+
+    def error(self, text: object) -> TaskError:
+        """Make an error that says where this value stands."""
+        place = self.source.place(self.keys)
+        return TaskError(f"{place}: {text}" if place else str(text))
+
+    @contextmanager
+    def placing(self) -> Iterator[None]:
+        """Let errors about this value say where it stands."""
+        try:
+            yield
+        except TaskError:
+            raise
+        except ConfigError as error:
+            raise self.error(error) from error
+
+    def check(self, check: Callable[..., _Value], *arguments: Any, **options: Any) -> _Value:
+        """Check the value with one of the functions of ``fmugym.checks``."""
+        with self.placing():
+            return check(self.name, self.value, *arguments, **options)
+
+    def child(self, key: str) -> Entry:
+        """The value under a key of this table; None if it is missing."""
+        items = self.value if isinstance(self.value, Mapping) else {}
+        return Entry(items.get(key), (*self.keys, key), self.sources)
+
+    def items(self) -> dict[str, Entry]:
+        """The values of this table by key.
+
+        Raises:
+            ConfigError: If this is no table.
+        """
+        what = self.name if self.keys else "a task"
+        with self.placing():
+            items = check_mapping(what, self.value)
+        return {key: self.child(key) for key in items}
+
+    def table(self, known: Iterable[str]) -> dict[str, Entry]:
+        """The values of this table, whose keys must be known.
+
+        Raises:
+            ConfigError: If this is no table, or for an unknown key, with the nearest known one.
+        """
+        known, items = list(known), self.items()
+        for key, entry in items.items():
+            if key not in known:
+                raise entry.error(unknown_name("key", key, known))
+        return items
+
+    def required(self, key: str) -> Entry:
+        """The value under a key that must be there.
+
+        Raises:
+            ConfigError: If it is missing.
+        """
+        entry = self.child(key)
+        if entry.value is None:
+            raise self.error(f"the key {key!r} is missing")
+        return entry
+
+    def text(self) -> str:
+        """The value, which must be a text."""
+        return self.check(check_text)
+
+    def flag(self) -> bool:
+        """The value, which must be true or false."""
+        return self.check(check_flag)
+
+    def elements(self) -> list[Entry]:
+        """The elements of a list, as entries with the place of the list.
+
+        Raises:
+            ConfigError: If this is no list.
+        """
+        if not isinstance(self.value, list | tuple):
+            raise self.error(f"expected a list, got {shown(self.value)}")
+        return [Entry(value, self.keys, self.sources) for value in self.value]
+
+    def path(self) -> Path:
+        """The value as a path; a relative one is relative to the folder of its file."""
+        path = Path(self.text()).expanduser()
+        return path if path.is_absolute() else self.source.folder / path

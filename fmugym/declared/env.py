@@ -1,0 +1,112 @@
+"""The environment of a declared task."""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+from types import MethodType
+from typing import Any
+
+from fmugym.archive.bundled import bundled_fmu
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.fmu import FMU
+from fmugym.declared.entries import Entry
+from fmugym.declared.plan import Plan
+from fmugym.declared.task import Task
+from fmugym.env import FMUEnv
+from fmugym.errors import shown, unknown_name
+
+__all__ = ["TaskEnv", "fmu_path"]
+
+
+class TaskEnv(FMUEnv):
+    """The environment of a task that a file or a dict declares.
+
+    A class for a task with hooks of its own derives from it. Hooks that the class overrides take
+    the place of what the task declares.
+
+    Args:
+        config: The task: a ``Task``, the path of a TOML file, or a dict with the same keys.
+        log_level: Level of the logger, which gets the FMU's messages.
+        render_mode: As for ``FMUEnv``.
+        backend: As for ``FMUEnv``.
+        isolation: As for ``FMUEnv``.
+
+    Attributes:
+        task: The task.
+        cost_limits: What the costs of an episode may add up to, by name, as the task says.
+
+    Raises:
+        ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the
+            line and the key.
+        FMULoadError: If the FMU cannot be used on this machine.
+    """
+
+    def __init__(
+        self,
+        config: Any,
+        log_level: int = logging.WARNING,
+        *,
+        render_mode: str | None = None,
+        backend: Any = None,
+        isolation: str | None = None,
+    ) -> None:
+        self.task = Task.of(config)
+        path = fmu_path(self.task)
+        needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
+        plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
+        self.cost_limits = plan.cost_limits
+        for name, function in plan.hooks.items():
+            if name not in _own_hooks(type(self)):
+                setattr(self, name, MethodType(function, self))
+        with self.task.root.placing():
+            super().__init__(
+                path,
+                plan.config,
+                log_level,
+                render_mode=render_mode,
+                backend=backend,
+                isolation=isolation,
+            )
+
+    def _is_done(self) -> Any:
+        """Episodes of a task that says nothing about their end are only truncated."""
+        return False
+
+
+def _own_hooks(cls: type[TaskEnv]) -> set[str]:
+    """The names of everything that classes between ``TaskEnv`` and this one define."""
+    classes = cls.__mro__[: cls.__mro__.index(TaskEnv)]
+    return {name for one in classes for name in vars(one)}
+
+
+def fmu_path(task: Task) -> Path:
+    """Find the FMU of a task.
+
+    Raises:
+        ConfigError: If the task names none, or there is no bundled FMU of this name.
+    """
+    entry = task.root.required("fmu")
+    if isinstance(entry.value, str):
+        return Path(entry.value)
+    table = entry.table(("bundled", "fmi_version"))
+    version: Any = table["fmi_version"].value if "fmi_version" in table else "2.0"
+    with entry.placing():
+        return bundled_fmu(entry.required("bundled").text(), version)
+
+
+def _description(entry: Entry, path: Path) -> ModelDescription:
+    try:
+        status = path.stat()
+    except OSError:
+        near = sorted(file.name for file in path.parent.glob("*.fmu"))
+        folder = shown(str(path.parent))
+        raise entry.error(f"{unknown_name('FMU', path.name, near)}; looked in {folder}") from None
+    return _read_description(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=16)
+def _read_description(path: Path, changed: int, size: int) -> ModelDescription:
+    """Read a model description, once for all environments of a task."""
+    return FMU(path).description

@@ -1,0 +1,106 @@
+"""The functions of expressions, for numbers, arrays and symbols.
+
+All of them give one number the same value, to the last bit, as an element of an array: they are
+numpy's functions, or operators that IEEE 754 settles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+__all__ = ["FUNCTIONS", "OPERATIONS", "Function"]
+
+
+class Function(NamedTuple):
+    """A function that expressions may call.
+
+    Attributes:
+        call: The function.
+        fewest, most: How many arguments it takes; None for any number.
+    """
+
+    call: Callable[..., Any]
+    fewest: int = 1
+    most: int | None = 1
+
+
+def _divide(first: Any, second: Any) -> Any:
+    try:
+        return first / second
+    except ZeroDivisionError:  # Python's floats raise where numpy gives an infinity or NaN
+        return np.divide(first, second)
+
+
+def _remainder(first: Any, second: Any) -> Any:
+    try:
+        return first % second
+    except ZeroDivisionError:
+        return np.remainder(first, second)
+
+
+def _where(condition: Any, first: Any, second: Any) -> Any:
+    if isinstance(condition, bool | np.bool_):
+        return first if condition else second
+    return np.where(condition, first, second)
+
+
+def _clip(value: Any, low: Any, high: Any) -> Any:
+    return np.minimum(np.maximum(value, low), high)
+
+
+def _float32(value: Any) -> Any:
+    """Round to the nearest number that a float32 can hold."""
+    return np.positive(np.positive(value, dtype=np.float32), dtype=np.float64)
+
+
+def _float64(value: Any) -> Any:
+    return np.positive(value, dtype=np.float64)
+
+
+def _take(table: Any, index: Any) -> Any:
+    if isinstance(index, int | np.integer):
+        return float(table[index])
+    return np.take(table, index)  # looked up in each call: it is replaced while hooks are traced
+
+
+def _minimum(*values: Any) -> Any:
+    return reduce(np.minimum, values)
+
+
+def _maximum(*values: Any) -> Any:
+    return reduce(np.maximum, values)
+
+
+OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
+    "divide": _divide,
+    "remainder": _remainder,
+    "power": np.float_power,
+    "where": _where,
+    "float64": _float64,
+    "take": _take,
+    "interp": np.interp,
+}
+"""What the code of expressions calls for operators and for values that it looks up."""
+
+_OF_NUMPY: Final = (
+    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh"),
+    *("exp", "expm1", "log", "log10", "log1p", "sqrt", "square", "sign", "floor", "ceil"),
+    *("radians", "degrees"),
+)
+
+FUNCTIONS: Final[dict[str, Function]] = {
+    "abs": Function(abs),
+    "min": Function(_minimum, 2, None),
+    "max": Function(_maximum, 2, None),
+    "clip": Function(_clip, 3, 3),
+    "hypot": Function(np.hypot, 2, 2),
+    "arctan2": Function(np.arctan2, 2, 2),
+    "round": Function(np.rint),
+    "float32": Function(_float32),
+    **{name: Function(getattr(np, name)) for name in _OF_NUMPY},
+}
+"""The functions by the names that they have in expressions."""

@@ -1,0 +1,65 @@
+"""Making environments of task files."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from fmugym.declared.env import TaskEnv
+from fmugym.declared.task import Task
+from fmugym.env import FMUEnv
+from fmugym.errors import ArgumentError, shown
+
+__all__ = ["load"]
+
+
+def load(config: Any = None, **arguments: Any) -> FMUEnv:
+    """Make the environment that a task file declares.
+
+    Args:
+        config: The path of a TOML file, a dict with the same keys, or a ``Task``. See
+            ``docs/task-file.md``.
+        arguments: Arguments of the environment, such as ``render_mode``; see ``TaskEnv``.
+
+    Raises:
+        ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the
+            line and the key.
+        FMULoadError: If the FMU cannot be used on this machine.
+    """
+    if config is None:
+        raise ArgumentError("give the argument 'config': the path of a task file, or a dict")
+    task = Task.of(config)
+    if task.root.child("class").value is None:
+        if task.root.child("arguments").value is not None:
+            raise task.root.child("arguments").error("'arguments' are for a task with a 'class'")
+        return TaskEnv(task, **arguments)
+    env_class = _class_of(task)
+    own = task.root.child("arguments")
+    given = {} if own.value is None else {k: entry.value for k, entry in own.items().items()}
+    if issubclass(env_class, TaskEnv):
+        return env_class(task, **given, **arguments)
+    _require_no_more(task, env_class)
+    return env_class(**(given | arguments))
+
+
+def _class_of(task: Task) -> type[FMUEnv]:
+    entry = task.root.child("class")
+    found = entry.value
+    if isinstance(found, str):
+        module, _, name = found.partition(":")
+        try:
+            found = getattr(import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise entry.error(f"{shown(entry.value)} cannot be imported: {error}") from None
+    if not isinstance(found, type) or not issubclass(found, FMUEnv):
+        raise entry.error(f"expected 'module:Class' of an environment, got {shown(found)}")
+    return found
+
+
+def _require_no_more(task: Task, env_class: type[FMUEnv]) -> None:
+    for key in task.document:
+        if key not in {"version", "class", "arguments", "description"}:
+            raise task.root.child(key).error(
+                f"{env_class.__name__} takes 'arguments' only; derive it from fmugym.TaskEnv to "
+                f"declare {key!r} in the file"
+            )

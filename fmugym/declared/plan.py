@@ -1,0 +1,277 @@
+"""From a declared task and a model description to a config, spaces and hooks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.archive.description import ModelDescription
+from fmugym.config import EnvConfig
+from fmugym.declared.declarations import Declarations, Term
+from fmugym.declared.entries import Entry
+from fmugym.declared.expressions import function_of
+from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.quantities import duration
+from fmugym.declared.task import Task
+from fmugym.declared.variables import Record, inverted, is_plain
+from fmugym.errors import shown
+from fmugym.pool.spec import whole_number_of_steps
+
+__all__ = ["Plan"]
+
+_OF_SECTIONS: Final = frozenset(
+    {"model_input_names", "model_output_names", "model_parameters", "monitor_names"}
+    | {"episode_variables", "bounds", "time_step", "substeps", "max_episode_steps", "warm_up"}
+    | {"start_time", "positive_reward", "negative_reward"}
+)
+"""Keys of a config that other sections of a task determine."""
+
+_OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
+
+Hook = Callable[[Any], Any]
+
+
+class Plan:
+    """What an environment needs to know of its task.
+
+    Args:
+        task: The task.
+        description: The model description of its FMU.
+        needs_reward: Whether the task must say a reward; a class may have one of its own.
+
+    Attributes:
+        config: The config for ``FMUEnv``.
+        hooks: Functions of the environment by the names of the hooks that they are.
+        cost_limits: What the costs of an episode may add up to, by name.
+
+    Raises:
+        ConfigError: If the task does not fit the FMU, or contradicts itself. The text says where.
+    """
+
+    def __init__(
+        self, task: Task, description: ModelDescription, needs_reward: bool = True
+    ) -> None:
+        self._task, self._root = task, task.root
+        self._declared = declared = Declarations.read(task.root, description)
+        if needs_reward and not declared.rewards:
+            raise task.root.error('the task has no reward; say one, for example: reward = "1"')
+        self._time_step = _time_step(task.root, description)
+        self._naming = Naming(declared, self._time_step)
+        for name in declared.derived:
+            self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
+        self.config = self._make_config()
+        self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
+        limits = {name: term.limit for name, term in declared.costs.items()}
+        self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
+
+    # The config.
+
+    def _make_config(self) -> dict[str, Any]:
+        declared, records = self._declared, self._declared.records
+        return {
+            **self._own_config(),
+            **self._times(),
+            "model_input_names": [records[name].fmu_name for name in declared.written],
+            "model_output_names": [records[name].fmu_name for name in self._naming.outputs],
+            "monitor_names": [records[name].fmu_name for name in self._naming.monitors],
+            "model_parameters": {r.fmu_name: value for r, value in declared.parameters.values()},
+            "episode_variables": {name: one.start for name, one in declared.memory.items()},
+            "bounds": self._bounds(),
+        }
+
+    def _own_config(self) -> dict[str, Any]:
+        section = self._root.child("config")
+        if section.value is None:
+            return {}
+        return {key: entry.value for key, entry in section.table(_OF_CONFIG).items()}
+
+    def _times(self) -> dict[str, Any]:
+        times: dict[str, Any] = {"time_step": self._time_step}
+        for key in ("warm_up", "start_time"):
+            if self._root.child(key).value is not None:
+                times[key] = self._root.child(key).check(duration)
+        if self._root.child("substeps").value is not None:
+            times["substeps"] = self._root.child("substeps").value
+        if self._root.child("episode_length").value is not None:
+            times["max_episode_steps"] = self._episode_steps(self._root.child("episode_length"))
+        return times
+
+    def _episode_steps(self, entry: Entry) -> int:
+        length, step = entry.check(duration), self._time_step
+        count = whole_number_of_steps(length, step)
+        if not count:
+            raise entry.error(
+                f"episode_length must be a multiple of the time step of {step:g} s, got {length:g} "
+                "s"
+            )
+        return count
+
+    def _bounds(self) -> dict[str, tuple[float, float]]:
+        """The limits that the base class needs in order to make spaces."""
+        names = [*self._declared.written, *self._naming.outputs]
+        records = [self._declared.records[name] for name in names]
+        return {r.fmu_name: (r.low, r.high) for r in records if _has_own_limits(r)}
+
+    # Spaces, and what leads into and out of them.
+
+    def _hooks_of_spaces(self) -> dict[str, Hook]:
+        hooks: dict[str, Hook] = {}
+        actions, seen = self._action_space(), self._observation_space()
+        if actions is not None:
+            hooks["_get_action_space"] = lambda env: actions
+            hooks["_get_inputs"] = self._inputs()
+        if seen is not None:
+            hooks["_get_observation_space"] = lambda env: seen
+            hooks["_get_observation"] = self._observation()
+        return hooks
+
+    def _action_space(self) -> spaces.Space[Any] | None:
+        """The action space; None if it is that of the inputs as they are."""
+        records = self._declared.actions
+        are_inputs = all(r.variable is not None and is_plain(r) for r in records)
+        if are_inputs and not self._declared.inputs:
+            return None
+        if not records[0].levels:
+            return _box([(record.low, record.high) for record in records])
+        counts = [len(record.levels) for record in records]
+        return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
+
+    def _inputs(self) -> Hook:
+        """Write the FMU's inputs, in their units."""
+        declared = self._declared
+        codes = [
+            inverted(record.conversion, self._naming.action_code(record, "action"))
+            for record in declared.actions
+            if record.variable is not None
+        ]
+        for name, (record, expression) in declared.inputs.items():
+            entry = self._root.child("inputs").child(name)
+            code = self._naming.code(entry, expression, Moment.BEFORE)
+            codes.append(inverted(record.conversion, code.number.text))
+        if not codes:
+            raise declared.agent("actions").error(
+                "the actions write no input of the FMU: use them in expressions under [inputs]"
+            )
+        return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+
+    def _observation_space(self) -> spaces.Space[Any] | None:
+        """The observation space; None if it is that of the outputs as they are."""
+        names = [name for _, name in self._declared.observed]
+        records = self._declared.records
+        if names == self._naming.outputs and all(is_plain(records[name]) for name in names):
+            return None
+        return _box([self._declared.limits_of(name) for name in names])
+
+    def _observation(self) -> Hook:
+        codes = [self._observed(entry, name) for entry, name in self._declared.observed]
+        values = self._function(_tuple(codes))
+        return lambda env: np.array(values(env), dtype=np.float32)
+
+    def _observed(self, entry: Entry, name: str) -> str:
+        code = self._naming.code_of(name, Moment.AFTER)
+        if code is None or code.value is not None:
+            raise entry.error(f"{name!r} is a constant, which an agent need not observe")
+        return code.number.text
+
+    # What follows a step.
+
+    def _hooks_of_steps(self) -> dict[str, Hook]:
+        declared, hooks = self._declared, {}
+        if any(memory.update is not None for memory in declared.memory.values()):
+            hooks["_update"] = self._update()
+        if "terminated" in declared.flags:
+            hooks["_is_done"] = self._condition("terminated", Moment.AFTER)
+        if "truncated" in declared.flags:
+            hooks["_is_truncated"] = self._condition("truncated", Moment.JUDGED)
+        if declared.rewards:
+            hooks["_reward_policy"] = self._function(_sum(self._terms(declared.rewards)))
+        if declared.costs or declared.has_reward_terms:
+            hooks["_get_info"] = self._function(self._info())
+        return hooks
+
+    def _update(self) -> Hook:
+        """All values of the memory are computed before one of them is written."""
+        codes = {
+            name: self._naming.code(memory.entry, memory.update, Moment.AFTER).number.text
+            for name, memory in self._declared.memory.items()
+            if memory.update is not None
+        }
+        names, values = list(codes), self._function(_tuple(codes.values()))
+
+        def update(env: Any) -> None:
+            for name, value in zip(names, values(env), strict=True):
+                env.variables[name] = value
+
+        return update
+
+    def _condition(self, name: str, moment: Moment) -> Hook:
+        entry = self._root.child(name)
+        code = self._naming.code(entry, self._declared.flags[name], moment)
+        if not code.is_flag:
+            raise entry.error(f"expected a condition such as 'x > 1', got {shown(entry.value)}")
+        return self._function(code.text)
+
+    def _terms(self, terms: Mapping[str, Term]) -> dict[str, str]:
+        """Code for rewards or costs by name, weights included."""
+        codes = {}
+        for name, term in terms.items():
+            code = self._naming.code(term.entry, term.expression, Moment.JUDGED).number.text
+            codes[name] = code if term.weight == 1.0 else f"({term.weight!r} * {code})"
+        return codes
+
+    def _info(self) -> str:
+        """Code for the info: terms of the reward, and costs."""
+        rewards, costs = self._terms(self._declared.rewards), self._terms(self._declared.costs)
+        parts: dict[str, str] = {}
+        if self._declared.has_reward_terms:
+            parts["reward_terms"] = _dict({name: _in_steps(c) for name, c in rewards.items()})
+        if costs:
+            parts["cost"] = _in_steps(_sum(costs))
+            parts["costs"] = _dict({name: _in_steps(code) for name, code in costs.items()})
+        return _dict(parts)
+
+    def _function(self, text: str) -> Hook:
+        return function_of(text, self._naming.constants, self._task.name)
+
+
+def _time_step(root: Entry, description: ModelDescription) -> float:
+    entry = root.child("time_step")
+    if entry.value is not None:
+        step = entry.check(duration)
+        if step > 0:
+            return step
+        raise entry.error("time_step must be positive, got 0")
+    if description.step_size is None:
+        raise root.error("the key 'time_step' is missing, and the FMU has no default step size")
+    return description.step_size
+
+
+def _has_own_limits(record: Record) -> bool:
+    given = record.entry.value or {}
+    return is_plain(record) and ("min" in given or "max" in given)
+
+
+def _box(limits: list[tuple[float, float]]) -> spaces.Box:
+    low, high = np.array(limits, dtype=np.float32).T
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _tuple(codes: Iterable[str]) -> str:
+    return "(" + "".join(f"{code}, " for code in codes) + ")"
+
+
+def _dict(codes: Mapping[str, str]) -> str:
+    return "{" + ", ".join(f"{name!r}: {code}" for name, code in codes.items()) + "}"
+
+
+def _sum(codes: Mapping[str, str]) -> str:
+    return "(" + " + ".join(codes.values()) + ")"
+
+
+def _in_steps(code: str) -> str:
+    """Zero before the first step, which has no rewards and costs yet."""
+    return f"where(env.step_count > 0, {code}, 0.0)"

@@ -1,0 +1,250 @@
+"""A task as a file or a dict declares it: read, merged with what it extends, and written."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tomllib
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.checks import check_integer, check_mapping, check_path
+from fmugym.declared.entries import Entry, Source
+from fmugym.declared.writing import as_toml
+from fmugym.distributions import Choice, LogUniform, Normal, Uniform
+from fmugym.errors import ConfigError, reason, shown, unknown_name
+
+__all__ = ["KEYS", "VERSION", "Task"]
+
+VERSION: Final = 1
+"""The version of the format; it is raised when a key changes its meaning."""
+
+KEYS: Final = (
+    *("version", "extends", "description", "fmu", "class", "arguments"),
+    *("time_step", "substeps", "episode_length", "warm_up", "start_time"),
+    *("variables", "parameters", "inputs", "memory", "expressions", "agent"),
+    *("reward", "costs", "terminated", "truncated", "config"),
+)
+"""The keys of a task."""
+
+_NOT_INHERITED: Final = ("version", "extends")
+
+_MOST_FILES: Final = 20
+"""Files may extend each other in a chain of this length."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A declared task.
+
+    Two tasks are equal if they declare the same. Paths count as absolute paths.
+
+    Attributes:
+        document: What it declares: dicts, lists, texts and numbers. Only a task that was made of a
+            dict may hold other objects.
+        sources: The files that it was read from, the file itself first, or the dict.
+    """
+
+    document: Mapping[str, Any]
+    sources: tuple[Source, ...] = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, config: Any) -> Task:
+        """Make a task of a file, a dict or a task.
+
+        Raises:
+            ConfigError: If it is none of these, or as ``read`` and ``from_dict``.
+        """
+        if isinstance(config, Task):
+            return config
+        if isinstance(config, Mapping):
+            return cls.from_dict(config)
+        return cls.read(config)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Task:
+        """Read a TOML file, and the files that it extends.
+
+        Args:
+            path: The file; a relative path is relative to the working directory.
+
+        Raises:
+            ConfigError: If a file is missing, no TOML, or has an unknown key or version.
+        """
+        sources = [_read(check_path("the path of a task", path).absolute())]
+        while "extends" in sources[-1].document:
+            entry = _root(sources[-1]).child("extends")
+            base = entry.path().resolve()
+            if base in [source.path for source in sources] or len(sources) == _MOST_FILES:
+                raise entry.error(f"{shown(str(base))} is extended in a circle")
+            with entry.placing():
+                sources.append(_read(base))
+        return cls._merged(tuple(sources))
+
+    @classmethod
+    def from_dict(
+        cls, document: Mapping[str, Any], folder: str | os.PathLike[str] | None = None
+    ) -> Task:
+        """Make a task of a dict with the keys of a file.
+
+        Args:
+            document: The dict. Distributions may also be objects such as ``Uniform(0, 1)``.
+            folder: Where relative paths start; by default the working directory.
+
+        Raises:
+            ConfigError: For an unknown key, or as ``read`` for a file that it extends.
+        """
+        start = Path.cwd() if folder is None else check_path("folder", folder).absolute()
+        plain: dict[str, Any] = _plain(check_mapping("config", document))
+        source = Source(None, start, "", _with_paths(plain, start))
+        _check(source)
+        if "extends" not in plain:
+            return cls._merged((source,))
+        base = cls.read(_root(source).child("extends").path())
+        return cls._merged((source, *base.sources))
+
+    @classmethod
+    def _merged(cls, sources: tuple[Source, ...]) -> Task:
+        document: dict[str, Any] = {}
+        for source in reversed(sources):
+            own = {k: v for k, v in source.document.items() if k not in _NOT_INHERITED}
+            document = _merge(document, own)
+        return cls(document, sources)
+
+    @property
+    def root(self) -> Entry:
+        """The table of all keys, with the places in the files."""
+        return Entry(self.document, (), self.sources)
+
+    @property
+    def name(self) -> str:
+        """The name of the file; ``"task"`` for a dict."""
+        path = self.sources[0].path
+        return "task" if path is None else path.name
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the task to a new TOML file. Reading the file gives an equal task.
+
+        Paths are written relative to the new file. What the task extends is written out.
+
+        Args:
+            path: The file, which must not exist.
+
+        Raises:
+            ConfigError: If the task holds an object that no TOML file can hold; the text names it.
+            FileExistsError: If the file exists.
+        """
+        file = check_path("the path of a task", path).absolute()
+        text = as_toml({"version": VERSION, **_relative(dict(self.document), file.parent)})
+        with file.open("x", encoding="utf-8", newline="\n") as stream:
+            stream.write(text)
+
+
+def _root(source: Source) -> Entry:
+    return Entry(source.document, (), (source,))
+
+
+def _read(path: Path) -> Source:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ConfigError(f"{shown(str(path))} is no TOML file: {_advice(path)}") from None
+    except FileNotFoundError:
+        near = sorted(file.name for file in path.parent.glob("*.toml"))
+        error = unknown_name("task file", path.name, near)
+        raise ConfigError(f"{error}; looked in {shown(str(path.parent))}") from None
+    except OSError as error:
+        raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
+    try:
+        document = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path.name} is no TOML file: {reason(error)}") from None
+    source = Source(path, path.parent, text, _with_paths(_plain(document), path.parent))
+    _check(source)
+    return source
+
+
+def _advice(path: Path) -> str:
+    if path.suffix.lower() == ".fmu":
+        return f"'fmugym new {path.name}' writes a task file for an FMU"
+    return "it is not encoded in UTF-8"
+
+
+def _check(source: Source) -> None:
+    root = _root(source)
+    root.table(KEYS)
+    version = root.child("version")
+    if version.value is not None:
+        with version.placing():
+            check_integer(
+                f"the version of the format (this is fmugym with version {VERSION})",
+                version.value,
+                1,
+                VERSION,
+            )
+
+
+def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace values by those of the same keys; tables are merged, but not what they describe."""
+    merged = dict(base)
+    for key, value in own.items():
+        before = merged.get(key)
+        if isinstance(value, dict) and isinstance(before, dict) and _is_mergeable(value):
+            merged[key] = _merge(before, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _is_mergeable(value: Mapping[str, Any]) -> bool:
+    """Whether a table is a collection; a distribution or an FMU is one value."""
+    return "distribution" not in value and "bundled" not in value
+
+
+def _plain(value: Any) -> Any:
+    """The value in types that a file can hold, as far as that is possible."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items() if item is not None}
+    if isinstance(value, Uniform | LogUniform | Normal | Choice):
+        return _plain(asdict(value))
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
+        return value.tolist()
+    if isinstance(value, type):
+        return _named(value)
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def _named(value: type) -> Any:
+    """``"module:Class"`` where it leads to the class, the class itself otherwise."""
+    with suppress(KeyError, AttributeError):
+        if getattr(sys.modules[value.__module__], value.__qualname__) is value:
+            return f"{value.__module__}:{value.__qualname__}"
+    return value
+
+
+def _with_paths(document: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Make the paths in a document absolute."""
+    return _mapped_paths(document, lambda path: os.path.normpath(folder / Path(path).expanduser()))
+
+
+def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
+    return _mapped_paths(document, lambda path: _relative_path(path, folder))
+
+
+def _relative_path(path: str, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return path
+
+
+def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
+    fmu = document.get("fmu")
+    return document | {"fmu": function(fmu)} if isinstance(fmu, str) else document

@@ -1,0 +1,283 @@
+"""The variables of a task: one record for each, on every path between the task and the FMU."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.checks import check_mapping, number_of
+from fmugym.declared.entries import Entry
+from fmugym.declared.expressions import Expression
+from fmugym.declared.quantities import IDENTITY, Conversion, conversion_between
+from fmugym.distributions import Choice, Normal, Uniform, as_distribution, is_distribution
+from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.task.interface import checked, input_variable, output_variable
+
+__all__ = [
+    "VARIABLE_KEYS",
+    "Record",
+    "Records",
+    "converted",
+    "inverted",
+    "is_plain",
+    "number",
+    "number_or_distribution",
+    "start_value",
+]
+
+VARIABLE_KEYS: Final = ("name", "unit", "min", "max", "levels", "description")
+"""The keys of a variable."""
+
+
+def number(entry: Entry) -> float:
+    """A number of a task: a number, or a text with an expression of constants, such as ``pi / 2``.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    with entry.placing():
+        if isinstance(entry.value, str):
+            return Expression.parse(entry.value).constant()
+        return number_of(entry.name, entry.value)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A variable as a task sees it.
+
+    Attributes:
+        alias: Its name in the task.
+        entry: Where it is declared or used first.
+        variable: The FMU's variable; None for an action that only expressions read.
+        unit: The unit of the task; None if neither the task nor the FMU gives one.
+        conversion: From the FMU's unit to that of the task.
+        low, high: The limits in the unit of the task; infinite where there are none.
+        levels: The values that an action chooses from; empty for a continuous one.
+    """
+
+    alias: str
+    entry: Entry
+    variable: Variable | None
+    unit: str | None
+    conversion: Conversion
+    low: float
+    high: float
+    levels: tuple[float, ...] = ()
+
+    @property
+    def fmu_name(self) -> str:
+        """The name in the FMU.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        if self.variable is None:
+            raise self.entry.error(
+                f"{self.alias!r} is no variable of the FMU; give the FMU's name of it: "
+                f'{self.alias} = {{ name = "..." }}'
+            )
+        return self.variable.name
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether both limits are finite."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+
+class Records:
+    """The variables by their aliases; a variable of the FMU needs no declaration to be used.
+
+    Args:
+        root: The table of all keys.
+        description: The FMU's model description.
+    """
+
+    def __init__(self, root: Entry, description: ModelDescription) -> None:
+        self._root, self._description = root, description
+        section = root.child("variables")
+        declared = {} if section.value is None else section.items()
+        self._records = {alias: self._declared(entry) for alias, entry in declared.items()}
+
+    def names(self) -> list[str]:
+        """The aliases, and the names of the FMU's variables."""
+        return [*self._records, *self._description.variables]
+
+    def get(self, alias: str) -> Record | None:
+        """The record of an alias or of a variable of the FMU; None if there is none."""
+        if alias not in self._records and alias in self._description.variables:
+            entry = Entry(None, ("variables", alias), self._root.sources)
+            self._records[alias] = self._record(alias, entry, self._description.variables[alias])
+        return self._records.get(alias)
+
+    def __getitem__(self, alias: str) -> Record:
+        record = self.get(alias)
+        if record is None:
+            raise unknown_name("variable", alias, self.names())
+        return record
+
+    def find(self, entry: Entry, name: str, role: str, others: Sequence[str] = ()) -> Record:
+        """The record of a name.
+
+        Args:
+            entry: Where the name stands.
+            name: The name.
+            role: What it should name, for the error.
+            others: More names to suggest.
+
+        Raises:
+            ConfigError: If there is none, with the nearest name.
+        """
+        record = self.get(name)
+        if record is None:
+            raise entry.error(unknown_name(role, name, [*others, *self.names()]))
+        return record
+
+    def check_input(self, entry: Entry, record: Record) -> None:
+        """Check that a variable can be written before each step; one without the FMU's name can.
+
+        Raises:
+            ConfigError: If it cannot.
+        """
+        if record.variable is not None:
+            with entry.placing():
+                input_variable(self._description, record.fmu_name)
+
+    def check_output(self, entry: Entry, name: str) -> None:
+        """Check that a variable can be read after each step.
+
+        Raises:
+            ConfigError: If it cannot.
+        """
+        with entry.placing():
+            output_variable(self._description, self[name].fmu_name)
+
+    def _declared(self, entry: Entry) -> Record:
+        table, alias = entry.table(VARIABLE_KEYS), entry.name
+        if "name" not in table:
+            return self._record(alias, entry, self._description.variables.get(alias))
+        with table["name"].placing():
+            return self._record(alias, entry, self._description.variable(table["name"].text()))
+
+    def _record(self, alias: str, entry: Entry, variable: Variable | None) -> Record:
+        own = None if variable is None else variable.unit
+        unit = entry.child("unit")
+        wanted = own if unit.value is None else unit.text()
+        with unit.placing():
+            conversion = conversion_between(own, wanted, self._description.units)
+        low, high = _limits(entry, variable, conversion)
+        return Record(alias, entry, variable, wanted, conversion, low, high, _levels(entry))
+
+
+def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
+    """The limits of the task, or else those of the FMU."""
+    minimum, maximum = entry.child("min"), entry.child("max")
+    low, high = _own_limits(variable, conversion)
+    low = low if minimum.value is None else number(minimum)
+    high = high if maximum.value is None else number(maximum)
+    if not low < high and not (minimum.value is None and maximum.value is None):
+        raise entry.error(f"min must be below max, got {low} and {high}")
+    return low, high
+
+
+def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
+    if variable is None:
+        return -math.inf, math.inf
+    if variable.kind == "boolean":
+        return 0.0, 1.0
+    values: list[float] = [value for _, value in variable.items]
+    limits = (min(values), max(values)) if values else (variable.minimum, variable.maximum)
+    low, high = sorted(map(conversion, limits))
+    return low, high
+
+
+def _levels(entry: Entry) -> tuple[float, ...]:
+    levels = entry.child("levels")
+    if levels.value is None:
+        return ()
+    values = tuple(number(level) for level in levels.elements())
+    if len(set(values)) < max(2, len(values)) or not all(map(math.isfinite, values)):
+        raise levels.error(f"expected two or more different numbers, got {shown(levels.value)}")
+    return values
+
+
+def converted(conversion: Conversion, text: str) -> str:
+    """Code that turns a value of the FMU into one of the task."""
+    if conversion.factor != 1.0:
+        text = f"({text} * {conversion.factor!r})"
+    return text if conversion.offset == 0.0 else f"({text} + {conversion.offset!r})"
+
+
+def inverted(conversion: Conversion, text: str) -> str:
+    """Code that turns a value of the task into one of the FMU."""
+    if conversion.offset != 0.0:
+        text = f"({text} - {conversion.offset!r})"
+    return text if conversion.factor == 1.0 else f"({text} / {conversion.factor!r})"
+
+
+def is_plain(record: Record) -> bool:
+    """Whether the values of the task are those of the FMU."""
+    return record.conversion == IDENTITY and not record.levels
+
+
+def number_or_distribution(entry: Entry) -> Any:
+    """A number, or a distribution, whose numbers may be texts with expressions of constants.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    if is_distribution(entry.value):
+        return entry.value
+    if not isinstance(entry.value, Mapping):
+        return number(entry)
+    with entry.placing():
+        items = check_mapping(entry.name, entry.value)
+        for name in items.keys() - {"distribution", "values", "probabilities"}:
+            items[name] = number(entry.child(name))
+        return as_distribution(entry.name, items)
+
+
+def start_value(record: Record, entry: Entry) -> Any:
+    """The value of a parameter: a number or distribution in the unit of the FMU, or a text.
+
+    Raises:
+        ConfigError: If the variable cannot be set, or the value does not fit it.
+    """
+    name, variable = record.fmu_name, record.variable
+    if variable is None or not variable.settable_at_start:
+        raise entry.error(f"{name!r} cannot be set at the start of an episode")
+    if isinstance(entry.value, str) and (variable.items or variable.kind == "string"):
+        value: Any = entry.value
+    else:
+        value = number_or_distribution(entry)
+    with entry.placing():
+        value = _in_unit_of_fmu(record.conversion, value)
+        return value if variable.kind == "string" else checked(variable, value)
+
+
+def _in_unit_of_fmu(conversion: Conversion, value: Any) -> Any:
+    """Convert a number or a distribution.
+
+    Raises:
+        ConfigError: If such a distribution cannot be converted.
+    """
+    if conversion == IDENTITY or isinstance(value, str):
+        return value
+    if not is_distribution(value):
+        return conversion.inverse(value)
+    match value:
+        case Uniform():
+            low, high = sorted(map(conversion.inverse, (value.low, value.high)))
+            return Uniform(low, high)
+        case Normal():
+            low, high = sorted(map(conversion.inverse, (value.low, value.high)))
+            std = value.std / abs(conversion.factor)
+            return Normal(conversion.inverse(value.mean), std, low, high)
+        case Choice():
+            return Choice([*map(conversion.inverse, value.values)], value.probabilities)
+    raise ConfigError(
+        f"{shown(value)} cannot be converted to the FMU's unit; leave 'unit' out and give it in "
+        "the FMU's unit"
+    )

@@ -1,0 +1,375 @@
+"""Tables: constant arrays that hooks look values up in, by an index or by interpolation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import CellType, CodeType, FunctionType, ModuleType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.vector.hooks.graph import Cell, Graph
+from fmugym.vector.hooks.program import UntraceableError
+from fmugym.vector.hooks.symbols import (
+    Symbols,
+    Unboxed,
+    as_symbols,
+    each,
+    graph_of,
+    handlers,
+    has_symbols,
+    lift,
+)
+
+__all__ = ["FUNCTIONS", "Table", "is_table", "tables_in"]
+
+_MOST_VALUES: Final = 4096
+"""The most elements of a table."""
+
+_MOST_CHOICES: Final = 64
+"""The most values that are not constant among which an index chooses."""
+
+_INTEGER: Final = np.dtype(np.int64)
+
+
+class Table(np.ndarray[Any, Any]):
+    """An array that symbols may index. Hooks find it in the place of a constant array of theirs.
+
+    For everything else it is the same array: it has the same memory.
+    """
+
+    def __getitem__(self, key: Any) -> Any:
+        if has_symbols(key):
+            return graph_of(key).patched(self._look_up, look_up, (key,), {})
+        return super().__getitem__(key)
+
+    def _look_up(self, graph: Graph, function: Any, key: Any) -> Any:
+        return function(lift(graph, self.view(np.ndarray)), key)
+
+    def __array_function__(self, function: Any, types: Any, args: Any, keywords: Any) -> Any:
+        if any(issubclass(one, Symbols | Unboxed) for one in types):
+            return NotImplemented
+        return super().__array_function__(function, types, args, keywords)
+
+    def dot(self, other: Any, out: Any = None) -> Any:
+        """Do what the method of an array does."""
+        return np.dot(self, other, out)
+
+
+def is_table(value: Any) -> bool:
+    """Whether a value is an array that hooks may index with values."""
+    if type(value) is not np.ndarray or value.dtype.kind not in "biuf":
+        return False
+    return value.dtype.itemsize <= 8 and 0 < value.size <= _MOST_VALUES
+
+
+# Indexing
+
+
+def look_up(table: Symbols, key: Any) -> Symbols:
+    """Index an array with values, as numpy does: integers for some axes, slices for the others."""
+    keys = _expanded(key if isinstance(key, tuple) else (key,), table.ndim)
+    chosen = [axis for axis, part in enumerate(keys) if not isinstance(part, slice)]
+    sliced = table.cells[tuple(k if isinstance(k, slice) else slice(None) for k in keys)]
+    moved = np.moveaxis(sliced, chosen, range(len(chosen)))
+    lengths, rest = moved.shape[: len(chosen)], moved.shape[len(chosen) :]
+    index = _flat_index(table.graph, [keys[axis] for axis in chosen], lengths)
+    columns = moved.reshape(math.prod(lengths), -1)
+    parts = [_column(table, columns[:, i], index.cells) for i in range(columns.shape[1])]
+    found = np.stack(parts, axis=-1).reshape((*index.shape, *rest))
+    is_one_block = chosen == list(range(chosen[0], chosen[0] + len(chosen)))
+    if is_one_block:  # otherwise numpy leaves the axes of the index in front
+        axes = range(index.ndim)
+        found = np.moveaxis(found, axes, range(chosen[0], chosen[0] + index.ndim))
+    return table.like(found)
+
+
+def _expanded(keys: tuple[Any, ...], ndim: int) -> list[Any]:
+    """A key for each axis: a slice or integers."""
+    places = [place for place, key in enumerate(keys) if key is Ellipsis]
+    missing = [slice(None)] * (ndim - len(keys) + len(places))
+    at = places[0] if places else len(keys)
+    expanded = [*keys[:at], *missing, *keys[at + 1 :]]
+    if len(expanded) != ndim or not all(map(_is_integer_or_slice, expanded)):
+        raise UntraceableError("it indexes an array with values in a way that cannot be followed")
+    return expanded
+
+
+def _is_integer_or_slice(key: Any) -> bool:
+    if isinstance(key, slice):
+        return not has_symbols([key.start, key.stop, key.step])
+    return key is not None and not isinstance(key, bool) and _kind_of(key) in "iu"
+
+
+def _kind_of(key: Any) -> str:
+    return key.dtype.kind if isinstance(key, Symbols) else np.asarray(key).dtype.kind
+
+
+def _flat_index(graph: Graph, keys: Sequence[Any], lengths: Sequence[int]) -> Symbols:
+    """The number of the element in the order of memory. A key outside of its axis is an error."""
+    if len(keys) == 1:
+        return as_symbols(graph, keys[0]).cast(_INTEGER)
+    strides = [math.prod(lengths[axis + 1 :]) for axis in range(len(lengths))]
+    offsets = [
+        look_up(lift(graph, np.arange(length) * stride), as_symbols(graph, key).cast(_INTEGER))
+        for key, length, stride in zip(keys, lengths, strides, strict=True)
+    ]
+    flat: Any = offsets[0]
+    for offset in offsets[1:]:
+        flat = flat + offset
+    return flat  # type: ignore[no-any-return]
+
+
+def _column(table: Symbols, column: npt.NDArray[Any], index: npt.NDArray[Any]) -> Any:
+    graph = table.graph
+    values = [graph.value(cell) for cell in column]
+    if any(value is None for value in values):
+        return each(lambda cell: _chosen(graph, cell, list(column)), index)
+    constants = np.array(values, table.dtype)
+    return each(lambda cell: _taken(graph, cell, constants), index)
+
+
+def _taken(graph: Graph, index: Cell, constants: npt.NDArray[Any]) -> Cell:
+    number = _place_table(graph, constants)
+    return graph.compute("take", number, (index,), constants.dtype, constants.__getitem__)
+
+
+def _chosen(graph: Graph, index: Cell, cells: Sequence[Cell]) -> Cell:
+    """One of some values; an index outside of their number is an error when the program runs."""
+    if len(cells) > _MOST_CHOICES:
+        raise UntraceableError(f"an index chooses between more than {_MOST_CHOICES} values")
+    place = _taken(graph, index, np.arange(len(cells)))
+    result = cells[0]
+    for number, cell in enumerate(cells[1:], 1):
+        operands = place, graph.constant(number, _INTEGER)
+        result = graph.choose(graph.apply(np.equal, operands, np.dtype(np.bool_)), cell, result)
+    return result
+
+
+def _place_table(graph: Graph, table: npt.NDArray[Any]) -> Any:
+    key = table.dtype.char, table.tobytes()
+    graph.tables.setdefault(key, table)
+    return key
+
+
+def _take(a: Any, indices: Any, axis: Any = None, out: Any = None, mode: Any = "raise") -> Any:
+    graph = graph_of(a, indices)
+    table = as_symbols(graph, a)
+    if not has_symbols(indices):
+        return table.like(np.take(table.cells, indices, axis))
+    if out is not None or mode != "raise":
+        raise UntraceableError("it uses an argument of numpy.take")
+    index = as_symbols(graph, indices)
+    if axis is None:
+        return look_up(table.like(table.cells.ravel()), index)
+    return look_up(table, (slice(None),) * (axis % table.ndim) + (index,))
+
+
+def _take_along_axis(arr: Any, indices: Any, axis: Any = -1) -> Any:
+    graph = graph_of(arr, indices)
+    table, index = as_symbols(graph, arr), as_symbols(graph, indices).cast(_INTEGER)
+    if axis is None:
+        return look_up(table.like(table.cells.ravel()), index)
+    columns = list(np.moveaxis(table.cells, axis, 0))
+    rows = [
+        each(lambda at, *cells: _chosen(graph, at, cells), row, *columns)
+        for row in np.moveaxis(index.cells, axis, 0)
+    ]
+    return table.like(np.moveaxis(np.stack(rows), 0, axis))
+
+
+def _choose(a: Any, choices: Any, out: Any = None, mode: Any = "raise") -> Any:
+    if out is not None or mode != "raise":
+        raise UntraceableError("it uses an argument of numpy.choose")
+    graph = graph_of(a, choices)
+    parts = [as_symbols(graph, choice) for choice in choices]
+    dtype = np.result_type(*(part.dtype for part in parts))
+    index = as_symbols(graph, a).cast(_INTEGER)
+    checked: Any = np.where(index < 0, len(parts), index)  # numpy.choose knows no negative index
+    cells = [part.cast(dtype).cells for part in parts]
+    chosen = each(lambda at, *values: _chosen(graph, at, values), checked.cells, *cells)
+    return Symbols(graph, chosen, dtype)
+
+
+# Searching
+
+
+def _searchsorted(a: Any, v: Any, side: Any = "left", sorter: Any = None) -> Any:
+    """Halve the part of a table that a value belongs to, until nothing is left of it."""
+    if has_symbols(a) or sorter is not None:
+        raise UntraceableError("numpy.searchsorted has a table that is not constant, or a sorter")
+    graph, table = graph_of(v), np.asarray(a)
+    value = as_symbols(graph, v)
+    if np.any(table != table):
+        raise UntraceableError("numpy.searchsorted has a table with a NaN")
+    dtype = np.promote_types(table.dtype, value.dtype)
+    value, table = value.cast(dtype), table.astype(dtype)
+    is_before = np.less if side == "left" else np.less_equal
+    place: Any = np.zeros_like(value, np.int64)
+    for step in (1 << bit for bit in reversed(range(len(table).bit_length()))):
+        further = place + step
+        known = look_up(lift(graph, table), np.minimum(further, len(table)) - 1)
+        place = np.where((further <= len(table)) & is_before(known, value), further, place)
+    return np.where(value != value, len(table), place)  # a NaN belongs behind all numbers
+
+
+def _digitize(x: Any, bins: Any, right: bool = False) -> Any:
+    edges = np.asarray(bins)
+    side = "left" if right else "right"
+    if len(edges) > 1 and edges[0] > edges[-1]:
+        other = "right" if right else "left"
+        return len(edges) - _searchsorted(edges[::-1], x, other)
+    return _searchsorted(edges, x, side)
+
+
+# Interpolation
+
+
+def _interp(
+    x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None
+) -> Symbols:
+    graph = graph_of(x, xp, fp, left, right, period)
+    xp, fp, left, right, period = (_known(graph, part) for part in (xp, fp, left, right, period))
+    xs, ys = (np.asarray(part, np.float64) for part in (xp, fp))
+    if xs.ndim != 1 or xs.shape != ys.shape or not xs.size:
+        raise ValueError("fp and xp are not of the same length")
+    if period is not None:
+        x, xs, ys, left, right = (*_repeated(x, xs, ys, abs(period)), None, None)
+    ends = [ys[0] if left is None else left, ys[-1] if right is None else right]
+    number = _place_table(graph, np.concatenate([xs, ys, np.array(ends, np.float64)]))
+    floats = as_symbols(graph, x).cast(np.float64)
+
+    def fold(values: Any) -> Any:
+        return np.interp(values, xs, ys, left, right)
+
+    cells = each(
+        lambda cell: graph.compute("interpolate", number, (cell,), np.dtype(np.float64), fold),
+        floats.cells,
+    )
+    return Symbols(graph, cells, np.float64)
+
+
+def _known(graph: Graph, part: Any) -> Any:
+    """The numbers of symbols that are all constants; anything else as it is."""
+    if not has_symbols(part):
+        return part
+    symbols = as_symbols(graph, part)
+    values = [graph.value(cell) for cell in symbols.cells.reshape(-1)]
+    if any(value is None for value in values):
+        raise UntraceableError("numpy.interp has a table that is not constant")
+    return np.array(values, symbols.dtype).reshape(symbols.shape)
+
+
+def _repeated(x: Any, xs: Any, ys: Any, period: float) -> tuple[Any, Any, Any]:
+    """The argument and the table of ``numpy.interp`` for values that repeat."""
+    xs = xs % period
+    order = np.argsort(xs)
+    xs, ys = xs[order], ys[order]
+    longer = np.concatenate([xs[-1:] - period, xs, xs[:1] + period])
+    return x % period, longer, np.concatenate([ys[-1:], ys, ys[:1]])
+
+
+handlers.update(index=look_up)
+
+FUNCTIONS: Final[Mapping[Any, Any]] = {
+    np.take: _take,
+    np.take_along_axis: _take_along_axis,
+    np.choose: _choose,
+    np.searchsorted: _searchsorted,
+    np.digitize: _digitize,
+    np.interp: _interp,
+}
+"""The functions of numpy that look values up."""
+
+
+# Where hooks find their tables
+
+
+@contextmanager
+def tables_in(env: Any) -> Iterator[None]:
+    """Let the functions of an environment find a ``Table`` in the place of each constant array.
+
+    These are the arrays that the methods of its class, and functions that these call, refer to by
+    a global name, as an attribute of a module or as a variable of a surrounding function.
+    """
+    functions = _functions_of(env)
+    places = [place for function in functions for place in _places_of(function)]
+    held = [(place, name, place[name]) for place, name in places if is_table(place[name])]
+    for place, name, value in held:
+        place[name] = value.view(Table)
+    try:
+        yield
+    finally:
+        for place, name, value in held:
+            place[name] = value
+
+
+class _Variable(dict[str, Any]):
+    """The variable of a closure as a dict of one entry."""
+
+    def __init__(self, cell: CellType) -> None:
+        super().__init__({"": cell.cell_contents})
+        self._cell = cell
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._cell.cell_contents = value
+
+
+_OURS: Final = ("fmugym", "gymnasium", "numpy")
+
+
+def _functions_of(env: Any) -> list[FunctionType]:
+    """The functions of a class, and those that they call by name, without those of packages."""
+    classes = [cls for cls in type(env).__mro__ if not _is_foreign(cls.__module__)]
+    waiting = [value for cls in classes for value in vars(cls).values()]
+    waiting += vars(env).values()
+    found: dict[int, FunctionType] = {}
+    while waiting:
+        function = _unwrapped(waiting.pop())
+        known = not isinstance(function, FunctionType) or id(function) in found
+        if known or _is_foreign(function.__module__ or ""):
+            continue
+        found[id(function)] = function
+        waiting += [place[name] for place, name in _places_of(function)]
+    return list(found.values())
+
+
+def _is_foreign(module: str) -> bool:
+    return module.partition(".")[0] in _OURS and not module.startswith("fmugym.envs")
+
+
+def _unwrapped(value: Any) -> Any:
+    """The function of a property, a static method and the like."""
+    for name in ("fget", "__func__", "func", "__wrapped__"):
+        inner = getattr(value, name, None) if not isinstance(value, FunctionType) else None
+        value = value if inner is None else inner
+    return value
+
+
+def _places_of(function: FunctionType) -> list[tuple[dict[str, Any], str]]:
+    """Where a function finds what is not local: dicts and names in them."""
+    names = set(_names_in(function.__code__))
+    spaces = [function.__globals__]
+    modules = [function.__globals__.get(name) for name in names]
+    spaces += [
+        vars(one)
+        for one in modules
+        if isinstance(one, ModuleType) and not _is_foreign(one.__name__)
+    ]
+    places = [(space, name) for space in spaces for name in names if name in space]
+    for cell in function.__closure__ or ():
+        try:
+            places.append((_Variable(cell), ""))
+        except ValueError:  # the variable has no value yet
+            continue
+    return places
+
+
+def _names_in(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names_in(constant)

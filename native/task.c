@@ -1,0 +1,22 @@
+#include "task.h"
+
+#include "instances.h"
+
+size_t note_status(Task *task, size_t index, Status status) {
+    task->pool->settings.status[index] = (int8_t)status;
+    if (status <= STATUS_WARNING) {
+        return 0;
+    }
+    health_count_fault(task->pool, &task->pool->instances[index], status);
+    return 1;
+}
+
+void write_observation(const Pool *pool, size_t index, float *observations) {
+    const Settings *s = &pool->settings;
+    const double *value = s->output_values + index;
+    float *row = observations + index * s->num_observed;
+
+    for (size_t i = 0; i < s->num_observed; i++, value += s->count) {
+        row[i] = (float)*value;
+    }
+}

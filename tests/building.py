@@ -1,0 +1,65 @@
+"""Compile the libraries of test FMUs, each once for all processes of a test run."""
+
+import atexit
+import functools
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import fmpy
+
+HERE = Path(__file__).parent
+FOLDER = "FMUGYM_TESTS_FOLDER"
+"""The environment variable with the folder that the processes of a test run share."""
+
+FLAGS = ("-shared", "-fPIC", "-O1", "-g0", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror")
+FLAGS += ("-Wno-unused-parameter", "-Wno-unused-result")
+
+
+@functools.cache
+def compiler():
+    """The command of a C compiler: the system's, which is faster, or else zig's."""
+    return ["cc"] if shutil.which("cc") else [sys.executable, "-m", "ziglang", "cc"]
+
+
+@functools.cache
+def library(*sources, flags=(), stubs=None):
+    """The bytes of a shared library; the first call takes a few tenths of a second.
+
+    Args:
+        sources: The C files, relative to this folder.
+        flags: More arguments of the compiler.
+        stubs: The text of the file that the sources include as ``STUBS``.
+    """
+    digest = hashlib.sha256(repr((sources, flags, stubs)).encode()).hexdigest()[:16]
+    path = shared_folder() / f"{digest}{fmpy.sharedLibraryExtension}"
+    if not path.exists():
+        _compile(path, sources, flags, stubs)
+    return path.read_bytes()
+
+
+def _compile(path, sources, flags, stubs):
+    """Compile elsewhere and move the result, for another process may do the same."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        built = Path(folder) / path.name
+        command = [*compiler(), *FLAGS, *flags]
+        if stubs is not None:
+            (Path(folder) / "stubs.h").write_text(stubs)
+            command += [f"-I{folder}", '-DSTUBS="stubs.h"']
+        command += [*(HERE / source for source in sources), "-o", built, "-lm", "-lpthread"]
+        subprocess.run(command, check=True)
+        built.replace(path)
+
+
+@functools.cache
+def shared_folder():
+    """The folder of the test run; outside of one, a folder of this process."""
+    if FOLDER in os.environ:
+        return Path(os.environ[FOLDER])
+    folder = tempfile.mkdtemp(prefix="fmugym-tests-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)

@@ -1,0 +1,480 @@
+"""Tasks that are declared in files: equal to classes, compiled, and refused with good errors."""
+
+import multiprocessing
+import pickle
+import re
+import textwrap
+import tomllib
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import fmugym
+from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
+from fmugym.declared.declarations import BUILT_IN
+from fmugym.declared.expressions import CONSTANTS
+from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.task import KEYS
+from fmugym.declared.variables import VARIABLE_KEYS
+from fmugym.errors import TaskError
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+DOCS = Path(__file__).parent.parent / "docs"
+
+TWINS = {
+    "cart_pole": ("fmugym/CartPole-v0", 0.0),
+    "pendulum": ("fmugym/Pendulum-v0", 1e-9),
+}
+"""By file: the id of the equal class, and a bound of the difference of rewards.
+
+The class rounds as Gymnasium does, by the C library's ``powf``, when it steps alone. A declared
+task gives one environment the rewards of many, which round correctly.
+"""
+
+each_file = pytest.mark.parametrize("name", TWINS)
+
+
+def same(first, second):
+    """Compare two results of reset or step; infos may be dicts, with arrays of arrays."""
+    np.testing.assert_equal(plain(first), plain(second))
+
+
+def plain(value):
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(plain, value))
+    return list(value) if isinstance(value, np.ndarray) and value.dtype == object else value
+
+
+class TestExamples:
+    @each_file
+    def test_one_environment_equals_the_class(self, name):
+        twin_id, tolerance = TWINS[name]
+        env = gymnasium.make("fmugym/FMU-v0", config=str(EXAMPLES / f"{name}.toml"))
+        twin = gymnasium.make(twin_id)
+        assert env.action_space == twin.action_space
+        assert env.observation_space == twin.observation_space
+        env.action_space.seed(0)
+        for seed in range(4):
+            same(env.reset(seed=seed), twin.reset(seed=seed))
+            ended = False
+            while not ended:
+                action = env.action_space.sample()
+                (seen, reward, *ends), (expected, other, *others) = (
+                    env.step(action),
+                    twin.step(action),
+                )
+                same(seen, expected)
+                assert ends[:2] == others[:2]
+                assert abs(reward - other) <= tolerance
+                ended = any(ends[:2])
+        env.close()
+        twin.close()
+
+    @each_file
+    @pytest.mark.parametrize("mode", ["next_step", "same_step"])
+    def test_a_vector_environment_equals_that_of_the_class(self, name, mode):
+        config = str(EXAMPLES / f"{name}.toml")
+        options = {"num_envs": 5, "autoreset_mode": mode}
+        envs = gymnasium.make_vec("fmugym/FMU-v0", config=config, hooks="compiled", **options)
+        twins = gymnasium.make_vec(TWINS[name][0], **options)
+        envs.action_space.seed(0)
+        same(envs.reset(seed=7), twins.reset(seed=7))
+        for _ in range(230):
+            actions = envs.action_space.sample()
+            same(envs.step(actions), twins.step(actions))
+        envs.close()
+        twins.close()
+
+    @each_file
+    def test_every_hook_is_compiled(self, name):
+        make = partial(fmugym.load, EXAMPLES / f"{name}.toml")
+        envs = FMUVectorEnv(make, 2, hooks="compiled")
+        assert envs._engine._task.left == {}
+        envs.close()
+
+    @each_file
+    def test_a_file_survives_writing(self, name, tmp_path):
+        task = Task.read(EXAMPLES / f"{name}.toml")
+        (tmp_path / "folder").mkdir()
+        task.write(tmp_path / "folder" / "copy.toml")
+        assert Task.read(tmp_path / "folder" / "copy.toml") == task
+
+
+TANK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.02,
+    "episode_length": "1s",
+    "variables": {
+        "angle": {"name": "q", "unit": "deg", "min": -200, "max": 200},
+        "rate": {"name": "q_dot", "unit": "rpm"},
+        "torque": {"name": "tau", "unit": "N.mm", "min": -10, "max": 10},
+    },
+    "parameters": {"q_0": {"distribution": "uniform", "low": 0.5, "high": 1.0}, "m": 0.06},
+    "agent": {"actions": ["torque"], "observations": ["angle", "rate", "error", "total"]},
+    "memory": {
+        "target": {"start": Uniform(-10, 10), "min": -10, "max": 10},
+        "total": {"start": 0, "update": "total + dt * error"},
+    },
+    "expressions": {"error": "angle - target"},
+    "reward": {
+        "near": {"expr": "1 / (1 + abs(error))", "weight": 2},
+        "calm": "-abs(torque - previous(torque)) if step > 1 else 0",
+    },
+    "costs": {"heat": {"expr": "torque**2 * dt_h", "limit": 10}, "fast": "abs(rate) > 5"},
+    "terminated": "not (-170 < angle < 170)",
+}
+
+
+def changed(**sections):
+    """``TANK`` with other sections."""
+    return TANK | sections
+
+
+def test_units_reach_observations_actions_and_rewards():
+    env = fmugym.load(TANK)
+    observation, info = env.reset(seed=1)
+    assert observation[0] == np.float32(env.state[0] * 180 / np.pi)
+    np.testing.assert_array_equal(env.action_space.high, np.float32([10]))
+    assert info["reward_terms"] == {"near": 0.0, "calm": 0.0}
+    assert info["cost"] == 0.0
+    observation, reward, _, _, info = env.step(np.float32([5]))
+    assert env.inputs == (pytest.approx(0.005),)
+    rate = env.state[1] * 60 / (2 * np.pi)
+    assert observation[1] == pytest.approx(rate)
+    error = env.state[0] * 180 / np.pi - env.variables["target"]
+    assert reward == pytest.approx(2 / (1 + abs(error)))
+    assert info["reward_terms"]["near"] == pytest.approx(reward)
+    assert info["costs"]["heat"] == pytest.approx(25 * 0.02 / 3600)
+    assert info["costs"]["fast"] == float(abs(rate) > 5)
+    assert info["cost"] == info["costs"]["heat"] + info["costs"]["fast"]
+    assert env.cost_limits == {"heat": 10.0}
+    env.close()
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
+    envs = FMUVectorEnv(partial(fmugym.load, TANK), 3, hooks=hooks, autoreset_mode="same_step")
+    singles = [fmugym.load(TANK) for _ in range(3)]
+    observations, infos = envs.reset(seed=5)
+    for i, env in enumerate(singles):
+        same(env.reset(seed=5 + i)[0], observations[i])
+    envs.action_space.seed(3)
+    for _ in range(60):
+        actions = envs.action_space.sample()
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        for i, env in enumerate(singles):
+            seen, reward, end, cut, info = env.step(actions[i])
+            assert (reward, end, cut) == (rewards[i], terminated[i], truncated[i])
+            if end or cut:
+                same(seen, infos["final_obs"][i])
+                seen, _ = env.reset()
+            else:
+                assert info["cost"] == infos["cost"][i]
+                assert info["reward_terms"]["calm"] == infos["reward_terms"]["calm"][i]
+            same(seen, observations[i])
+    for env in (envs, *singles):
+        env.close()
+
+
+def test_all_hooks_of_a_task_with_memory_and_costs_are_compiled():
+    envs = FMUVectorEnv(partial(fmugym.load, TANK), 2, hooks="compiled")
+    assert envs._engine._task.left == {}
+    envs.close()
+
+
+def test_an_expression_writes_an_input():
+    task = changed(
+        variables={"gain": {"min": 0, "max": 1}},
+        inputs={"tau": "-0.001 * gain * q_dot"},
+        agent={"actions": "gain", "observations": ["q", "q_dot"]},
+        memory={},
+        expressions={},
+        reward=1,
+        costs={},
+        terminated=False,
+    )
+    env = fmugym.load(task)
+    env.reset(seed=0)
+    env.step([1.0])
+    rate = env.state[1]
+    env.step([0.5])
+    assert env.inputs == (-0.0005 * rate,)
+    env.close()
+
+
+def test_levels_of_two_actions():
+    task = {
+        "fmu": {"bundled": "DoublePendulum"},
+        "variables": {
+            "tau1": {"levels": [-1, 0, 1]},
+            "other": {"name": "tau2", "levels": [0.5, -0.5]},
+        },
+        "agent": {"actions": ["tau1", "other"], "observations": ["q1"]},
+        "time_step": "20ms",
+        "reward": "previous(other) + other",
+    }
+    env = fmugym.load(task)
+    assert env.action_space == gymnasium.spaces.MultiDiscrete([3, 2])
+    env.reset(seed=0)
+    assert env.step(np.array([2, 0]))[1] == 1.0  # what came before is the first element
+    assert env.inputs == (1.0, 0.5)
+    assert env.step(np.array([0, 1]))[1] == 0.0
+    assert env.inputs == (-1.0, -0.5)
+    env.close()
+
+
+def write(folder, name, text):
+    path = folder / name
+    path.write_text(textwrap.dedent(text), encoding="utf-8")
+    return path
+
+
+SMALL = """\
+    fmu = { bundled = "Pendulum" }
+    time_step = "20ms"
+    reward = "-abs(q)"
+    [variables]
+    tau = { min = -1, max = 1 }
+    [agent]
+    actions = ["tau"]
+    observations = ["q", "q_dot"]
+    """
+
+
+class TestFiles:
+    def test_a_file_extends_another_in_another_folder(self, tmp_path):
+        (tmp_path / "base").mkdir()
+        fmu = tmp_path / "base" / "pendulum.fmu"
+        fmu.write_bytes(fmugym.bundled_fmu("Pendulum").read_bytes())
+        base = SMALL.replace('{ bundled = "Pendulum" }', '"pendulum.fmu"')
+        write(tmp_path / "base", "base.toml", base)
+        path = write(
+            tmp_path,
+            "own.toml",
+            """\
+            extends = "base/base.toml"
+            [variables]
+            tau = { max = 0.5 }
+            [parameters]
+            m = { distribution = "uniform", low = 0.05, high = 0.06 }
+            """,
+        )
+        env = fmugym.load(path)
+        assert env.fmu.path == fmu
+        np.testing.assert_array_equal(env.action_space.low, [-1])
+        np.testing.assert_array_equal(env.action_space.high, [0.5])
+        assert env.config.model_parameters == {"m": Uniform(0.05, 0.06)}
+        env.task.write(tmp_path / "whole.toml")
+        assert Task.read(tmp_path / "whole.toml") == env.task
+        assert 'fmu = "base/pendulum.fmu"' in (tmp_path / "whole.toml").read_text()
+        env.close()
+
+    def test_a_mistake_in_the_extended_file_is_found_there(self, tmp_path):
+        write(tmp_path, "base.toml", SMALL.replace('"-abs(q)"', '"-abs(qq)"'))
+        path = write(tmp_path, "own.toml", 'extends = "base.toml"\n')
+        with pytest.raises(TaskError, match=r"^base\.toml, line 3, reward: .*'qq'"):
+            fmugym.load(path)
+
+    def test_files_that_extend_each_other_are_refused(self, tmp_path):
+        path = write(tmp_path, "a.toml", 'extends = "b.toml"\n')
+        write(tmp_path, "b.toml", '\nextends = "a.toml"\n')
+        with pytest.raises(TaskError, match=r"b\.toml, line 2, extends: .*circle"):
+            fmugym.load(path)
+
+    def test_a_later_version_is_refused(self, tmp_path):
+        path = write(tmp_path, "a.toml", "version = 99\n" + textwrap.dedent(SMALL))
+        with pytest.raises(TaskError, match=r"line 1, version: .*99"):
+            fmugym.load(path)
+
+    def test_objects_that_cannot_be_written_are_named(self, tmp_path):
+        class Own:
+            def sample(self, rng):
+                return 1.0
+
+        task = Task.from_dict(changed(parameters={"m": Own()}))
+        with pytest.raises(ConfigError, match=r"parameters\.m .*Own"):
+            task.write(tmp_path / "a.toml")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_distributions_are_written(self, tmp_path):
+        task = Task.from_dict(TANK)
+        task.write(tmp_path / "a.toml")
+        assert Task.read(tmp_path / "a.toml") == task
+
+    def test_an_existing_file_stays(self, tmp_path):
+        path = write(tmp_path, "a.toml", SMALL)
+        with pytest.raises(FileExistsError):
+            Task.read(path).write(path)
+
+
+MISTAKES = {
+    "misspelt key": ('reward = "-abs(q)"', 'reword = "1"', "line 3", "'reward'"),
+    "misspelt alias": ('["q", "q_dot"]', '["q", "q_dit"]', "line 8", "'q_dot'"),
+    "misspelt action": ('["tau"]', '["tua"]', "line 7", "'tau'"),
+    "misspelt name": ('"-abs(q)"', '"-abs(q_dto)"', "line 3", "column 6"),
+    "misspelt function": ('"-abs(q)"', '"-bas(q)"', "line 3", "'abs'"),
+    "no expression": ('"-abs(q)"', '"-abs(q"', "line 3", "column 5"),
+    "attribute": ('"-abs(q)"', '"q.real"', "line 3", "column 1"),
+    "missing reward": ('reward = "-abs(q)"', "", "task.toml", "no reward"),
+    "number for condition": (
+        "[variables]",
+        'terminated = "q"\n[variables]',
+        "line 4",
+        "q > 1|x > 1",
+    ),
+    "unit of another kind": ("min = -1", 'unit = "kg", min = -1', "line 5", "'kg'.*'N.m'"),
+    "unknown unit": ("min = -1", 'unit = "Nmm", min = -1', "line 5", "'Nmm'"),
+    "unlimited action": ("tau = {", 'tau = { name = "q",', "line 7", "'q' cannot be an input"),
+    "limits": ("max = 1", "max = -2", "line 5", "-1.*-2"),
+    "duration": ('"20ms"', '"20 msec"', "line 2", "20 msec"),
+    "missing FMU": ('{ bundled = "Pendulum" }', '"Pendlum.fmu"', "line 1", "Pendlum"),
+    "bundled FMU": ('"Pendulum"', '"Pendlum"', "line 1", "'Pendulum'"),
+    "two meanings": ("[agent]", "[memory]\ntau = 1\n[agent]", "line 7", "'tau'"),
+    "reserved": ("[agent]", "[memory]\ntime = 1\n[agent]", "line 7", "'time'"),
+    "circle": ("[agent]", '[expressions]\na = "b"\nb = "a"\n[agent]', "line [78]", "itself"),
+    "key of config": ("[agent]", '[config]\non_fualt = "raise"\n[agent]', "line 7", "'on_fault'"),
+    "parameter": ("[agent]", "[parameters]\nmm = 1\n[agent]", "line 7", "'m'"),
+    "fixed output": ("[agent]", "[parameters]\nq_dot = 1\n[agent]", "line 7", "'q_dot'"),
+    "length": (
+        'time_step = "20ms"',
+        'time_step = 0.02\nepisode_length = "0.05s"',
+        "line 3",
+        "0.02",
+    ),
+    "class": ("[variables]", "class = 'math:Pie'\n[variables]", "line 4", "math:Pie"),
+    "previous of memory": ('"-abs(q)"', '"previous(time)"', "line 3", "'time'"),
+    "arguments": ('"-abs(q)"', '"hypot(q)"', "line 3", "2 arguments, got 1"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "place", "fact"), MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_are_placed_and_explained(old, new, place, fact, tmp_path):
+    text = textwrap.dedent(SMALL)
+    assert old in text
+    path = write(tmp_path, "task.toml", text.replace(old, new, 1))
+    with pytest.raises(TaskError, match=rf"{place}.*({fact})"):
+        fmugym.load(path).close()
+
+
+def test_an_action_without_limits(tmp_path):
+    text = textwrap.dedent(SMALL).replace("tau = { min = -1, max = 1 }", "u = { min = 0 }")
+    path = write(tmp_path, "task.toml", text.replace('["tau"]', '["u"]'))
+    with pytest.raises(TaskError, match=r"line 5.*'u' needs limits"):
+        fmugym.load(path)
+
+
+def test_a_mistake_in_a_dict_is_named_by_its_keys():
+    with pytest.raises(TaskError, match=r"^agent\.actions: .*'torqe'.*'torque'"):
+        fmugym.load(changed(agent={"actions": ["torqe"], "observations": ["angle"]}))
+
+
+@pytest.mark.parametrize(
+    ("path", "fact"),
+    [("cart_pol.toml", "'cart_pole.toml'"), ("../resources/fmus/2.0/CartPole.fmu", "fmugym new")],
+)
+def test_a_path_that_is_no_task_file(path, fact):
+    with pytest.raises(ConfigError, match=fact):
+        fmugym.load(EXAMPLES / path)
+
+
+class Damped(TaskEnv):
+    """A task with a hook of its own."""
+
+    def __init__(self, config, gain=1.0, **arguments):
+        self.gain = gain
+        super().__init__(config, **arguments)
+
+    def _reward_policy(self):
+        return -self.gain * abs(self.state[0])
+
+
+class TestClasses:
+    def test_a_class_replaces_declared_hooks(self, tmp_path):
+        head = "class = 'test_declared:Damped'\n"
+        text = textwrap.dedent(SMALL).replace('reward = "-abs(q)"\n', "")
+        path = write(tmp_path, "task.toml", head + text + "[arguments]\ngain = 3.0\n")
+        env = fmugym.load(path)
+        env.reset(seed=0)
+        assert env.step([0.1])[1] == -3.0 * abs(env.state[0])
+        env.close()
+
+    def test_another_class_takes_its_arguments(self):
+        env = fmugym.load({"class": "fmugym.envs:CartPoleEnv", "arguments": {"fmi_version": 3.0}})
+        assert env.fmu.description.fmi_major_version == 3
+        env.close()
+
+    def test_sections_for_another_class_are_refused(self):
+        with pytest.raises(TaskError, match=r"reward.*CartPoleEnv"):
+            fmugym.load({"class": "fmugym.envs:CartPoleEnv", "reward": "1"})
+
+
+def test_pickles_make_the_same_environment_without_the_file(tmp_path):
+    path = write(tmp_path, "task.toml", SMALL)
+    env = fmugym.load(path)
+    path.unlink()
+    twin = pickle.loads(pickle.dumps(env))
+    same(env.reset(seed=2), twin.reset(seed=2))
+    same(env.step([0.3]), twin.step([0.3]))
+    env.close()
+    twin.close()
+
+
+def first_observation(env):
+    return env.reset(seed=2)[0]
+
+
+def test_a_spawned_process_makes_the_same_environment():
+    env = fmugym.load(EXAMPLES / "pendulum.toml")
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        same(pool.apply(first_observation, (env,)), first_observation(env))
+    env.close()
+
+
+def test_specs_of_files_and_dicts_are_text():
+    for config in (str(EXAMPLES / "cart_pole.toml"), changed(memory={"target": 1.0, "total": 0})):
+        spec = gymnasium.make("fmugym/FMU-v0", config=config).spec
+        env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
+        env.reset(seed=0)
+        env.close()
+
+
+def test_the_tasks_in_the_documentation_run():
+    text = (DOCS / "task-file.md").read_text(encoding="utf-8")
+    first, *others = re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)
+    base = tomllib.loads(first)
+    for other in [{}, *map(tomllib.loads, others)]:
+        env = fmugym.load({k: merged(base.get(k), other.get(k)) for k in base | other})
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+    assert len(others) > 2
+
+
+def merged(base, own):
+    return {**base, **own} if isinstance(base, dict) and isinstance(own, dict) else own or base
+
+
+@pytest.mark.parametrize(
+    ("heading", "names"),
+    [
+        ("Keys", KEYS),
+        ("Variables", [*VARIABLE_KEYS]),
+        ("Expressions", [*FUNCTIONS, "previous", *BUILT_IN, *CONSTANTS]),
+    ],
+)
+def test_the_tables_of_the_documentation_are_complete(heading, names):
+    text = (DOCS / "task-file.md").read_text(encoding="utf-8")
+    part = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.+?`) \|", part, re.M)
+    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(names)
+
+
+def test_the_id_needs_a_task():
+    with pytest.raises(ConfigError, match="config"):
+        gymnasium.make("fmugym/FMU-v0")
