@@ -43,7 +43,7 @@ from fmugym.pool.base import (
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -187,6 +187,7 @@ class NativePool(AttendedPool):
                     "outputs": self._access(spec.outputs),
                     "num_observed": spec.num_observed,
                     "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                    "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
                 },
                 arrays={
                     "inputs": self.inputs,
