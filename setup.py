@@ -27,7 +27,7 @@ native = Extension(
     define_macros=[("Py_LIMITED_API", "0x030B0000")],
     extra_compile_args=["/std:c11", "/fp:precise"]
     if WINDOWS
-    else ["-std=gnu11", "-O3", "-ffp-contract=off", "-fvisibility=hidden"],
+    else ["-std=gnu11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"],
     libraries=[] if WINDOWS else ["m", "pthread", "dl"],
     py_limited_api=True,
     optional=not REQUIRED,

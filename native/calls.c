@@ -65,7 +65,7 @@ static Verdict observe_all(const Pool *pool, const Turn *turn) {
     PlayScratch registers;
     Verdict verdict = {.ended = 0};
 
-    play_open(turn, end, &registers);
+    play_open(turn, &registers);
     for (size_t first = 0; first < end; first += RUN) {
         play_observe(turn, first, length_of_run(first, end), &registers, &verdict);
     }

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "instances.h"
+#include "records.h"
 
 static const size_t STATES_LIMIT = (size_t)256 << 20; /* total bytes of one pool's initial states */
 
@@ -248,6 +249,10 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     const bool recorded = is_to_be_recorded(pool, me);
     const Status status = reset_instance(pool, me, call, scratch);
 
+    if (pool->records != NULL) {
+        matrix_gather(&call->start_values, index_of(pool, me), call->start->count, scratch.values);
+        record_begin(pool, index_of(pool, me), call->start, scratch.values);
+    }
     if (recorded && status <= STATUS_WARNING) {
         record_start(pool, me, call, scratch);
     } else if (recorded) {

@@ -78,11 +78,9 @@ static Source source_of(const Turn *turn) {
     return source;
 }
 
-void play_open(const Turn *turn, size_t count, PlayScratch *scratch) {
-    const bool has_short_runs = count % PROGRAM_WIDTH != 0;
-
-    program_prepare(&turn->play->inputs, has_short_runs, scratch->inputs);
-    program_prepare(&turn->play->judgement, has_short_runs, scratch->judgement);
+void play_open(const Turn *turn, PlayScratch *scratch) {
+    program_prepare(&turn->play->inputs, scratch->memory, &scratch->inputs);
+    program_prepare(&turn->play->judgement, scratch->memory, &scratch->judgement);
 }
 
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
@@ -100,6 +98,15 @@ void play_keep_outputs(const Play *play, size_t begin, size_t count) {
     }
 }
 
+WIDE static void count_steps(const Play *play, size_t begin, size_t count) {
+    const uint8_t *restrict ended = play->ended + begin;
+    int64_t *restrict step_counts = play->step_counts + begin;
+
+    for (size_t j = 0; j < count; j++) {
+        step_counts[j] = ended[j] ? 0 : step_counts[j] + 1;
+    }
+}
+
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
     const Play *play = turn->play;
     Notes notes = {.outside = false};
@@ -108,13 +115,11 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
         take_actions(turn, begin, count);
     }
     const Source source = source_of(turn);
-    program_run(&play->inputs, &source, begin, count, scratch->inputs, &notes);
+    program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
     if (play->keeps_always) {
         play_keep_outputs(play, begin, count);
     }
-    for (size_t index = begin; index < begin + count; index++) {
-        play->step_counts[index] = play->ended[index] ? 0 : play->step_counts[index] + 1;
-    }
+    count_steps(play, begin, count);
 }
 
 /* An episode that starts has no action yet. */
@@ -151,7 +156,19 @@ void play_start_episode(const Turn *turn, size_t index) {
     }
 }
 
+WIDE static bool is_any_set(const uint8_t *flags, size_t count) {
+    uint8_t any = 0;
+
+    for (size_t j = 0; j < count; j++) {
+        any |= flags[j];
+    }
+    return any != 0;
+}
+
 static void start_episodes(const Turn *turn, size_t begin, size_t count) {
+    if (!is_any_set(turn->play->ended + begin, count)) {
+        return;
+    }
     for (size_t index = begin; index < begin + count; index++) {
         if (turn->play->ended[index]) {
             play_start_episode(turn, index);
@@ -199,25 +216,30 @@ WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const uin
     return number;
 }
 
+static void add_notes(const Notes *notes, size_t count, Verdict *verdict) {
+    verdict->outside |= notes->outside;
+    if (is_any_set(notes->not_finite, count)) {
+        for (size_t j = 0; j < count; j++) {
+            verdict->troubled += notes->not_finite[j];
+        }
+    }
+}
+
 void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
                 Verdict *verdict) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
-    const Register *registers = scratch->judgement;
+    const void *const *places = scratch->judgement.places;
     Notes notes = {.outside = false};
 
     start_episodes(turn, begin, count);
     copy_rows(play, begin, count);
-    program_run(&play->judgement, &source, begin, count, scratch->judgement, &notes);
+    program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
-    for (size_t j = 0; j < count; j++) {
-        verdict->troubled += notes.not_finite[j];
-    }
-    verdict->outside |= notes.outside;
-    verdict->ended += judge(turn, begin, count, registers[results[DONE]].flags,
-                            registers[results[TRUNCATED]].flags,
-                            registers[results[REWARD]].doubles, &verdict->troubled);
+    add_notes(&notes, count, verdict);
+    verdict->ended += judge(turn, begin, count, places[results[DONE]], places[results[TRUNCATED]],
+                            places[results[REWARD]], &verdict->troubled);
 }
 
 /* The program updates no variables where an episode has ended: it stores those from before. */
@@ -231,12 +253,9 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     copy_rows(play, begin, count);
     memcpy(before, ended, count);
     memset(ended, 1, count);
-    program_run(&play->judgement, &source, begin, count, scratch->judgement, &notes);
+    program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);
     memcpy(ended, before, count);
-    for (size_t j = 0; j < count; j++) {
-        verdict->troubled += notes.not_finite[j];
-    }
-    verdict->outside |= notes.outside;
+    add_notes(&notes, count, verdict);
 }
 
 void play_skip(const Turn *turn, size_t index) {

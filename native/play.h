@@ -94,7 +94,8 @@ bool play_has_bad_action(const Turn *turn);
 
 /* Scratch memory of one thread. */
 typedef struct {
-    Register inputs[PROGRAM_REGISTERS], judgement[PROGRAM_REGISTERS];
+    Register memory[PROGRAM_REGISTERS]; /* of one program at a time */
+    Registers inputs, judgement;
 } PlayScratch;
 
 /* What became of a run. */
@@ -105,7 +106,7 @@ typedef struct {
     bool outside;    /* whether a hook looked up an index outside of a table */
 } Verdict;
 
-void play_open(const Turn *turn, size_t count, PlayScratch *scratch);
+void play_open(const Turn *turn, PlayScratch *scratch);
 
 /* Both handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
  * are reset or stepped, the second afterwards. */

@@ -131,6 +131,21 @@ typedef struct Snapshot {
     uint32_t *generations;
 } Snapshot;
 
+/* A value that was set before initialization. */
+typedef struct {
+    double value;
+    uint32_t reference, type;
+} RecordedStart;
+
+/* The episode of an instance so far; see records.h. */
+typedef struct {
+    RecordedStart *starts;
+    size_t number_of_starts;
+    double *inputs; /* of each step */
+    size_t rows, room;
+    bool whole; /* whether no step of the episode is missing */
+} Record;
+
 enum { SAMPLES = 8 };
 
 /* The measured cost of an operation: a low quantile of the last samples. Other load on the
@@ -167,6 +182,9 @@ typedef struct Pool {
     size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
+    void **spares;   /* for each instance, a state whose memory is used again, or NULL */
+    Atomic wasteful; /* whether the FMU makes a new state instead of overwriting one */
+    Record *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Tape tape;

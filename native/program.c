@@ -82,9 +82,13 @@ static bool instruction_is_sound(const Program *program, size_t action_elements,
     }
     const uint16_t operands[] = {i.a, i.b, i.c};
     const bool stores = i.operation == STORE_ROW || i.operation == STORE_SEEN;
-    for (size_t k = 0; k < number_of_operands(program, i); k++) {
+    if (!stores && i.to < program->number_of_constants) {
+        return false;
+    }
+    for (size_t k = 0; k < 3; k++) {
         /* Loops are compiled for operands that are not overwritten. */
-        if (operands[k] >= program->registers || (operands[k] == i.to && !stores)) {
+        const bool overwritten = !stores && k < number_of_operands(program, i) && operands[k] == i.to;
+        if (operands[k] >= program->registers || overwritten) {
             return false;
         }
     }
@@ -112,7 +116,8 @@ bool program_is_sound(const Program *program, size_t action_elements) {
         }
     }
     for (size_t i = 0; i < program->number_of_constants; i++) {
-        if (program->constants[i].to >= program->registers || program->constants[i].size > 8) {
+        if (i >= program->registers || program->constants[i].to != i ||
+            program->constants[i].size > 8) {
             return false;
         }
     }
@@ -126,16 +131,19 @@ bool program_is_sound(const Program *program, size_t action_elements) {
 
 /* Memory */
 
-void program_prepare(const Program *program, bool has_short_runs, Register *registers) {
-    if (has_short_runs) {
-        memset(registers, 0, program->registers * sizeof *registers);
+void program_fill(const Constant *constant, Register *filled) {
+    unsigned char *to = filled->bytes;
+
+    for (size_t j = 0; j < PROGRAM_WIDTH; j++, to += constant->size) {
+        memcpy(to, &constant->bits, constant->size);
     }
-    for (size_t i = 0; i < program->number_of_constants; i++) {
-        const Constant *constant = &program->constants[i];
-        unsigned char *to = registers[constant->to].bytes;
-        for (size_t j = 0; j < PROGRAM_WIDTH; j++, to += constant->size) {
-            memcpy(to, &constant->bits, constant->size);
-        }
+}
+
+void program_prepare(const Program *program, Register *memory, Registers *registers) {
+    registers->own = memory;
+    for (size_t i = 0; i < program->registers; i++) {
+        const bool is_constant = i < program->number_of_constants;
+        registers->places[i] = is_constant ? program->filled[i].bytes : memory[i].bytes;
     }
 }
 
@@ -164,39 +172,88 @@ static void copy_values(void *to, size_t to_step, const void *from, size_t from_
     }
 }
 
-static void load_action(const Source *s, const char *actions, size_t element, size_t begin,
-                        size_t count, Register *to) {
-    const char *from = actions + (begin * s->action_elements + element) * s->action_size;
-    copy_values(to, 1, from, s->action_elements, count, s->action_size);
-}
-
-static void load_active(const Source *s, size_t begin, size_t count, uint8_t *to) {
-    for (size_t j = 0; j < count; j++) {
-        const int8_t status = s->statuses == NULL ? 0 : s->statuses[begin + j];
-        const bool failed = status > STATUS_WARNING && status != STATUS_TERMINATED;
-        to[j] = !failed && !(s->ended != NULL && s->ended[begin + j]);
+/* The values after the last of a run are 0, so that no operation meets what others have left. */
+static void clear_rest(Register *to, size_t count, size_t lanes, size_t size) {
+    if (count < lanes) {
+        memset(to->bytes + count * size, 0, (lanes - count) * size);
     }
 }
 
-static void load_stopped(const Source *s, size_t begin, size_t count, uint8_t *to) {
+/* Returns the place of values that follow each other in memory; copies others to a register. */
+static const void *loaded(const char *from, size_t step, size_t size, size_t count,
+                          size_t lanes, Register *to) {
+    if (step == 1 && count == lanes) {
+        return from;
+    }
+    copy_values(to, 1, from, step, count, size);
+    clear_rest(to, count, lanes, size);
+    return to;
+}
+
+static const void *load_row(const Row *row, size_t begin, size_t count, size_t lanes,
+                            Register *to) {
+    const char *from = row->data + begin * row->size;
+
+    if (row->changes) { /* a view of it would change as well */
+        memcpy(to, from, count * row->size);
+        clear_rest(to, count, lanes, row->size);
+        return to;
+    }
+    return loaded(from, 1, row->size, count, lanes, to);
+}
+
+static const void *load_action(const Source *s, const char *actions, size_t element, size_t begin,
+                               size_t count, size_t lanes, Register *to) {
+    const char *from = actions + (begin * s->action_elements + element) * s->action_size;
+    return loaded(from, s->action_elements, s->action_size, count, lanes, to);
+}
+
+WIDE static void find_active(const int8_t *statuses, const uint8_t *ended, size_t count,
+                             uint8_t *restrict to) {
     for (size_t j = 0; j < count; j++) {
-        to[j] = s->statuses != NULL && s->statuses[begin + j] == STATUS_TERMINATED;
+        const bool failed = (statuses[j] > STATUS_WARNING) & (statuses[j] != STATUS_TERMINATED);
+        to[j] = !failed & !ended[j];
+    }
+}
+
+WIDE static void find_stopped(const int8_t *statuses, size_t count, uint8_t *restrict to) {
+    for (size_t j = 0; j < count; j++) {
+        to[j] = statuses[j] == STATUS_TERMINATED;
+    }
+}
+
+static void load_active(const Source *s, size_t begin, size_t count, uint8_t *to) {
+    static const int8_t ok[PROGRAM_WIDTH];
+    static const uint8_t none[PROGRAM_WIDTH];
+
+    find_active(s->statuses == NULL ? ok : s->statuses + begin,
+                s->ended == NULL ? none : s->ended + begin, count, to);
+}
+
+static void load_stopped(const Source *s, size_t begin, size_t count, uint8_t *to) {
+    if (s->statuses == NULL) {
+        memset(to, 0, count);
+    } else {
+        find_stopped(s->statuses + begin, count, to);
     }
 }
 
 static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1};
 
-static void note_not_finite(const Register *from, uint32_t type, size_t count, Notes *notes) {
-    if (type == VALUE_DOUBLE) {
-        for (size_t j = 0; j < count; j++) {
-            notes->not_finite[j] |= !(fabs(from->doubles[j]) <= DBL_MAX);
-        }
-    } else if (type == VALUE_FLOAT) {
-        for (size_t j = 0; j < count; j++) {
-            notes->not_finite[j] |= !(fabsf(from->floats[j]) <= FLT_MAX);
-        }
+/* Looks at all first, because nearly always all are finite. */
+#define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
+    WIDE static void name(const Type *values, size_t count, Notes *notes) {                        \
+        Whole any = 0; /* as wide as the values, so that the compiler can vectorize */             \
+        for (size_t j = 0; j < count; j++) {                                                       \
+            any |= !(absolute(values[j]) <= most);                                                 \
+        }                                                                                          \
+        for (size_t j = 0; any != 0 && j < count; j++) {                                           \
+            notes->not_finite[j] |= !(absolute(values[j]) <= most);                                \
+        }                                                                                          \
     }
-}
+
+NOTE_NOT_FINITE(double, note_not_finite, int64_t, fabs, DBL_MAX)
+NOTE_NOT_FINITE(float, note_not_finite32, int32_t, fabsf, FLT_MAX)
 
 void program_clear_seen(const Program *program, char *const *seen, size_t index) {
     for (size_t i = 0; i < program->number_of_slots; i++) {
@@ -207,32 +264,43 @@ void program_clear_seen(const Program *program, char *const *seen, size_t index)
 }
 
 static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t count,
-                       const Register *from, Notes *notes) {
+                       const void *from, Notes *notes) {
     const size_t size = size_of_type[slot->type];
     char *to = s->seen[slot->array] + (begin * slot->elements + slot->element) * size;
 
     copy_values(to, slot->elements, from, 1, count, size);
-    note_not_finite(from, slot->type, count, notes);
+    if (slot->type == VALUE_DOUBLE) {
+        note_not_finite(from, count, notes);
+    } else if (slot->type == VALUE_FLOAT) {
+        note_not_finite32(from, count, notes);
+    }
 }
 
 /* Operations of numpy */
 
-static void call(const Called *called, size_t count, Register *registers, Instruction i) {
-    char *data[CALL_INPUTS + 1] = {(char *)&registers[i.a], (char *)&registers[i.b],
-                                   (char *)&registers[i.c]};
+/* The loops of numpy do not write to what they read. */
+static void call(const Called *called, size_t count, size_t lanes, const Registers *registers,
+                 Instruction i) {
+    const void *const *places = registers->places;
+    char *data[CALL_INPUTS + 1] = {(char *)places[i.a], (char *)places[i.b], (char *)places[i.c]};
     const ptrdiff_t length = (ptrdiff_t)count;
 
-    data[called->inputs] = (char *)&registers[i.to];
+    data[called->inputs] = (char *)registers->own[i.to].bytes;
     called->loop(called->context, data, &length, called->sizes, called->auxiliary);
+    clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->inputs]);
 }
+
+/* The number of blocks makes the compiler see that no value is left over. */
+#define EACH_LANE(statement)                                                                       \
+    for (size_t j = 0; j < blocks * PROGRAM_BLOCK; j++) {                                          \
+        statement;                                                                                 \
+    }
 
 #define CAST_LOOP(number, From, To)                                                                \
     case number: {                                                                                 \
         const From *restrict values = from;                                                        \
         To *restrict into = to;                                                                    \
-        for (size_t j = 0; j < PROGRAM_WIDTH; j++) {                                               \
-            into[j] = (To)values[j];                                                               \
-        }                                                                                          \
+        EACH_LANE(into[j] = (To)values[j]);                                                        \
         break;                                                                                     \
     }
 
@@ -253,7 +321,7 @@ static void call(const Called *called, size_t count, Register *registers, Instru
         }                                                                                          \
         break;
 
-static void cast(uint16_t types, const void *from, void *to) {
+WIDE static void cast(uint16_t types, const void *from, size_t blocks, void *to) {
     const int to_type = types % VALUE_TYPES;
 
     switch (types / VALUE_TYPES) {
@@ -272,7 +340,7 @@ static void cast(uint16_t types, const void *from, void *to) {
 }
 
 /* Negative indices count from the end. One outside of the table reads its first value. */
-static void take(const Table *table, const int64_t *indices, size_t count, void *to,
+static void take(const Table *table, const int64_t *indices, size_t count, char *to,
                  Notes *notes) {
     const int64_t length = (int64_t)table->length;
 
@@ -282,7 +350,7 @@ static void take(const Table *table, const int64_t *indices, size_t count, void 
             notes->outside = true;
             index = 0;
         }
-        memcpy((char *)to + j * table->size, table->data + (size_t)index * table->size,
+        memcpy(to + j * table->size, table->data + (size_t)index * table->size,
                table->size);
     }
 }
@@ -347,9 +415,7 @@ static void interpolate(const Table *table, const double *from, size_t count, do
         const Type *restrict x = first, *restrict y = second;                                      \
         Result *restrict r = to;                                                                   \
         (void)y;                                                                                   \
-        for (size_t j = 0; j < PROGRAM_WIDTH; j++) {                                               \
-            r[j] = expression;                                                                     \
-        }                                                                                          \
+        EACH_LANE(r[j] = (expression));                                                            \
     }                                                                                              \
     break
 
@@ -358,9 +424,7 @@ static void interpolate(const Table *table, const double *from, size_t count, do
         const uint8_t *restrict chosen = first;                                                    \
         const Type *restrict x = second, *restrict y = third;                                      \
         Type *restrict r = to;                                                                     \
-        for (size_t j = 0; j < PROGRAM_WIDTH; j++) {                                               \
-            r[j] = chosen[j] ? x[j] : y[j];                                                        \
-        }                                                                                          \
+        EACH_LANE(r[j] = chosen[j] ? x[j] : y[j]);                                                 \
     }                                                                                              \
     break
 
@@ -368,7 +432,7 @@ static void interpolate(const Table *table, const double *from, size_t count, do
 #define WRAPPED(expression) (int64_t)(expression)
 
 WIDE static void compute(uint16_t operation, const void *first, const void *second,
-                         const void *third, void *to) {
+                         const void *third, size_t blocks, void *to) {
     switch (operation) {
     case ADD_D:
         EACH(double, double, x[j] + y[j]);
@@ -461,52 +525,77 @@ WIDE static void compute(uint16_t operation, const void *first, const void *seco
     }
 }
 
-void program_run(const Program *program, const Source *source, size_t begin, size_t count,
-                 Register *registers, Notes *notes) {
-    for (size_t place = 0; place < program->length; place++) {
-        const Instruction i = program->code[place];
-        Register *to = &registers[i.to];
-        const Register *first = &registers[i.a];
-        const Row *row;
+static inline size_t whole_blocks(size_t count) {
+    return (count + PROGRAM_BLOCK - 1) / PROGRAM_BLOCK * PROGRAM_BLOCK;
+}
 
+/* What moves values between registers and the memory of others. Returns false for anything else. */
+static bool move(const Program *program, const Source *source, size_t begin, size_t count,
+                 Registers *registers, Instruction i, Notes *notes) {
+    const size_t lanes = whole_blocks(count);
+    Register *to = &registers->own[i.to];
+    const void **place = &registers->places[i.to], *first = registers->places[i.a];
+    const Row *row;
+
+    switch (i.operation) {
+    case LOAD_ROW:
+        *place = load_row(&program->rows[i.extra], begin, count, lanes, to);
+        return true;
+    case LOAD_ACTION:
+        *place = load_action(source, source->actions, i.extra, begin, count, lanes, to);
+        return true;
+    case LOAD_PREVIOUS_ACTION:
+        *place = load_action(source, source->previous_actions, i.extra, begin, count, lanes, to);
+        return true;
+    case STORE_ROW:
+        row = &program->rows[i.extra];
+        memcpy(row->data + begin * row->size, first, count * row->size);
+        return true;
+    case STORE_SEEN:
+        store_seen(&program->slots[i.extra], source, begin, count, first, notes);
+        return true;
+    default:
+        return false;
+    }
+}
+
+void program_run(const Program *program, const Source *source, size_t begin, size_t count,
+                 Registers *registers, Notes *notes) {
+    const size_t lanes = whole_blocks(count);
+    const void **places = registers->places;
+
+    for (const Instruction *next = program->code; next < program->code + program->length; next++) {
+        const Instruction i = *next;
+        if (move(program, source, begin, count, registers, i, notes)) {
+            continue;
+        }
+        Register *to = &registers->own[i.to];
+        places[i.to] = to;
         switch (i.operation) {
-        case LOAD_ROW:
-            row = &program->rows[i.extra];
-            copy_values(to, 1, row->data + begin * row->size, 1, count, row->size);
-            break;
-        case LOAD_ACTION:
-            load_action(source, source->actions, i.extra, begin, count, to);
-            break;
-        case LOAD_PREVIOUS_ACTION:
-            load_action(source, source->previous_actions, i.extra, begin, count, to);
-            break;
         case LOAD_ACTIVE:
             load_active(source, begin, count, to->flags);
+            clear_rest(to, count, lanes, 1);
             break;
         case LOAD_STOPPED:
             load_stopped(source, begin, count, to->flags);
-            break;
-        case STORE_ROW:
-            row = &program->rows[i.extra];
-            copy_values(row->data + begin * row->size, 1, first, 1, count, row->size);
-            break;
-        case STORE_SEEN:
-            store_seen(&program->slots[i.extra], source, begin, count, first, notes);
+            clear_rest(to, count, lanes, 1);
             break;
         case CALL:
-            call(&program->calls[i.extra], count, registers, i);
+            call(&program->calls[i.extra], count, lanes, registers, i);
             break;
         case CAST:
-            cast(i.extra, first, to);
+            cast(i.extra, places[i.a], lanes / PROGRAM_BLOCK, to);
             break;
         case TAKE:
-            take(&program->tables[i.extra], first->integers, count, to, notes);
+            take(&program->tables[i.extra], places[i.a], count, (char *)to->bytes, notes);
+            clear_rest(to, count, lanes, program->tables[i.extra].size);
             break;
         case INTERPOLATE:
-            interpolate(&program->tables[i.extra], first->doubles, count, to->doubles);
+            interpolate(&program->tables[i.extra], places[i.a], count, to->doubles);
+            clear_rest(to, count, lanes, sizeof(double));
             break;
         default:
-            compute(i.operation, first, &registers[i.b], &registers[i.c], to);
+            compute(i.operation, places[i.a], places[i.b], places[i.c], lanes / PROGRAM_BLOCK, to);
         }
     }
 }

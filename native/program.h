@@ -9,7 +9,8 @@
 #include <stdint.h>
 
 enum {
-    PROGRAM_WIDTH = 32,      /* instances evaluated at the same time */
+    PROGRAM_WIDTH = 64,      /* most instances evaluated at the same time */
+    PROGRAM_BLOCK = 16,      /* operations compute a multiple of this many values */
     PROGRAM_REGISTERS = 256, /* maximum number of registers */
     PROGRAM_RESULTS = 3,     /* maximum number of results */
     CALL_INPUTS = 3          /* maximum number of inputs of a loop of numpy */
@@ -112,7 +113,7 @@ typedef union {
     uint8_t flags[PROGRAM_WIDTH];
 } Register;
 
-/* A register that has the same value for all instances throughout. */
+/* The first registers have the same value for all instances throughout. */
 typedef struct {
     uint64_t bits; /* the value in its first bytes */
     uint16_t to, size;
@@ -133,7 +134,8 @@ typedef struct {
 /* One value for each instance. */
 typedef struct {
     char *data;
-    size_t size; /* bytes of a value */
+    size_t size;  /* bytes of a value */
+    bool changes; /* whether the program stores in it */
 } Row;
 
 /* An element of an array that has the instances on its first axis. */
@@ -153,6 +155,7 @@ typedef struct {
 typedef struct {
     const Instruction *code;
     const Constant *constants;
+    const Register *filled; /* the constants, in all places of their registers */
     const Called *calls;
     const Row *rows;
     const Slot *slots;
@@ -177,9 +180,17 @@ typedef struct {
     bool outside;                      /* whether an index was outside of its table */
 } Notes;
 
-/* Must be called once before the first run with these registers. Writes the constants, which
- * stay in place. If some runs are shorter than a register, sets all others to 0. */
-void program_prepare(const Program *program, bool has_short_runs, Register *registers);
+/* Where the value of each register is: with the constants, in a row, or in memory of its own. */
+typedef struct {
+    const void *places[PROGRAM_REGISTERS];
+    Register *own;
+} Registers;
+
+/* Writes a constant in all places of a register. */
+void program_fill(const Constant *constant, Register *filled);
+
+/* Must be called once before the first run with these registers, which use this memory. */
+void program_prepare(const Program *program, Register *memory, Registers *registers);
 
 /* Whether every operand refers to something that exists. The program writes and reads count
  * instances of rows that are long enough. */
@@ -189,9 +200,8 @@ bool program_is_sound(const Program *program, size_t action_elements);
 void program_clear_seen(const Program *program, char *const *seen, size_t index);
 
 /* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Operations of its
- * own are always computed in full width, because loops of a fixed length become vector
- * instructions. */
+ * own compute whole blocks, because loops of a fixed length become vector instructions. */
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
-                 Register *registers, Notes *notes);
+                 Registers *registers, Notes *notes);
 
 #endif

@@ -115,6 +115,7 @@ class Tables(Task):
     """Looks values up, and has an info."""
 
     space = gym.spaces.MultiDiscrete([3, 4])
+    angles, comfort = np.array([-0.5, 0.0, 0.5]), np.array([0.0, 1.0, 0.0])
 
     def __init__(self):
         super().__init__()
@@ -126,7 +127,7 @@ class Tables(Task):
 
     def _reward_policy(self):
         q, q_dot = self.state
-        comfort = np.interp(q, [-0.5, 0.0, 0.5], [0.0, 1.0, 0.0], left=-1.0)
+        comfort = np.interp(q, self.angles, self.comfort, left=-1.0)
         band = np.select([q_dot > 0.3, q_dot < -0.3], [q_dot - 0.3, -0.3 - q_dot], 0.0)
         return comfort - np.clip(band, None, 1.0)
 

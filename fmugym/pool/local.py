@@ -6,12 +6,13 @@ import logging
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError
-from fmugym.pool.attendant import Attendant, AttendedPool
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.python import PythonPool
+from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.states import InitialStates
 
@@ -31,7 +32,7 @@ def local_pool(
     first_index: int = 0,
     counts: HealthArray | None = None,
     attended: bool = True,
-) -> AttendedPool:
+) -> SavingPool:
     """Make a pool that loads the FMU into this process.
 
     Args:
@@ -59,7 +60,7 @@ def local_pool(
             "instances, which only the native pool or isolation='process' can provide"
         )
     announce(INITIALIZATION)  # an FMU may do all of its work when it is instantiated
-    pool: AttendedPool
+    pool: SavingPool
     if native:
         from fmugym.pool.native import NativePool
 

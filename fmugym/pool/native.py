@@ -32,7 +32,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
-from fmugym.pool.attendant import AttendedPool, InitialState
+from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -40,9 +40,11 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
 
@@ -82,7 +84,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(AttendedPool):
+class NativePool(SavingPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -142,6 +144,8 @@ class NativePool(AttendedPool):
             fmu.close()
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
+        if self._prepare_saving(fmu.description, spec):
+            self._pool.keep_records()
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
@@ -322,6 +326,34 @@ class NativePool(AttendedPool):
             index, self._access(variables), values.tobytes(), state.outputs, state.data
         )
 
+    def serialize_states(self, indices: IndexArray) -> Serialized:
+        """See ``SavingPool.serialize_states``."""
+        ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
+        data = self._open_pool().bundle(np.ascontiguousarray(indices), ends, steps)
+        if isinstance(data, int):
+            raise SimulationError(self.failure(data))
+        return data, ends, steps
+
+    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``SavingPool.deserialize_states``."""
+        pool = self._open_pool()
+        sources, indices = np.ascontiguousarray(sources), np.ascontiguousarray(indices)
+        pool.unbundle(indices, sources, bundle.data, bundle.ends, bundle.steps, bundle.outputs)
+
+    def record_of(self, index: int) -> Record | None:
+        """See ``SavingPool.record_of``."""
+        found = self._open_pool().record_of(index)
+        if found is None:
+            return None
+        starts, steps, inputs = found
+        types, references, values = zip(*starts, strict=True) if starts else ((), (), ())
+        variables = self._listener.variables(bytes(types), list(references))
+        return Record(
+            tuple(variable.name for variable in variables),
+            np.array(values, np.float64),
+            np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
+        )
+
     def _count_steps(self) -> None:
         if self._close.alive:
             self._pool.count_steps()
@@ -343,6 +375,8 @@ class NativePool(AttendedPool):
         if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
             return False
         self._open_pool().begin_by(False, method == ResetMethod.INSTANCE)
+        self._pool.keep_records()
+        self._mistrust_states()
         self._spec = replace(self._spec, reset_method=method)
         return True
 
@@ -568,7 +602,7 @@ class _Listener:
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
         return Tape(
-            self._variables(types, np.frombuffer(references, np.uint32).tolist()),
+            self.variables(types, np.frombuffer(references, np.uint32).tolist()),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),
@@ -576,7 +610,7 @@ class _Listener:
             np.frombuffer(statuses, np.int8),
         )
 
-    def _variables(self, types: bytes, references: list[int]) -> tuple[Variable, ...]:
+    def variables(self, types: bytes, references: list[int]) -> tuple[Variable, ...]:
         """Find variables; aliases are as good."""
         version = self._description.fmi_major_version
         known = {

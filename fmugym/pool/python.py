@@ -18,11 +18,13 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.log import raise_caught
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
-from fmugym.pool.attendant import AttendedPool, InitialState
+from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.pacing import Pacer
+from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.slot import Slot, Snapshot
 from fmugym.pool.spec import ResetMethod
 
@@ -32,7 +34,7 @@ _WARNING: Final = int(Status.WARNING)
 """An enumeration's member has Python code, in which numpy drops what a signal handler raises."""
 
 
-class PythonPool(AttendedPool):
+class PythonPool(SavingPool):
     """N instances stepped one after another; see ``Pool`` for the contract.
 
     Args:
@@ -77,6 +79,8 @@ class PythonPool(AttendedPool):
             raise
         finally:
             restore_arithmetic()
+        if self._prepare_saving(fmu.description, spec):
+            self._keep_records()
         recycle = functools.partial(_recycle, self._slots)
         self._watch = watch_leaks(fmu, spec, self._counts, recycle, log)
 
@@ -153,6 +157,32 @@ class PythonPool(AttendedPool):
         raise_caught()
         return self.outputs, self.statuses
 
+    def serialize_states(self, indices: IndexArray) -> Serialized:
+        """See ``SavingPool.serialize_states``."""
+        chosen = [self._slots[index] for index in indices.tolist()]
+        try:
+            data, ends = joined([slot.serialize() for slot in chosen])
+        finally:
+            restore_arithmetic()
+        raise_caught()
+        return data, ends, np.array([slot.count for slot in chosen], np.int64)
+
+    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``SavingPool.deserialize_states``."""
+        for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
+            state, outputs = bundle.state(source), bundle.outputs[:, source]
+            count = int(bundle.steps[source])
+            self._note(index, self._slots[index].deserialize(state, count, outputs))
+        raise_caught()
+
+    def record_of(self, index: int) -> Record | None:
+        """See ``SavingPool.record_of``."""
+        return self._slots[index].record
+
+    def _keep_records(self) -> None:
+        for slot in self._slots:
+            slot.keeps_record = True
+
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
         return self._slots[index].failure
@@ -204,6 +234,8 @@ class PythonPool(AttendedPool):
         self._spec = replace(self._spec, reset_method=method)
         for slot in self._slots:
             slot.begin_by(method)
+        self._keep_records()
+        self._mistrust_states()
         return True
 
     def recycle(self) -> None:

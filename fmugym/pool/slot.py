@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, SimulationError, printable
 from fmugym.fmi.access import Access
@@ -14,6 +16,7 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, PoolSpec
+from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.samples import Samples
@@ -70,6 +73,7 @@ class Slot:
     Attributes:
         failure: Why the last status was worse than a warning.
         is_due: Whether the next reset replaces the instance.
+        keeps_record: Whether the inputs of its episodes are kept.
     """
 
     def __init__(
@@ -82,7 +86,8 @@ class Slot:
         pacer: Pacer,
     ) -> None:
         self.failure = ""
-        self.is_due = False
+        self.is_due = self.keeps_record = False
+        self._played: tuple[tuple[str, ...], FloatArray, list[bytes]] | None = None
         self._unexplained = False
         self._counts, self._pacer = counts, pacer
         self._count = self._counted = 0
@@ -123,6 +128,9 @@ class Slot:
         self.count_steps()
         self._counts[Column.RESETS] += 1
         self._counts[Column.RETRIED] = 0
+        self._played = None
+        if self.keeps_record:
+            self._played = tuple(v.name for v in variables), np.array(values), []
         try:
             self._make_anew_if_due()
             self._instance.begin_episode()
@@ -271,6 +279,8 @@ class Slot:
         inputs = self._input_row.tolist()
         if not _all_finite(inputs):
             return self._not_finite("inputs", self._spec.inputs, inputs)
+        if self._played is not None:
+            self._played[2].append(self._input_row.tobytes())
         if self._spec.fault_retries:
             self._counts[Column.RETRIED] = 0
         status = self._inputs.set()
@@ -411,12 +421,61 @@ class Slot:
     def restore(self, snapshot: Snapshot) -> int:
         """Return to a state and its time."""
         self.count_steps()
+        self._played = None
         try:
             self._instance.restore_state(snapshot.state)
         except SimulationError as error:
             return self._failed(str(error))
         self._begin_counting_at(snapshot.count)
         return self._read_outputs(Status.OK)
+
+    @property
+    def count(self) -> int:
+        """The number of communication steps in this episode."""
+        return self._count
+
+    def serialize(self) -> bytes:
+        """Serialize the FMU state; ``b""`` if the instance cannot be stepped any more.
+
+        Raises:
+            SimulationError: If the FMU fails.
+        """
+        if self._instance.phase is not _STEPPING:
+            return b""
+        state = self._instance.save_state()
+        try:
+            return self._instance.serialize(state)
+        finally:
+            state.release()
+
+    def deserialize(self, data: bytes, count: int, outputs: FloatArray) -> int:
+        """Return to a serialized state, its number of communication steps and its outputs."""
+        self.count_steps()
+        self._played = None
+        self._output_row[:] = outputs
+        self._good_outputs = outputs.tolist()
+        if not data:
+            self._instance.forbid_steps()
+            return Status.OK
+        try:
+            if self._instance.phase is Phase.DEAD:
+                self._replace()
+            state = self._instance.deserialize(data)
+            self._instance.restore_state(state)
+            state.release()
+        except SimulationError as error:
+            return self._failed(str(error))
+        self._begin_counting_at(count)
+        return Status.OK
+
+    @property
+    def record(self) -> Record | None:
+        """The episode until now; None if it is not known as a whole."""
+        if self._played is None:
+            return None
+        names, starts, rows = self._played
+        inputs = np.frombuffer(b"".join(rows)).reshape(len(rows), len(self._spec.inputs))
+        return Record(names, starts, inputs)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""

@@ -87,6 +87,8 @@ class PoolSpec:
             shows that they work there.
         state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
         licence_wait: How long to wait for a refused licence, in seconds of real time.
+        records: Whether the inputs of episodes are kept, because it is not known yet whether the
+            FMU's states can be saved; see ``fmugym.pool.saving``.
     """
 
     inputs: tuple[Variable, ...]
@@ -110,6 +112,7 @@ class PoolSpec:
     keep_states: bool = False
     state_files: str = ""
     samplings: tuple[str, ...] = ()
+    records: bool = False
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""

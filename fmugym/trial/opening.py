@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.bundled import is_bundled
@@ -17,10 +19,12 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
+from fmugym.pool.saving import SavingPool, offers_states
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
+from fmugym.trial.resuming import do_states_work, known_to_work
 from fmugym.trial.trial import Candidate, examine, revise, state_files
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -92,7 +96,9 @@ def make_pool(
         if spec.keep_states:
             completed = completed.with_states(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
-            pool = _open(fmu, spec, num_instances, log, completed, call_timeout)
+            trust = _Trust.of(fmu, spec, starts, completed)
+            pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout)
+        pool.trust_states_if(trust.do_states_work)
         if rehearse and reset_method is None:
             _rehearse(pool, fmu, spec, starts, verdict, completed, log)
         return pool
@@ -108,7 +114,7 @@ def _open(
     log: logging.Logger,
     plan: _Plan,
     call_timeout: float | None,
-) -> Pool:
+) -> SavingPool:
     spec = replace(
         spec,
         reset_method=plan.method,
@@ -161,6 +167,33 @@ def _rehearse(
         revise(candidate, tried, starts, found)
 
     pool.rehearse_with(Repetition(candidate, spec, verdict, plan.native, keep, log))
+
+
+@dataclass(frozen=True)
+class _Trust:
+    """Whether serialized states work, as far as known when a pool is opened.
+
+    Attributes:
+        spec: What the pool does; records are kept until it is known that states work.
+        do_states_work: Finds it out.
+    """
+
+    spec: PoolSpec
+    do_states_work: Callable[[], bool]
+
+    @classmethod
+    def of(cls, fmu: FMU, spec: PoolSpec, starts: Starts | None, plan: _Plan) -> _Trust:
+        """Look up what earlier trials have shown."""
+        candidate, tried = Candidate.of(fmu), _tried(spec)
+        if not offers_states(fmu.description, replace(spec, reset_method=plan.method)):
+            return cls(spec, bool)
+        known: bool | None = is_bundled(fmu.path)
+        if not known:
+            known = False if candidate.exempt else known_to_work(candidate, tried, starts)
+        if known is not None:
+            return cls(replace(spec, records=not known), partial(bool, known))
+        ask = partial(do_states_work, candidate, tried, starts)
+        return cls(replace(spec, records=True), ask)
 
 
 def _tried(spec: PoolSpec) -> PoolSpec:

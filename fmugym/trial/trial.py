@@ -45,12 +45,17 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = [
     "Candidate",
+    "Outcome",
     "Request",
     "Stage",
+    "content_of",
     "examine",
+    "known_resuming",
     "known_verdict",
     "meet",
+    "note_resuming",
     "revise",
+    "run",
 ]
 
 logger = logging.getLogger(__name__)
@@ -107,6 +112,7 @@ class Stage(StrEnum):
     LIBRARY = "the rehearsal of libraries loaded anew"
     STATE = "the serialization of an initial state"
     RESUMED = "the rehearsal of an initial state from another process"
+    HALFWAY = "the rehearsal of a state in the middle of an episode"
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
     THREADS = "the comparison with an instance in another thread"
@@ -131,6 +137,8 @@ class Request:
         skip: The stages in which an earlier worker died.
         sample: The ``Sample`` of an initial state that another worker has made, if this one has to
             try only that.
+        resume: Whether to try a state in the middle of an episode; or a ``Halfway`` that another
+            worker has made.
         check_memory: Whether the C library checks for memory errors (glibc only).
     """
 
@@ -141,11 +149,12 @@ class Request:
     alone: bool = False
     skip: frozenset[str] = frozenset()
     sample: Any = None
+    resume: Any = None
     check_memory: bool = True
 
 
 @dataclass(frozen=True)
-class _Outcome:
+class Outcome:
     """How a trial ended.
 
     ``stage`` is what the worker was doing; None before it touched the FMU. If the process survived
@@ -244,6 +253,24 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
     return knows_states and (verdict.neighbours is not None or not several)
 
 
+def known_resuming(candidate: Candidate, spec: Any, starts: Any) -> Grade | None:
+    """The grade of states in the middle of an episode; None if they were not tried."""
+    try:
+        return Grade(recall(_resuming_key(candidate, spec, starts)) or "")
+    except ValueError:
+        return None
+
+
+def note_resuming(candidate: Candidate, spec: Any, starts: Any, grade: Grade) -> None:
+    """Keep this grade, unless the FMU has failed, which may have passing causes."""
+    if grade is not Grade.FAILS:
+        remember(_resuming_key(candidate, spec, starts), str(grade))
+
+
+def _resuming_key(candidate: Candidate, spec: Any, starts: Any) -> str:
+    return f"{_verdict_key(candidate, spec, starts)}-resuming"
+
+
 def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> None:
     """Replace the verdict that ``examine`` has cached for the same arguments."""
     for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path)):
@@ -254,7 +281,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
     """Start workers until one finishes. Each skips the stages in which earlier ones crashed."""
     name, notes = request.candidate.path.name, _Notes()
     while True:
-        outcome = _run(request)
+        outcome = run(request)
         if outcome.stage is None:
             logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
             return Verdict()
@@ -285,7 +312,7 @@ def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -
         return Grade.ABSENT
     if sample is None:
         return Grade.FAILS
-    outcome = _run(replace(request, sample=pickle.loads(sample)))
+    outcome = run(replace(request, sample=pickle.loads(sample)))
     _Notes().require_licence(request.candidate.path.name, outcome)
     return Grade(outcome.answer.get("states", Grade.FAILS))
 
@@ -295,10 +322,10 @@ class _Notes:
 
     def __init__(self) -> None:
         self._answer: dict[str, Any] = {}
-        self._deaths: list[_Outcome] = []
+        self._deaths: list[Outcome] = []
         self.sample: bytes | None = None
 
-    def add(self, outcome: _Outcome) -> None:
+    def add(self, outcome: Outcome) -> None:
         """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
         self.sample = outcome.sample or self.sample
@@ -320,7 +347,7 @@ class _Notes:
             reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
 
-    def require_licence(self, name: str, outcome: _Outcome) -> None:
+    def require_licence(self, name: str, outcome: Outcome) -> None:
         """Give up if an instance got no licence: this tells nothing about the FMU itself.
 
         Raises:
@@ -353,7 +380,8 @@ class _Notes:
         return replace(self.verdict, isolate=True, neighbours=Neighbours.PROCESSES)
 
 
-def _run(request: Request) -> _Outcome:
+def run(request: Request) -> Outcome:
+    """Let a worker try what is requested; returns how that ended."""
     with tempfile.TemporaryDirectory(prefix="fmugym-probe-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         (folder / "request").write_bytes(pickle.dumps(request))
@@ -361,7 +389,7 @@ def _run(request: Request) -> _Outcome:
             end, last_lines = _watch(folder, request)
         except OSError as error:
             end, last_lines = f"found no Python to start: {error}", []
-        return _Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
+        return Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
 
 
 def _stage(folder: Path) -> str | None:
@@ -508,11 +536,15 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     return f"{_content_key(candidate.path)}-{asked}"
 
 
+def content_of(path: Path) -> str:
+    """The SHA-256 of a file; it is read again only when it has changed."""
+    status = path.stat()
+    return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
+
+
 def _content_key(path: Path) -> str:
     """The scope of a verdict: this content, this platform, and this version of the package."""
-    status = path.stat()
-    content = _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
-    return _digest(f"{content} {fmpy.platform_tuple} {_version()}".encode())
+    return _digest(f"{content_of(path)} {fmpy.platform_tuple} {_version()}".encode())
 
 
 @functools.lru_cache(maxsize=256)

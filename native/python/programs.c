@@ -70,7 +70,11 @@ static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count) {
         if (!take_numbers(PyTuple_GetItem(rows, i), buffer, true, "a row of a program", count)) {
             return false;
         }
-        p->rows[i] = (Row){buffer->buf, (size_t)buffer->itemsize};
+        if ((uintptr_t)buffer->buf % (uintptr_t)buffer->itemsize != 0) {
+            PyErr_SetString(PyExc_ValueError, "a row of a program is not aligned");
+            return false;
+        }
+        p->rows[i] = (Row){buffer->buf, (size_t)buffer->itemsize, false};
     }
     return true;
 }
@@ -154,6 +158,7 @@ static bool allocate(PyProgram *p, const Parts *parts) {
     p->calls = calloc(calls + 1, sizeof *p->calls);
     p->rows = calloc(rows + 1, sizeof *p->rows);
     p->tables = calloc(tables + 1, sizeof *p->tables);
+    p->filled = malloc(((size_t)parts->constants_size / sizeof(Constant) + 1) * sizeof(Register));
     p->program = (Program){
         .code = (const Instruction *)(const void *)parts->code,
         .constants = (const Constant *)(const void *)parts->constants,
@@ -170,7 +175,8 @@ static bool allocate(PyProgram *p, const Parts *parts) {
         .number_of_seen = (size_t)parts->seen,
         .registers = (size_t)parts->registers,
     };
-    if (p->buffers == NULL || p->calls == NULL || p->rows == NULL || p->tables == NULL) {
+    if (p->buffers == NULL || p->calls == NULL || p->rows == NULL || p->tables == NULL ||
+        p->filled == NULL) {
         PyErr_NoMemory();
         return false;
     }
@@ -190,6 +196,33 @@ static bool is_sound(PyProgram *p, const Parts *parts, Py_ssize_t count, size_t 
     return sound;
 }
 
+/* The constants' registers begin at the first place in their memory that is aligned. */
+static void fill_constants(PyProgram *p) {
+    const size_t alignment = _Alignof(Register);
+    const size_t past = (size_t)((uintptr_t)p->filled % alignment);
+    Register *filled = (Register *)(void *)(p->filled + (past == 0 ? 0 : alignment - past));
+
+    for (size_t i = 0; i < p->program.number_of_constants; i++) {
+        program_fill(&p->program.constants[i], &filled[i]);
+    }
+    p->program.filled = filled;
+}
+
+/* Two rows may be the same memory. */
+static void note_change(PyProgram *p, const char *changed) {
+    for (size_t i = 0; i < p->program.number_of_rows; i++) {
+        p->rows[i].changes |= p->rows[i].data == changed;
+    }
+}
+
+static void note_changes(PyProgram *p) {
+    for (size_t i = 0; i < p->program.length; i++) {
+        if (p->program.code[i].operation == STORE_ROW) {
+            note_change(p, p->rows[p->program.code[i].extra].data);
+        }
+    }
+}
+
 bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *program) {
     Parts found;
 
@@ -199,9 +232,14 @@ bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyP
     }
     Py_INCREF(parts);
     program->parts = parts;
-    return parse(parts, &found) && allocate(program, &found) &&
-           take_rows(program, found.rows, count) && take_tables(program, found.tables) &&
-           take_calls(program, found.calls) && is_sound(program, &found, count, action_elements);
+    if (!parse(parts, &found) || !allocate(program, &found) ||
+        !take_rows(program, found.rows, count) || !take_tables(program, found.tables) ||
+        !take_calls(program, found.calls) || !is_sound(program, &found, count, action_elements)) {
+        return false;
+    }
+    fill_constants(program);
+    note_changes(program);
+    return true;
 }
 
 void release_program(PyProgram *program) {
@@ -212,6 +250,7 @@ void release_program(PyProgram *program) {
     free(program->calls);
     free(program->rows);
     free(program->tables);
+    free(program->filled);
     Py_XDECREF(program->parts);
 }
 
@@ -286,18 +325,19 @@ static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
 
 static bool evaluate(Evaluation *e) {
     const Program *program = &e->program.program;
-    Register registers[PROGRAM_REGISTERS];
+    Register memory[PROGRAM_REGISTERS];
+    Registers registers;
     Notes notes = {.outside = false};
 
-    program_prepare(program, true, registers);
+    program_prepare(program, memory, &registers);
     for (size_t begin = 0; begin < e->count; begin += PROGRAM_WIDTH) {
         const size_t rest = e->count - begin;
         const size_t count = rest < PROGRAM_WIDTH ? rest : PROGRAM_WIDTH;
-        program_run(program, &e->source, begin, count, registers, &notes);
+        program_run(program, &e->source, begin, count, &registers, &notes);
         for (size_t i = 0; i < program->number_of_results; i++) {
             const Py_buffer *b = &e->buffers[FIRST_RESULT + i];
             const size_t size = (size_t)b->itemsize;
-            memcpy((char *)b->buf + begin * size, registers[program->results[i]].bytes,
+            memcpy((char *)b->buf + begin * size, registers.places[program->results[i]],
                    count * size);
         }
     }

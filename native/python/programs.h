@@ -16,6 +16,7 @@ typedef struct {
     Called *calls;
     Row *rows;
     Table *tables;
+    char *filled; /* the memory of the constants' registers */
     Py_ssize_t seen_bytes[MOST_SEEN]; /* the size of each array of observations */
 } PyProgram;
 

@@ -90,6 +90,10 @@ PyObject *py_costs(PyObject *object, PyObject *unused);
 PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_pack(PyObject *object, PyObject *index);
 PyObject *py_adopt(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_keep_records(PyObject *object, PyObject *unused);
+PyObject *py_record_of(PyObject *object, PyObject *index);
 PyObject *py_uses_states(PyObject *object, PyObject *unused);
 
 PyObject *py_save(PyObject *object, PyObject *unused);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -100,7 +100,6 @@ class CompiledEngine(BatchEngine):
         self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
-        self._shape = num_envs, env._output_count
         self._kept = np.zeros_like(self._pool.outputs)
         shape = (num_envs, *(env.action_space.shape or ()))
         dtype = env.action_space.dtype
@@ -120,6 +119,7 @@ class CompiledEngine(BatchEngine):
         self._drawn_shape = len(self._names), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
+        self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
         reads_actions = task.judgement.loads("load_action") or task.loads("load_previous_action")
         is_typed = not self.env._input_writer.all_real  # then an error may name the action
         self._keeps_actions = reads_actions or is_typed or bool(task.left)
@@ -267,14 +267,12 @@ class CompiledEngine(BatchEngine):
         if seeds is not None:
             self._streams.seed(seeds, np.flatnonzero(mask))
         self._streams.require_seeds()
-        seen, drawn = self._new_seen(), self._draw_ahead(mask)
+        seen, drawn = self._layout.new_arrays(), self._draw_ahead(mask)
         self.has_moved = True
         troubled = self._start(mask, seen, drawn)
-        infos: dict[str, Any] = _start_infos(self._names, drawn, mask)
-        observations = seen
-        if self._layout.has_own:
-            observations, own = self._layout.divided(seen, self._n)
-            infos = restricted(own, mask) | infos if own else infos
+        observations, own = self._layout.divided(seen)
+        infos = restricted(own, mask) if own else own
+        infos |= _start_infos(self._names, drawn, mask)
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -284,22 +282,25 @@ class CompiledEngine(BatchEngine):
         self.any_ended = b"\x01" in self.ended.tobytes()  # a fifth of the time of any()
         return observations, infos
 
-    def _new_seen(self) -> Any:
-        """New arrays for what hooks or the pool make of a step: observations and infos."""
-        layout = self._layout
-        return layout.new_arrays() if layout.has_own else np.empty(self._shape, _FLOAT32)
-
-    def _divided(self, seen: Any) -> tuple[Any, dict[str, Any]]:
-        """The observations and infos in these arrays."""
-        layout = self._layout
-        return layout.divided(seen, self._n) if layout.has_own else (seen, {})
-
-    def _draw_ahead(self, mask: MaskArray | None) -> FloatArray:
+    def _draw_ahead(self, mask: MaskArray) -> FloatArray:
         """Make the array of drawn values; those of episodes that only Python can draw are in it."""
         drawn = np.empty(self._drawn_shape)
-        if mask is not None and self._draws_ahead:
+        if self._draws_ahead:
             drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
         return drawn
+
+    def _make_spare(self) -> tuple[FloatArray, Any, MaskArray | None]:
+        """Make arrays for the episodes that start in a step; they serve until one does.
+
+        Returns:
+            For the values drawn and, if episodes start where others end, for the last observations
+            and for which environments these are; otherwise None.
+        """
+        last, started = None, None
+        if self.starts_at_ends and self._starts_in_pass:
+            last, started = self._layout.new_arrays(), np.empty(self._n, _BOOL)
+        self._spare = np.empty(self._drawn_shape), last, started
+        return self._spare
 
     def call(
         self,
@@ -321,17 +322,37 @@ class CompiledEngine(BatchEngine):
         self._longest = self._limit  # this path does not count steps
         self.has_moved = False
         if self._left or (resetting is not None and self._draws_ahead):
-            actions = self._flat(actions)  # a refused step draws nothing
-        drawn, last, started = self._draw_ahead(resetting), None, None
-        if self.starts_at_ends and self._starts_in_pass:
-            last, started = self._new_seen(), np.empty(self._n, _BOOL)
-        if "_get_inputs" in self._left:
-            self._call_get_inputs(actions, resetting)
-        rewards = np.empty(self._n)
-        judged = rewards, np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
-        seen = self._new_seen()
+            actions = self._checked_ahead(actions, resetting)
+        drawn, last, started = self._spare or self._make_spare()
+        if resetting is not None:
+            drawn = self._draw_ahead(resetting)
+        seen = self._layout.new_arrays()
+        judged = np.empty(self._n), np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         play = self._play if resetting is started is None else self._play_with_resets
-        arrays = seen, *judged, drawn, last, started
+        troubled, begun = self._do(play, actions, seen, *judged, drawn, last, started)
+        observations, infos = self._layout.divided(seen)
+        if resetting is not None:
+            infos |= _start_infos(self._names, drawn, resetting)
+        elif begun:
+            infos = self._with_ends(infos, drawn, last, started)
+        result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
+        if troubled or self._left:
+            result = self._completed(result, resetting, started)
+        return result
+
+    def _checked_ahead(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
+        """Check actions before Python draws or calls a hook: a refused step changes nothing."""
+        checked = self._flat(actions)
+        if "_get_inputs" in self._left:
+            self._call_get_inputs(checked, resetting)
+        return checked
+
+    def _do(self, play: Callable[..., Any], actions: Any, *arrays: Any) -> tuple[int, int]:
+        """Let the pool do the step.
+
+        Returns:
+            How many instances had trouble, and how many ended episodes were followed by others.
+        """
         try:
             troubled, ended, begun = play(actions, *arrays)
         except (TypeError, ValueError, BufferError) as error:
@@ -342,29 +363,28 @@ class CompiledEngine(BatchEngine):
             raise
         self.has_moved = True
         self.any_ended = ended > begun
-        infos: dict[str, Any] = {}
-        if resetting is not None:
-            infos = _start_infos(self._names, drawn, resetting)
-        elif begun:
-            infos = LateDict.of(self._infos_at_ends, drawn, last, started)
-        result: StepResult = _make_tuple(StepResult, (seen, *judged, infos))
-        return self._completed(result, troubled, resetting, started)
+        return troubled, begun
 
     def _completed(
-        self, result: StepResult, troubled: int, resetting: MaskArray | None, started: Any
+        self, result: StepResult, resetting: MaskArray | None, started: MaskArray | None
     ) -> StepResult:
-        """Add what the pool does not do itself; that is nothing for most tasks."""
-        if self._layout.has_own:
-            result = self._layout.completed(result)
+        """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
-        if troubled or self._left:
-            self._mend(result, resetting if started is None else started)
+        self._mend(result, resetting if started is None else started)
         return result
+
+    def _with_ends(
+        self, infos: dict[str, Any], drawn: FloatArray, last: Any, started: Any
+    ) -> dict[str, Any]:
+        """Add the infos on the episodes that have followed others in this step."""
+        self._spare = None
+        late = LateDict.of(self._infos_at_ends, drawn, last, started)
+        return infos | late if infos else late
 
     def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:
         """The infos of a step in which episodes have followed others."""
-        observations, infos = self._divided(last)
+        observations, infos = self._layout.divided(last)
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
         final = final_infos(objects, restricted(infos, started), started)
@@ -480,33 +500,51 @@ def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
 
 
 class _Layout:
-    """The arrays that a program stores, and the observations and infos that they make.
+    """The arrays that a program or the pool fills, and the observations and infos in them.
 
     Args:
         task: The programs.
         env: The environment, with the arrays of N.
+
+    Attributes:
+        new_arrays: Makes the arrays of a step: those that the program stores in, or else one for
+            the observations of the pool.
+        divided: Returns the observations and a new dict of infos that such arrays hold.
     """
 
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
-        num_envs = len(env.step_count)
-        self.has_own = bool(task.seen) or not env._pool_observes
-        self._shapes = [((num_envs, *array.shape), array.dtype) for array in task.seen]
+        self._n = len(env.step_count)
+        self._shape = self._n, env._output_count
+        self._shapes = [((self._n, *array.shape), array.dtype) for array in task.seen]
         self._paths = [array.path for array in task.seen]
-        self._is_plain = self._paths == [("observation",)]
+        self._names = [path[-1] for path in self._paths]
+        stores = bool(task.seen) or not env._pool_observes
+        self.new_arrays: Callable[[], Any] = self._stored if stores else self._observed
+        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] = self._alone
+        if stores and self._paths == [("observation",)]:
+            self.divided = self._only
+        elif stores and all(len(path) == 2 and path[0] == "observation" for path in self._paths):
+            self.divided = self._named
+        elif stores:
+            self.divided = self._tree
 
-    def new_arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """New arrays for a step."""
+    def _observed(self) -> npt.NDArray[Any]:
+        return np.empty(self._shape, _FLOAT32)
+
+    def _stored(self) -> tuple[npt.NDArray[Any], ...]:
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
 
-    def completed(self, result: StepResult) -> StepResult:
-        """The result with observations and infos made of the arrays of a step."""
-        observations, infos = self.divided(result.observations, len(result.rewards))
-        return _with(result, observations, infos | result.infos if infos else result.infos)
+    def _alone(self, array: Any) -> tuple[Any, dict[str, Any]]:
+        return array, {}
 
-    def divided(self, arrays: Any, num_envs: int) -> tuple[Any, dict[str, Any]]:
-        """The observations and the infos of these arrays."""
-        if self._is_plain:
-            return arrays[0], {}
+    def _only(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
+        return arrays[0], {}
+
+    def _named(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
+        return dict(zip(self._names, arrays, strict=True)), {}
+
+    def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos of any form."""
         tree: dict[str, Any] = {"observation": {}, "info": {}}
         for path, array in zip(self._paths, arrays, strict=True):
             *parents, name = path
@@ -514,14 +552,8 @@ class _Layout:
             for parent in parents:
                 place = place.setdefault(parent, {})
             place[name] = array
-        infos = with_masks(tree["info"], np.ones(num_envs, np.bool_)) if tree["info"] else {}
+        infos = with_masks(tree["info"], np.ones(self._n, np.bool_)) if tree["info"] else {}
         return tree["observation"], infos
-
-
-def _with(result: StepResult, observations: Any, infos: dict[str, Any]) -> StepResult:
-    judged = result.rewards, result.terminated, result.truncated
-    replaced: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
-    return replaced
 
 
 def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

@@ -227,9 +227,8 @@ def _digitize(x: Any, bins: Any, right: bool = False) -> Any:
 def _interp(
     x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None
 ) -> Symbols:
-    if has_symbols((xp, fp, left, right, period)):
-        raise UntraceableError("numpy.interp has a table that is not constant")
-    graph = graph_of(x)
+    graph = graph_of(x, xp, fp, left, right, period)
+    xp, fp, left, right, period = (_known(graph, part) for part in (xp, fp, left, right, period))
     xs, ys = (np.asarray(part, np.float64) for part in (xp, fp))
     if xs.ndim != 1 or xs.shape != ys.shape or not xs.size:
         raise ValueError("fp and xp are not of the same length")
@@ -247,6 +246,17 @@ def _interp(
         floats.cells,
     )
     return Symbols(graph, cells, np.float64)
+
+
+def _known(graph: Graph, part: Any) -> Any:
+    """The numbers of symbols that are all constants; anything else as it is."""
+    if not has_symbols(part):
+        return part
+    symbols = as_symbols(graph, part)
+    values = [graph.value(cell) for cell in symbols.cells.reshape(-1)]
+    if any(value is None for value in values):
+        raise UntraceableError("numpy.interp has a table that is not constant")
+    return np.array(values, symbols.dtype).reshape(symbols.shape)
 
 
 def _repeated(x: Any, xs: Any, ys: Any, period: float) -> tuple[Any, Any, Any]:

@@ -1,0 +1,102 @@
+"""Programs run in C on arrays of any length, beside the same expressions in numpy."""
+
+import numpy as np
+import pytest
+
+from fmugym.pool import has_native_pool
+from fmugym.vector.hooks.loops import loop_of
+from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
+
+pytestmark = pytest.mark.skipif(not has_native_pool(), reason="programs run in the native pool")
+
+LENGTHS = (1, 15, 16, 17, 63, 64, 65, 130)
+DOUBLE = np.dtype(np.float64)
+
+
+def cast(source, target):
+    return TYPES.index(source) * len(TYPES) + TYPES.index(target)
+
+
+def evaluate(code, rows, actions, results=(), seen=(), constants=(), slots=(), calls=()):
+    """Run a program whose first registers hold the constants."""
+    from fmugym import _native
+
+    lines = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in code]
+    filled = [(np.float64(value).view("u8"), i, 8, 0) for i, value in enumerate(constants)]
+    parts = (
+        np.array(lines, np.uint16).tobytes(),
+        np.array(filled, CONSTANT).tobytes(),
+        np.array(list(slots), SLOT).tobytes(),
+        calls,
+        tuple(rows),
+        (),
+        16,
+        len(seen),
+        tuple(range(len(constants), len(constants) + len(results))),
+    )
+    return _native.evaluate(parts, len(actions), 1, actions, actions, tuple(results), tuple(seen))
+
+
+@pytest.mark.parametrize("n", LENGTHS)
+def test_runs_of_any_length(n):
+    rng = np.random.default_rng(n)
+    x, y, action = rng.normal(size=(3, n))
+    counts = rng.integers(-5, 5, n)
+    flags, numbers, seen = np.zeros(n, np.bool_), np.zeros(n), np.zeros((n, 2), np.float32)
+    sine = loop_of(np.sin, (DOUBLE, DOUBLE)), 1, (8, 8, 0, 0)
+    code = (
+        ("load_row", 0, 3),
+        ("load_row", 1, 4),
+        ("load_action", 0, 5),
+        ("load_row", 2, 6),
+        ("cast", cast("q", "d"), 7, 6),
+        ("call", 0, 8, 3),
+        ("multiply d", 0, 9, 8, 0),
+        ("less d", 0, 1, 9, 5),
+        ("where 8", 0, 2, 1, 4, 7),
+        ("cast", cast("d", "f"), 10, 2),
+        ("store_seen", 0, 0, 10),
+        ("cast", cast("d", "f"), 11, 5),
+        ("store_seen", 1, 0, 11),
+        ("store_row", 3, 0, 9),
+    )
+    slots = (0, 0, 2, TYPES.index("f")), (0, 1, 2, TYPES.index("f"))
+    stored = np.zeros(n)
+    rows = x, y, counts, stored
+    evaluate(code, rows, action, (flags, numbers), (seen,), (3.0,), slots, (sine,))
+    expected = np.sin(x) * 3.0
+    chosen = np.where(expected < action, y, counts)
+    np.testing.assert_array_equal(stored, expected)
+    np.testing.assert_array_equal(flags, expected < action)
+    np.testing.assert_array_equal(numbers, chosen)
+    np.testing.assert_array_equal(seen, np.stack([chosen, action], axis=1).astype(np.float32))
+
+
+@pytest.mark.parametrize("n", LENGTHS)
+def test_rows_that_a_program_both_reads_and_writes(n):
+    rng = np.random.default_rng(n)
+    first, second = rng.normal(size=(2, n))
+    before = first.copy(), second.copy()
+    code = (
+        ("load_row", 0, 0),
+        ("load_row", 1, 1),
+        ("store_row", 0, 0, 1),
+        ("store_row", 1, 0, 0),
+    )
+    evaluate(code, (first, second), np.zeros(n))
+    np.testing.assert_array_equal(first, before[1])
+    np.testing.assert_array_equal(second, before[0])
+
+
+@pytest.mark.parametrize(
+    "line", [("load_row", 0, 0), ("load_row", 0, 1, 60000), ("add d", 0, 0, 1, 1)], ids=str
+)
+def test_constants_stay_and_every_operand_exists(line):
+    with pytest.raises(ValueError, match="a program is not sound"):
+        evaluate((line,), (np.zeros(3),), np.zeros(3), constants=(1.0,))
+
+
+def test_a_row_that_is_not_aligned():
+    row = np.zeros(25, np.uint8)[1:].view(np.float64)
+    with pytest.raises(ValueError, match="aligned"):
+        evaluate((("load_row", 0, 0),), (row,), np.zeros(3))
