@@ -12,6 +12,7 @@
 #include "floats.h"
 #include "fmi.h"
 #include "log.h"
+#include "mark.h"
 #include "pace.h"
 #include "platform.h"
 #include "play.h"
@@ -61,6 +62,7 @@ typedef struct {
     double *output_values; /* one row of count per output */
     int8_t *status;
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
+    const Mark *mark; /* where a crash is noted, or NULL */
 } Settings;
 
 /* The health counters of each instance. fmugym/pool/health.py lists their names in this order. */

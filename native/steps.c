@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "inside.h"
 #include "instances.h"
 
 static const char *const BAD_INPUTS = "the inputs are not finite";
@@ -177,9 +178,11 @@ void instance_copy_outputs(const Pool *pool, const Instance *me, double *values)
 Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
     const size_t count = s->outputs->count;
+    begin_call(CALL_READ);
     const Status got = access_get(s->outputs, me->library, me->component, scratch.values,
                                   scratch.typed, &pool->floats);
 
+    end_call();
     if (got > STATUS_WARNING) {
         return instance_fail(pool, me, "reading the outputs", got);
     }

@@ -193,7 +193,7 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *categories, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *mark, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
@@ -217,11 +217,11 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "model",   "token",  "resources",  "paths",
-                            "private", "logging", "states", "categories", NULL};
+                            "private", "logging", "states", "categories", "mark", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iyyyO!pppO!:library", names, &a->version, &s->model, &s->token,
+    return parse_group(group, "$iyyyO!pppO!O:library", names, &a->version, &s->model, &s->token,
                        &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories);
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -399,7 +399,8 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;
-    return take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
+    return take_mark(a->mark, &s->mark) &&
+           take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }
 
