@@ -44,8 +44,9 @@ from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.mark import Mark
 from fmugym.pool.saving import SavingPool, Serialized
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -99,6 +100,7 @@ class NativePool(SavingPool):
             instantiated only once per process. See ``fmugym.trial.shared_globals``.
         first_index: The number of the first instance in messages.
         counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
+        mark: Where a crash inside the FMU is noted.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -122,6 +124,7 @@ class NativePool(SavingPool):
         private_libraries: bool | None = None,
         first_index: int = 0,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
         if private_libraries is None:
@@ -136,6 +139,7 @@ class NativePool(SavingPool):
         self._counts = no_counts(num_instances) if counts is None else counts
         self._result = self.outputs, self.statuses
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
+        self._mark = mark
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
         self._listener = _Listener(fmu.description, spec)
         try:
@@ -171,6 +175,7 @@ class NativePool(SavingPool):
                     "logging": log.isEnabledFor(logging.INFO),
                     "states": description.capabilities.can_get_and_set_fmu_state,
                     "categories": tuple(c.encode() for c in description.error_categories),
+                    "mark": None if self._mark is None else self._mark.page,
                 },
                 experiment={
                     "start_time": spec.start_time,
@@ -191,6 +196,7 @@ class NativePool(SavingPool):
                     "outputs": self._access(spec.outputs),
                     "num_observed": spec.num_observed,
                     "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                    "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
                 },
                 arrays={
                     "inputs": self.inputs,

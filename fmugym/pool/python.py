@@ -23,6 +23,7 @@ from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.mark import END, RESET, STEP, Mark, calling
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.slot import Slot, Snapshot
@@ -43,6 +44,7 @@ class PythonPool(SavingPool):
         num_instances: N.
         log: The logger that gets the FMU's messages.
         counts: Gets the counts of ``health``, shape (N, HEALTH_COUNTS).
+        mark: Where a crash inside the FMU is noted.
 
     Raises:
         FMULoadError: If the FMU cannot be loaded or instantiated.
@@ -56,6 +58,7 @@ class PythonPool(SavingPool):
         log: logging.Logger,
         *,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -66,13 +69,17 @@ class PythonPool(SavingPool):
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
-        self._library = Library(fmu, log)
+        self._mark = mark
+        self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
+        with self._resetting:
+            self._library = Library(fmu, log)
         pacer = Pacer(spec)
         try:
-            self._slots = [
-                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
-                for i in range(num_instances)
-            ]
+            with self._resetting:
+                self._slots = [
+                    Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
+                    for i in range(num_instances)
+                ]
             raise_caught()
         except BaseException:
             self._library.close()
@@ -95,9 +102,10 @@ class PythonPool(SavingPool):
     def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
-        for index, slot in enumerate(self._slots):
-            if mask is None or mask[index]:
-                self._note(index, slot.reset(variables, values[:, index]))
+        with self._resetting:
+            for index, slot in enumerate(self._slots):
+                if mask is None or mask[index]:
+                    self._note(index, slot.reset(variables, values[:, index]))
         raise_caught()
         self._note_reset(variables, values, mask)
 
@@ -110,9 +118,10 @@ class PythonPool(SavingPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        for index, slot in enumerate(self._slots):
-            if skip is None or not skip[index]:
-                self._note(index, slot.step())
+        with self._stepping:
+            for index, slot in enumerate(self._slots):
+                if skip is None or not skip[index]:
+                    self._note(index, slot.step())
         if observations is not None:
             np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
         raise_caught()
@@ -244,7 +253,8 @@ class PythonPool(SavingPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._library.close()
+        with calling(self._mark, END):
+            self._library.close()
         restore_arithmetic()
         raise_caught()
 
