@@ -120,8 +120,8 @@ class CompiledEngine(BatchEngine):
         self._prepared = False
         if task is None or not _can_draw(task, plan):
             return
-        self._names, self._left = plan.drawn_names, task.left
-        self._drawn_shape = len(self._names), self._n
+        self._left = task.left
+        self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
         self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
@@ -234,9 +234,9 @@ class CompiledEngine(BatchEngine):
                 for name, start in env._start_inputs
             ),
             "drawn_variables": tuple(
-                (flat[name][0], number)
-                for number, name in enumerate(plan.drawn_names)
-                if name in flat
+                (flat[draw.name][draw.element or 0], number)
+                for number, draw in enumerate(plan.draws)
+                if draw.name in flat
             ),
             "variable_starts": tuple(
                 (row, np.array(value, row.dtype).tobytes())
@@ -277,7 +277,7 @@ class CompiledEngine(BatchEngine):
         self.has_moved = True
         troubled = self._start(mask, seen, drawn)
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
-        infos = restricted(infos, mask) | _start_infos(self._names, drawn, mask)
+        infos = restricted(infos, mask) | _start_infos(self.env._plan, drawn, mask)
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -371,7 +371,7 @@ class CompiledEngine(BatchEngine):
     ) -> dict[str, Any]:
         """Add the infos on the episodes that have started in this step."""
         if resetting is not None:
-            infos["drawn"] = LateDict.of(_told, self._names, drawn, resetting)
+            infos["drawn"] = LateDict.of(_told, self.env._plan, drawn, resetting)
             infos["_drawn"] = resetting
             return infos
         self._spare = None
@@ -393,7 +393,7 @@ class CompiledEngine(BatchEngine):
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
         final = final_infos(objects, restricted(infos, started), started)
-        return _start_infos(self._names, drawn, started) | final
+        return _start_infos(self.env._plan, drawn, started) | final
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -552,9 +552,9 @@ class _Layout:
         return tree["observation"], infos
 
 
-def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return {"drawn": LateDict.of(_told, names, drawn, mask), "_drawn": mask}  # rarely read
+def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
 
 
-def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(dict(zip(names, drawn, strict=True)), mask)
+def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return coded(plan.named(drawn), mask)
