@@ -15,7 +15,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import SimulationError
 from fmugym.fmi.library import Library
-from fmugym.fmi.log import raise_caught
+from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.attendant import AttendedPool, InitialState
@@ -67,11 +67,11 @@ class PythonPool(AttendedPool):
         self._library = Library(fmu, log)
         pacer = Pacer(spec)
         try:
-            self._slots = [
-                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
-                for i in range(num_instances)
-            ]
-            raise_caught()
+            with fmu_calls:
+                self._slots = [
+                    Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
+                    for i in range(num_instances)
+                ]
         except BaseException:
             self._library.close()
             raise
@@ -91,10 +91,10 @@ class PythonPool(AttendedPool):
     def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
-        for index, slot in enumerate(self._slots):
-            if mask is None or mask[index]:
-                self._note(index, slot.reset(variables, values[:, index]))
-        raise_caught()
+        with fmu_calls:
+            for index, slot in enumerate(self._slots):
+                if mask is None or mask[index]:
+                    self._note(index, slot.reset(variables, values[:, index]))
         self._note_reset(variables, values, mask)
 
     def step(
@@ -106,12 +106,13 @@ class PythonPool(AttendedPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        for index, slot in enumerate(self._slots):
-            if skip is None or not skip[index]:
-                self._note(index, slot.step())
-        if observations is not None:
-            np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
-        raise_caught()
+        with fmu_calls:
+            for index, slot in enumerate(self._slots):
+                if skip is None or not skip[index]:
+                    self._note(index, slot.step())
+            if observations is not None:
+                observed = self.outputs[: self._spec.num_observed]
+                np.copyto(observations, observed.T, casting="same_kind")
         if self._is_recording:
             self._note_step(skip)
         return self.outputs, self.statuses
@@ -132,11 +133,10 @@ class PythonPool(AttendedPool):
         if self._watch is not None:
             self._watch.has_snapshots = True
         try:
-            snapshot = [slot.save() for slot in self._slots]
+            with fmu_calls:
+                return [slot.save() for slot in self._slots]
         finally:
             restore_arithmetic()
-        raise_caught()
-        return snapshot
 
     def restore(
         self, snapshot: list[Snapshot], mask: MaskArray | None = None
@@ -148,9 +148,9 @@ class PythonPool(AttendedPool):
         for index in chosen:
             self._slots[index].require_own(snapshot[index])
         self._drop_recording()
-        for index in chosen:
-            self._note(index, self._slots[index].restore(snapshot[index]))
-        raise_caught()
+        with fmu_calls:
+            for index in chosen:
+                self._note(index, self._slots[index].restore(snapshot[index]))
         return self.outputs, self.statuses
 
     def failure(self, index: int) -> str:
@@ -160,11 +160,10 @@ class PythonPool(AttendedPool):
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         try:
-            values = np.stack([slot.read(variables) for slot in self._slots], axis=1)
+            with fmu_calls:
+                return np.stack([slot.read(variables) for slot in self._slots], axis=1)
         finally:
             restore_arithmetic()
-        raise_caught()
-        return values
 
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
@@ -173,7 +172,8 @@ class PythonPool(AttendedPool):
     def pack(self, index: int) -> InitialState | None:
         """See ``AttendedPool.pack``."""
         try:
-            return self._slots[index].pack()
+            with fmu_calls:
+                return self._slots[index].pack()
         finally:
             restore_arithmetic()
 
@@ -186,7 +186,8 @@ class PythonPool(AttendedPool):
     ) -> bool:
         """See ``AttendedPool.adopt``."""
         try:
-            return self._slots[index].adopt(variables, values, state)
+            with fmu_calls:
+                return self._slots[index].adopt(variables, values, state)
         finally:
             restore_arithmetic()
 
@@ -212,9 +213,11 @@ class PythonPool(AttendedPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._library.close()
-        restore_arithmetic()
-        raise_caught()
+        try:
+            with fmu_calls:
+                self._library.close()
+        finally:
+            restore_arithmetic()
 
 
 def _recycle(slots: Sequence[Slot]) -> None:
