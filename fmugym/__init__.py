@@ -1,30 +1,37 @@
 """Co-simulation FMUs as Gymnasium environments.
 
 Importing this package registers its environments, so that ``gymnasium.make("fmugym/...")`` works.
+Everything else is imported when it is first used.
 """
 
-from fmugym import envs
-from fmugym.archive.bundled import bundled_fmu
-from fmugym.archive.fmu import FMU
-from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.config import EnvConfig
-from fmugym.declared import Task, TaskEnv, load
-from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
-from fmugym.errors import (
-    ConfigError,
-    ContractError,
-    FMUGymError,
-    FMULoadError,
-    LicenceError,
-    SimulationError,
-    TaskError,
-)
-from fmugym.fmi.status import Status
-from fmugym.pool import Backend, Paced
-from fmugym.registration import register
-from fmugym.tools.linearization import LinearModel, linearize
-from fmugym.vector import FMUVectorEnv
+from typing import TYPE_CHECKING
+
+from fmugym.lazy import lazily
+from fmugym.registration import register, register_bundled
+
+if TYPE_CHECKING:
+    from fmugym import envs
+    from fmugym.archive.bundled import bundled_fmu
+    from fmugym.archive.fmu import FMU
+    from fmugym.archive.safe_zip import ArchiveLimits
+    from fmugym.config import EnvConfig
+    from fmugym.declared import Task, TaskEnv, load
+    from fmugym.distributions import Choice, LogUniform, Normal, Uniform
+    from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
+    from fmugym.errors import (
+        ConfigError,
+        ContractError,
+        FMUGymError,
+        FMULoadError,
+        LicenceError,
+        SimulationError,
+        TaskError,
+    )
+    from fmugym.fmi.status import Status
+    from fmugym.pool import Backend, Paced
+    from fmugym.task.snapshot import Snapshot
+    from fmugym.tools.linearization import LinearModel, linearize
+    from fmugym.vector import FMUVectorEnv
 
 __all__ = [
     "FMU",
@@ -47,6 +54,7 @@ __all__ = [
     "Normal",
     "Paced",
     "SimulationError",
+    "Snapshot",
     "Status",
     "Task",
     "TaskEnv",
@@ -58,3 +66,41 @@ __all__ = [
     "load",
     "register",
 ]
+
+_MODULES = {
+    "archive.bundled": ["bundled_fmu"],
+    "archive.fmu": ["FMU"],
+    "archive.safe_zip": ["ArchiveLimits"],
+    "config": ["EnvConfig"],
+    "declared": ["Task", "TaskEnv", "load"],
+    "distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
+    "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"],
+    "errors": [
+        *("ConfigError", "ContractError", "FMUGymError"),
+        *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),
+    ],
+    "fmi.status": ["Status"],
+    "pool": ["Backend", "Paced"],
+    "task.snapshot": ["Snapshot"],
+    "tools.linearization": ["LinearModel", "linearize"],
+    "vector": ["FMUVectorEnv"],
+}
+_ROOMS = [
+    *("archive", "checks", "config", "declared", "distributions", "env", "envs", "errors", "fmi"),
+    *("identification", "lab", "pool", "registration", "rendering", "sb3", "task", "testing"),
+    *("tools", "trial", "vector"),
+]
+"""Modules and packages that ``fmugym.name`` imports."""
+
+__getattr__ = lazily(
+    __name__,
+    {room: f"{__name__}.{room}" for room in _ROOMS}
+    | {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names},
+)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register_bundled()

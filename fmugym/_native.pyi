@@ -109,6 +109,24 @@ class Draws:
         """
 
 @final
+class Mark:
+    """A mapped page of a file, in which a crash inside an FMU leaves its signal and the call.
+
+    Args:
+        file: The descriptor of a file of at least 4096 bytes; not needed afterwards.
+
+    Raises:
+        OSError: If the system cannot do so.
+    """
+
+    def __new__(cls, file: int, /) -> Mark: ...
+    def begin(self, call: int, /) -> None:
+        """Note that this thread is inside an FMU that Python calls; see ``enum FmuCall``."""
+
+    def end(self) -> None:
+        """End that."""
+
+@final
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
 
@@ -124,6 +142,7 @@ class Library(TypedDict):
     logging: bool
     states: bool
     categories: tuple[bytes, ...]
+    mark: Mark | None
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -148,6 +167,7 @@ class Variables(TypedDict):
     outputs: Access
     num_observed: int
     strings: tuple[tuple[int, bytes], ...]
+    sampling: bytes
 
 class Arrays(TypedDict):
     """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
@@ -320,6 +340,46 @@ class Pool:
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
+
+    def bundle(self, indices: Array, ends: Array, steps: Array, /) -> bytes | int:
+        """Serialize the states of M instances.
+
+        Args:
+            indices: The instances, int64, shape (M,).
+            ends: Filled with where each state ends, int64, shape (M,).
+            steps: Filled with the communication steps of each, int64, shape (M,).
+
+        Returns:
+            The states one after the other, or the index of an instance that failed.
+        """
+
+    def unbundle(
+        self,
+        indices: Array,
+        sources: Array,
+        data: bytes,
+        ends: Array,
+        steps: Array,
+        outputs: Array,
+        /,
+    ) -> int:
+        """Restore serialized states; instance ``indices[i]`` gets the one at ``sources[i]``.
+
+        Returns:
+            How many of the instances have a status worse than a warning.
+        """
+
+    def keep_records(self) -> None:
+        """Keep the start values and the inputs of all episodes, from the next reset on."""
+
+    def record_of(
+        self, index: int, /
+    ) -> tuple[tuple[tuple[int, int, float], ...], int, bytes] | None:
+        """The start values (type, reference, value), number of steps, and inputs of an episode.
+
+        Returns:
+            None if the episode is not known as a whole.
+        """
 
     def costs(self) -> tuple[float, float, float]:
         """The measured ns per instance of ``step``, ``reset``, ``step_or_reset``; 0 if unknown."""

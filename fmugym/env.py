@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from math import hypot, isfinite
 from typing import Any, ClassVar, Final, Never
 
@@ -23,6 +25,8 @@ from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
 from fmugym.task.results import FLOAT32_LIMIT, as_info
+from fmugym.task.saving import columns_of, place_columns
+from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
@@ -334,6 +338,65 @@ class FMUEnv(Constructed):
         if not self._is_finite(observation):
             raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
         return observation, self.config.fault_reward, self.done, not self.done, info
+
+    # Snapshots.
+
+    @cached_property
+    def _scope(self) -> dict[str, str]:
+        return scope_of(self)
+
+    def save_state(self) -> Snapshot:
+        """Save the episode at this moment.
+
+        The first call for an FMU that is not bundled may take some seconds: a trial in two other
+        processes shows whether its serialized states work. If they do not, or if the FMU offers
+        none, the snapshot holds the inputs of the episode; see ``Snapshot.method``.
+
+        Returns:
+            A value that this environment, and every other one with the same FMU and config, can
+            restore, also in another process.
+
+        Raises:
+            SimulationError: Before the first reset, after ``close``, if a real system stands in
+                for the FMU, or if the FMU fails.
+        """
+        pool = self._open_pool("save_state")
+        if not self._was_reset:
+            raise SimulationError("save_state was called before the first reset")
+        bundle = pool.save_instances(np.zeros(1, np.int64))
+        return Snapshot(self._scope, columns_of(self), bundle)
+
+    def restore_state(self, snapshot: Snapshot) -> Any:
+        """Go on from a snapshot, with its random generator, too; no reset is needed before.
+
+        Args:
+            snapshot: Of one environment with the same FMU and config.
+
+        Returns:
+            The observation at the moment of the snapshot.
+
+        Raises:
+            ConfigError: If the snapshot is of another FMU or config, or not of one environment.
+            SimulationError: If the FMU fails, or if a real system stands in for it.
+        """
+        pool = self._open_pool("restore_state")
+        columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
+        if not self._was_reset:
+            self._prepare_hooks()
+        self._ended = True  # there is no episode if the FMU fails
+        first = np.zeros(1, np.int64)
+        if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
+            raise SimulationError(pool.failure(0))
+        place_columns(self, columns, 0)
+        return self._observation_and_info()[0]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
+        """Make a new environment in the middle of the same episode, if there is one."""
+        args, kwargs = copy.deepcopy(self._constructor_arguments, memo)
+        twin = type(self)(*args, **kwargs)
+        if self._was_reset and self._pool is not None:
+            twin.restore_state(self.save_state())
+        return twin
 
     def _fault_rate(self) -> float:
         return float(fault_rates(self._open_pool("health").health())[0])

@@ -14,7 +14,15 @@ from fmugym.errors import ConfigError, shown
 from fmugym.vector import vectorized
 from fmugym.vector.entry_points import vector_entry_point
 
-__all__ = ["register"]
+__all__ = ["register", "register_bundled"]
+
+_BUNDLED: dict[str, dict[str, Any]] = {
+    "CartPole": {"max_episode_steps": 500, "reward_threshold": 475.0},
+    "Pendulum": {"max_episode_steps": 200},
+    "ModelicaCartPole": {"max_episode_steps": 200},
+    "CloudPendulum": {"max_episode_steps": 500},
+}
+"""Specs of the environments of ``fmugym.envs``, by name."""
 
 
 def register(
@@ -57,6 +65,13 @@ def register(
         )
     except gymnasium.error.Error as error:
         raise ConfigError(f"{shown(env_id)} cannot be registered: {error}") from None
+
+
+def register_bundled() -> None:
+    """Register the environments that come with the package, without importing them."""
+    for name, spec in _BUNDLED.items():
+        register(f"fmugym/{name}-v0", f"fmugym.envs:{name}Env", **spec)
+    register("fmugym/FMU-v0", "fmugym.declared:load")
 
 
 def _entry_point(env: Any) -> Any:

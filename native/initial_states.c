@@ -3,7 +3,9 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "inside.h"
 #include "instances.h"
+#include "records.h"
 
 static const size_t STATES_LIMIT = (size_t)256 << 20; /* total bytes of one pool's initial states */
 
@@ -71,8 +73,10 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     }
     pace_wait(&pool->pace);
     instance_begin_turn(pool);
+    begin_call(CALL_INITIALIZE);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
+    end_call();
     instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
@@ -248,6 +252,10 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     const bool recorded = is_to_be_recorded(pool, me);
     const Status status = reset_instance(pool, me, call, scratch);
 
+    if (pool->records != NULL) {
+        matrix_gather(&call->start_values, index_of(pool, me), call->start->count, scratch.values);
+        record_begin(pool, index_of(pool, me), call->start, scratch.values);
+    }
     if (recorded && status <= STATUS_WARNING) {
         record_start(pool, me, call, scratch);
     } else if (recorded) {

@@ -12,6 +12,7 @@
 #include "floats.h"
 #include "fmi.h"
 #include "log.h"
+#include "mark.h"
 #include "pace.h"
 #include "platform.h"
 #include "play.h"
@@ -21,6 +22,10 @@ typedef struct {
     uint32_t reference;
     const char *text;
 } StringValue;
+
+/* What a step gives of the values that an output has after each of its substeps.
+ * fmugym/pool/spec.py lists their names in this order. */
+typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX } Sampling;
 
 /* The settings of a pool. Everything they point to must stay in place as long as the pool
  * exists. */
@@ -50,12 +55,14 @@ typedef struct {
     const StringValue *strings;
     size_t number_of_strings;
     const Access *inputs, *outputs;
+    const unsigned char *sampling; /* one Sampling for each output, or NULL if all are the last */
     size_t num_observed;
     size_t count;
     size_t threads;
     double *output_values; /* one row of count per output */
     int8_t *status;
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
+    const Mark *mark; /* where a crash is noted, or NULL */
 } Settings;
 
 /* The health counters of each instance. fmugym/pool/health.py lists their names in this order. */
@@ -126,6 +133,21 @@ typedef struct Snapshot {
     uint32_t *generations;
 } Snapshot;
 
+/* A value that was set before initialization. */
+typedef struct {
+    double value;
+    uint32_t reference, type;
+} RecordedStart;
+
+/* The episode of an instance so far; see records.h. */
+typedef struct {
+    RecordedStart *starts;
+    size_t number_of_starts;
+    double *inputs; /* of each step */
+    size_t rows, room;
+    bool whole; /* whether no step of the episode is missing */
+} Record;
+
 enum { SAMPLES = 8 };
 
 /* The measured cost of an operation: a low quantile of the last samples. Other load on the
@@ -162,6 +184,9 @@ typedef struct Pool {
     size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
+    void **spares;   /* for each instance, a state whose memory is used again, or NULL */
+    Atomic wasteful; /* whether the FMU makes a new state instead of overwriting one */
+    Record *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Tape tape;

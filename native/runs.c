@@ -5,15 +5,21 @@
 
 #include "initial_states.h"
 #include "instances.h"
+#include "records.h"
 #include "starts.h"
 
-static Status restore_instance(Task *task, Instance *me, Scratch scratch) {
+static Status restore_instance(Task *task, Instance *me, size_t place, Scratch scratch) {
     const size_t index = index_of(task->pool, me);
 
+    if (task->states != NULL) {
+        const size_t number = (size_t)task->states->sources[place];
+        return instance_unbundle(task->pool, me, task->states, number);
+    }
     health_count_steps(task->pool, me);
     if (index == 0) {
         tape_drop(&task->pool->tape);
     }
+    record_drop(task->pool, index);
     const Status status = instance_restore(task->pool, me, task->snapshot->states[index]);
     if (status > STATUS_WARNING) {
         return status;
@@ -34,7 +40,7 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
             continue;
         }
         Instance *me = &pool->instances[index];
-        const Status status = task->operation == RESTORE ? restore_instance(task, me, scratch)
+        const Status status = task->operation == RESTORE ? restore_instance(task, me, i, scratch)
                                                          : instance_reset(pool, me, call, scratch);
         troubled += note_status(task, index, status);
         if (call->observations != NULL) {
@@ -308,8 +314,21 @@ static size_t take_not_small(Task *task, size_t begin, size_t count, double *out
     return troubled;
 }
 
+static void record_inputs(const Task *task, size_t begin, size_t count, const double *inputs) {
+    const size_t width = task->pool->settings.inputs->count;
+
+    for (size_t j = 0; j < count; j++, inputs += width) {
+        if (!is_in(task->call->mask, begin + j)) {
+            record_add(task->pool, begin + j, inputs);
+        }
+    }
+}
+
 static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
     gather_inputs(task, begin, count, scratch.inputs);
+    if (task->pool->records != NULL) {
+        record_inputs(task, begin, count, scratch.inputs);
+    }
     scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
 

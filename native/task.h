@@ -3,7 +3,7 @@
 #ifndef FMUGYM_TASK_H
 #define FMUGYM_TASK_H
 
-#include "pool.h"
+#include "bundles.h"
 #include "steps.h"
 
 /* What a call does; all threads that work on it write to its last fields. */
@@ -12,6 +12,7 @@ typedef struct {
     const Call *call;
     int operation;
     const Snapshot *snapshot; /* the snapshot to restore */
+    const States *states;     /* or the serialized states */
     bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */

@@ -10,7 +10,7 @@ import fmugym
 PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
-    {"errors", "_native"},
+    {"errors", "lazy", "_native"},
     {"checks"},
     {"archive", "distributions", "rendering"},
     {"fmi"},

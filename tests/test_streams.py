@@ -11,6 +11,7 @@ from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
 from fmugym.pool import has_native_pool
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.generators import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector import streams as module
 from fmugym.vector.streams import EpisodeStreams
@@ -58,7 +59,7 @@ def plan_of(*distributions):
 
 
 def state_of(streams, index):
-    return module._state_of(streams.states[index].tolist())
+    return generator_state_of(streams.states[index].tolist())
 
 
 def test_seeds_of_any_size(native):

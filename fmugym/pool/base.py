@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.errors import SimulationError
+from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.pool.tape import Judge
@@ -151,6 +152,40 @@ class Pool(ABC):
         """Free all instances. It may be called more than once."""
 
     # Optional abilities. The defaults are for pools without them.
+
+    @property
+    def save_method(self) -> SaveMethod | None:
+        """How ``save_instances`` saves; None if the pool cannot do it."""
+        return None
+
+    def save_instances(self, indices: IndexArray) -> Bundle:
+        """Save the states of single instances, as a value that fits any others.
+
+        Args:
+            indices: The instances, shape (M,). All must have been reset once.
+
+        Raises:
+            SimulationError: If the pool cannot save states, or an instance fails.
+        """
+        raise SimulationError(f"a {type(self).__name__} has no states that could be saved")
+
+    def restore_instances(
+        self, bundle: Bundle, sources: IndexArray, indices: IndexArray
+    ) -> StatusArray:
+        """Let instances go on from saved states of any instances of the same FMU.
+
+        Args:
+            bundle: From ``save_instances`` of any pool of the same FMU and specification.
+            sources: Which of the states each instance gets, shape (M,).
+            indices: The instances, shape (M,), each of them once.
+
+        Returns:
+            The statuses of all instances, shape (N,).
+
+        Raises:
+            SimulationError: If the pool cannot restore states.
+        """
+        raise SimulationError(f"a {type(self).__name__} has no states that could be restored")
 
     @property
     def is_real(self) -> bool:

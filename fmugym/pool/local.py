@@ -6,12 +6,14 @@ import logging
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError
-from fmugym.pool.attendant import Attendant, AttendedPool
+from fmugym.pool.attendant import Attendant
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
+from fmugym.pool.mark import Mark
 from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.python import PythonPool
+from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.states import InitialStates
 
@@ -31,7 +33,8 @@ def local_pool(
     first_index: int = 0,
     counts: HealthArray | None = None,
     attended: bool = True,
-) -> AttendedPool:
+    mark: Mark | None = None,
+) -> SavingPool:
     """Make a pool that loads the FMU into this process.
 
     Args:
@@ -45,6 +48,7 @@ def local_pool(
         first_index: See ``NativePool``.
         counts: See ``NativePool``.
         attended: Whether an ``Attendant`` goes with resets where one is needed.
+        mark: Where a crash inside the FMU is noted.
 
     Raises:
         LicenceError: If the FMU gets no licence.
@@ -59,7 +63,7 @@ def local_pool(
             "instances, which only the native pool or isolation='process' can provide"
         )
     announce(INITIALIZATION)  # an FMU may do all of its work when it is instantiated
-    pool: AttendedPool
+    pool: SavingPool
     if native:
         from fmugym.pool.native import NativePool
 
@@ -72,9 +76,10 @@ def local_pool(
             private_libraries=private_libraries,
             first_index=first_index,
             counts=counts,
+            mark=mark,
         )
     else:
-        pool = PythonPool(fmu, spec, num_instances, log, counts=counts)
+        pool = PythonPool(fmu, spec, num_instances, log, counts=counts, mark=mark)
     states = InitialStates(spec) if spec.state_files else None
     pool.attend(Attendant.of(fmu.path.name, spec, log, states) if attended else states)
     announce(STEP)

@@ -32,7 +32,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.status import Status
 from fmugym.fmi.words import quoted, unpacked
-from fmugym.pool.attendant import AttendedPool, InitialState
+from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -40,10 +40,13 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.mark import Mark
+from fmugym.pool.saving import SavingPool, Serialized
+from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -82,7 +85,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(AttendedPool):
+class NativePool(SavingPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -97,6 +100,7 @@ class NativePool(AttendedPool):
             instantiated only once per process. See ``fmugym.trial.shared_globals``.
         first_index: The number of the first instance in messages.
         counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
+        mark: Where a crash inside the FMU is noted.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -120,6 +124,7 @@ class NativePool(AttendedPool):
         private_libraries: bool | None = None,
         first_index: int = 0,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
         if private_libraries is None:
@@ -134,6 +139,7 @@ class NativePool(AttendedPool):
         self._counts = no_counts(num_instances) if counts is None else counts
         self._result = self.outputs, self.statuses
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
+        self._mark = mark
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
         self._listener = _Listener(fmu.description, spec)
         try:
@@ -142,6 +148,8 @@ class NativePool(AttendedPool):
             fmu.close()
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
+        if self._prepare_saving(fmu.description, spec):
+            self._pool.keep_records()
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
@@ -167,6 +175,7 @@ class NativePool(AttendedPool):
                     "logging": log.isEnabledFor(logging.INFO),
                     "states": description.capabilities.can_get_and_set_fmu_state,
                     "categories": tuple(c.encode() for c in description.error_categories),
+                    "mark": None if self._mark is None else self._mark.page,
                 },
                 experiment={
                     "start_time": spec.start_time,
@@ -187,6 +196,7 @@ class NativePool(AttendedPool):
                     "outputs": self._access(spec.outputs),
                     "num_observed": spec.num_observed,
                     "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                    "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
                 },
                 arrays={
                     "inputs": self.inputs,
@@ -321,6 +331,34 @@ class NativePool(AttendedPool):
             index, self._access(variables), values.tobytes(), state.outputs, state.data
         )
 
+    def serialize_states(self, indices: IndexArray) -> Serialized:
+        """See ``SavingPool.serialize_states``."""
+        ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
+        data = self._open_pool().bundle(np.ascontiguousarray(indices), ends, steps)
+        if isinstance(data, int):
+            raise SimulationError(self.failure(data))
+        return data, ends, steps
+
+    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``SavingPool.deserialize_states``."""
+        pool = self._open_pool()
+        sources, indices = np.ascontiguousarray(sources), np.ascontiguousarray(indices)
+        pool.unbundle(indices, sources, bundle.data, bundle.ends, bundle.steps, bundle.outputs)
+
+    def record_of(self, index: int) -> Record | None:
+        """See ``SavingPool.record_of``."""
+        found = self._open_pool().record_of(index)
+        if found is None:
+            return None
+        starts, steps, inputs = found
+        types, references, values = zip(*starts, strict=True) if starts else ((), (), ())
+        variables = self._listener.variables(bytes(types), list(references))
+        return Record(
+            tuple(variable.name for variable in variables),
+            np.array(values, np.float64),
+            np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
+        )
+
     def _count_steps(self) -> None:
         if self._close.alive:
             self._pool.count_steps()
@@ -342,6 +380,8 @@ class NativePool(AttendedPool):
         if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
             return False
         self._open_pool().begin_by(False, method == ResetMethod.INSTANCE)
+        self._pool.keep_records()
+        self._mistrust_states()
         self._spec = replace(self._spec, reset_method=method)
         return True
 
@@ -567,7 +607,7 @@ class _Listener:
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
         return Tape(
-            self._variables(types, np.frombuffer(references, np.uint32).tolist()),
+            self.variables(types, np.frombuffer(references, np.uint32).tolist()),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),
@@ -575,7 +615,7 @@ class _Listener:
             np.frombuffer(statuses, np.int8),
         )
 
-    def _variables(self, types: bytes, references: list[int]) -> tuple[Variable, ...]:
+    def variables(self, types: bytes, references: list[int]) -> tuple[Variable, ...]:
         """Find variables; aliases are as good."""
         version = self._description.fmi_major_version
         known = {

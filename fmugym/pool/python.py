@@ -18,11 +18,14 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
-from fmugym.pool.attendant import AttendedPool, InitialState
+from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.mark import END, RESET, STEP, Mark, calling
 from fmugym.pool.pacing import Pacer
+from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.slot import Slot, Snapshot
 from fmugym.pool.spec import ResetMethod
 
@@ -32,7 +35,7 @@ _WARNING: Final = int(Status.WARNING)
 """An enumeration's member has Python code, in which numpy drops what a signal handler raises."""
 
 
-class PythonPool(AttendedPool):
+class PythonPool(SavingPool):
     """N instances stepped one after another; see ``Pool`` for the contract.
 
     Args:
@@ -41,6 +44,7 @@ class PythonPool(AttendedPool):
         num_instances: N.
         log: The logger that gets the FMU's messages.
         counts: Gets the counts of ``health``, shape (N, HEALTH_COUNTS).
+        mark: Where a crash inside the FMU is noted.
 
     Raises:
         FMULoadError: If the FMU cannot be loaded or instantiated.
@@ -54,6 +58,7 @@ class PythonPool(AttendedPool):
         log: logging.Logger,
         *,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -64,10 +69,13 @@ class PythonPool(AttendedPool):
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
-        self._library = Library(fmu, log)
+        self._mark = mark
+        self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
+        with self._resetting:
+            self._library = Library(fmu, log)
         pacer = Pacer(spec)
         try:
-            with fmu_calls:
+            with fmu_calls, self._resetting:
                 self._slots = [
                     Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
                     for i in range(num_instances)
@@ -77,6 +85,8 @@ class PythonPool(AttendedPool):
             raise
         finally:
             restore_arithmetic()
+        if self._prepare_saving(fmu.description, spec):
+            self._keep_records()
         recycle = functools.partial(_recycle, self._slots)
         self._watch = watch_leaks(fmu, spec, self._counts, recycle, log)
 
@@ -91,7 +101,7 @@ class PythonPool(AttendedPool):
     def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
-        with fmu_calls:
+        with fmu_calls, self._resetting:
             for index, slot in enumerate(self._slots):
                 if mask is None or mask[index]:
                     self._note(index, slot.reset(variables, values[:, index]))
@@ -106,7 +116,7 @@ class PythonPool(AttendedPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        with fmu_calls:
+        with fmu_calls, self._stepping:
             for index, slot in enumerate(self._slots):
                 if skip is None or not skip[index]:
                     self._note(index, slot.step())
@@ -152,6 +162,32 @@ class PythonPool(AttendedPool):
             for index in chosen:
                 self._note(index, self._slots[index].restore(snapshot[index]))
         return self.outputs, self.statuses
+
+    def serialize_states(self, indices: IndexArray) -> Serialized:
+        """See ``SavingPool.serialize_states``."""
+        chosen = [self._slots[index] for index in indices.tolist()]
+        try:
+            with fmu_calls:
+                data, ends = joined([slot.serialize() for slot in chosen])
+        finally:
+            restore_arithmetic()
+        return data, ends, np.array([slot.count for slot in chosen], np.int64)
+
+    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``SavingPool.deserialize_states``."""
+        with fmu_calls:
+            for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
+                state, outputs = bundle.state(source), bundle.outputs[:, source]
+                count = int(bundle.steps[source])
+                self._note(index, self._slots[index].deserialize(state, count, outputs))
+
+    def record_of(self, index: int) -> Record | None:
+        """See ``SavingPool.record_of``."""
+        return self._slots[index].record
+
+    def _keep_records(self) -> None:
+        for slot in self._slots:
+            slot.keeps_record = True
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
@@ -205,6 +241,8 @@ class PythonPool(AttendedPool):
         self._spec = replace(self._spec, reset_method=method)
         for slot in self._slots:
             slot.begin_by(method)
+        self._keep_records()
+        self._mistrust_states()
         return True
 
     def recycle(self) -> None:
@@ -214,7 +252,7 @@ class PythonPool(AttendedPool):
     def close(self) -> None:
         """See ``Pool.close``."""
         try:
-            with fmu_calls:
+            with fmu_calls, calling(self._mark, END):
                 self._library.close()
         finally:
             restore_arithmetic()

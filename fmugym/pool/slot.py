@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, SimulationError, printable
 from fmugym.fmi.access import Access
@@ -14,8 +16,10 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, PoolSpec
+from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
+from fmugym.pool.samples import Samples
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Slot", "Snapshot"]
@@ -51,6 +55,10 @@ def _is_fine(status: int) -> bool:
     return 0 <= status <= _WARNING
 
 
+def _has_failed(status: int) -> bool:
+    return bool(status) and not _is_fine(status) and status != Status.TERMINATED
+
+
 class Slot:
     """One place in the pool. Its instance is replaced if a reset cannot help.
 
@@ -65,6 +73,7 @@ class Slot:
     Attributes:
         failure: Why the last status was worse than a warning.
         is_due: Whether the next reset replaces the instance.
+        keeps_record: Whether the inputs of its episodes are kept.
     """
 
     def __init__(
@@ -77,7 +86,8 @@ class Slot:
         pacer: Pacer,
     ) -> None:
         self.failure = ""
-        self.is_due = False
+        self.is_due = self.keeps_record = False
+        self._played: tuple[tuple[str, ...], FloatArray, list[bytes]] | None = None
         self._unexplained = False
         self._counts, self._pacer = counts, pacer
         self._count = self._counted = 0
@@ -87,6 +97,7 @@ class Slot:
         self._step_size = spec.communication_step_size
         self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
         self._first_outputs = b""
+        self._integrals = [i for i, name in enumerate(spec.samplings) if name == "integral"]
         self._build()
 
     def _build(self, *, hear_all: bool = False) -> None:
@@ -117,6 +128,9 @@ class Slot:
         self.count_steps()
         self._counts[Column.RESETS] += 1
         self._counts[Column.RETRIED] = 0
+        self._played = None
+        if self.keeps_record:
+            self._played = tuple(v.name for v in variables), np.array(values), []
         try:
             self._make_anew_if_due()
             self._instance.begin_episode()
@@ -161,7 +175,7 @@ class Slot:
             return False
         try:
             self._instance.restore_state(self._saved)
-            got = self._outputs.get()
+            got = self._get_between_steps()
         except SimulationError:  # a reset and an initialization may still work
             got = Status.ERROR
         if not _is_fine(got) or self._output_row.tobytes() != self._first_outputs:
@@ -265,29 +279,58 @@ class Slot:
         inputs = self._input_row.tolist()
         if not _all_finite(inputs):
             return self._not_finite("inputs", self._spec.inputs, inputs)
+        if self._played is not None:
+            self._played[2].append(self._input_row.tobytes())
         if self._spec.fault_retries:
             self._counts[Column.RETRIED] = 0
         status = self._inputs.set()
         if status and not _is_fine(status):
             return self._failed_call("setting the inputs", status)
-        status = self._advance()
-        if status and not _is_fine(status) and status != Status.TERMINATED:
-            return status
-        result = self._read_outputs(status)
+        result = self._advance_sampled() if self._spec.samplings else self._advance_and_read()
         if result > _WARNING and result != Status.NOT_FINITE:  # this may have been the last step
             self._instance.forbid_steps()
         return result
 
-    def _advance(self) -> int:
-        spec, status = self._spec, 0
-        do_step = self._step_with_retries if spec.fault_retries else self._instance.step
-        for _ in range(spec.substeps):
-            time = spec.communication_point(self._count)
-            status = do_step(time, self._step_size)
-            self._count += 1
-            if status and not _is_fine(status):
-                self._note_failure(f"the step at t = {time:g} s", status)
+    def _advance_and_read(self) -> int:
+        status = self._advance()
+        if _has_failed(status):
+            return status
+        got = self._outputs.get()
+        return self._take_outputs(status, got)
+
+    def _advance_sampled(self) -> int:
+        """Read the outputs after each substep, and let the row hold what is asked for of them."""
+        samples, status = Samples(self._spec.samplings, self._step_size), 0
+        for _ in range(self._spec.substeps):
+            status = self._step_once()
+            got = 0 if _has_failed(status) else self._outputs.get()
+            if _has_failed(status) or _has_failed(got):
+                self._output_row[:] = self._good_outputs
+                return self._take_outputs(status, got) if _has_failed(got) else status
+            samples.add(self._output_row.tolist())
+            if status == Status.TERMINATED:
                 break
+        self._output_row[:] = samples.conclude()
+        return self._take_outputs(status, 0)
+
+    def _advance(self) -> int:
+        status = 0
+        for _ in range(self._spec.substeps):
+            status = self._step_once()
+            if status and not _is_fine(status):
+                break
+        return status
+
+    def _step_once(self) -> int:
+        spec = self._spec
+        time = spec.communication_point(self._count)
+        if spec.fault_retries:
+            status = self._step_with_retries(time, self._step_size)
+        else:
+            status = self._instance.step(time, self._step_size)
+        self._count += 1
+        if status and not _is_fine(status):
+            self._note_failure(f"the step at t = {time:g} s", status)
         return status
 
     def _step_with_retries(self, time: float, step_size: float) -> int:
@@ -320,9 +363,23 @@ class Slot:
                 break
         return status
 
-    def _read_outputs(self, status: int) -> int:
-        """Read the outputs into the row; if any is not finite, keep the last good ones."""
+    def _get_between_steps(self) -> int:
+        """Get the outputs into the row, where integrals over a step are 0."""
         got = self._outputs.get()
+        self._output_row[self._integrals] = 0.0
+        return got
+
+    def _read_outputs(self, status: int) -> int:
+        """Read the outputs between steps."""
+        return self._take_outputs(status, self._get_between_steps())
+
+    def _take_outputs(self, status: int, got: int) -> int:
+        """Take the outputs in the row; if any is not finite, keep the last good ones.
+
+        Args:
+            status: What to return if all is well.
+            got: The status of reading them.
+        """
         if got and not _is_fine(got):
             return self._failed_call("reading the outputs", got)
         values = self._output_row.tolist()
@@ -364,12 +421,61 @@ class Slot:
     def restore(self, snapshot: Snapshot) -> int:
         """Return to a state and its time."""
         self.count_steps()
+        self._played = None
         try:
             self._instance.restore_state(snapshot.state)
         except SimulationError as error:
             return self._failed(str(error))
         self._begin_counting_at(snapshot.count)
         return self._read_outputs(Status.OK)
+
+    @property
+    def count(self) -> int:
+        """The number of communication steps in this episode."""
+        return self._count
+
+    def serialize(self) -> bytes:
+        """Serialize the FMU state; ``b""`` if the instance cannot be stepped any more.
+
+        Raises:
+            SimulationError: If the FMU fails.
+        """
+        if self._instance.phase is not _STEPPING:
+            return b""
+        state = self._instance.save_state()
+        try:
+            return self._instance.serialize(state)
+        finally:
+            state.release()
+
+    def deserialize(self, data: bytes, count: int, outputs: FloatArray) -> int:
+        """Return to a serialized state, its number of communication steps and its outputs."""
+        self.count_steps()
+        self._played = None
+        self._output_row[:] = outputs
+        self._good_outputs = outputs.tolist()
+        if not data:
+            self._instance.forbid_steps()
+            return Status.OK
+        try:
+            if self._instance.phase is Phase.DEAD:
+                self._replace()
+            state = self._instance.deserialize(data)
+            self._instance.restore_state(state)
+            state.release()
+        except SimulationError as error:
+            return self._failed(str(error))
+        self._begin_counting_at(count)
+        return Status.OK
+
+    @property
+    def record(self) -> Record | None:
+        """The episode until now; None if it is not known as a whole."""
+        if self._played is None:
+            return None
+        names, starts, rows = self._played
+        inputs = np.frombuffer(b"".join(rows)).reshape(len(rows), len(self._spec.inputs))
+        return Record(names, starts, inputs)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""

@@ -205,4 +205,5 @@ def _essence(spec: PoolSpec) -> PoolSpec:
         licence_wait=0.0,
         keep_states=False,
         state_files="",
+        records=False,
     )

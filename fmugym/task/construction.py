@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import floor, nan
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, cast
@@ -26,6 +26,7 @@ from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import checked, resolve, start_variable
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
+from fmugym.task.plain import plain_attributes
 from fmugym.task.results import finiteness_of
 from fmugym.task.step import Numbers
 from fmugym.task.values import EpisodeVariables, NamedValues
@@ -48,6 +49,12 @@ class Constructed(Pictured):
     _values: Any
     _number: int
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
+
+    _own_names: frozenset[str] = frozenset()
+    """The attributes that are not a subclass's own."""
+
+    _as_constructed: dict[str, Any]
+    """The plain attributes of a subclass when its hooks were prepared."""
 
     _has_info: bool
     _pool_tells = False
@@ -72,6 +79,7 @@ class Constructed(Pictured):
         render_mode: str | None,
     ) -> None:
         """Do everything that a constructor does before there is a pool."""
+        foreign = set(vars(self))
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
         _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
@@ -85,6 +93,8 @@ class Constructed(Pictured):
         self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
+        self._own_names = frozenset(dir(self._base))
+        self._note_own_names(foreign)
 
     def _open(self, backend: Any, isolation: str | None) -> None:
         """Open the pool, unless a vector environment is going to give one."""
@@ -96,12 +106,18 @@ class Constructed(Pictured):
 
     def _use(self, pool: Pool) -> None:
         """Let a pool of one step this environment, or one of N if a vector environment does it."""
+        foreign = set(vars(self))
         self._pool = pool
         self._step_pool, self._halt = pool.step_own, pool.halt
         self._input_row, self._output_row = pool.inputs[:, 0], pool.outputs[:, 0]
         self._observation_row = pool.observations[0]
         self._pool_tells = bool(pool.info())
         self._has_info = self._has_info or self._pool_tells
+        self._note_own_names(foreign)
+
+    def _note_own_names(self, foreign: Collection[str]) -> None:
+        """Note that all present attributes but those are not a subclass's own."""
+        self._own_names |= vars(self).keys() - foreign
 
     def _open_pool(self, method: str) -> Pool:
         if self._pool is None:
@@ -204,6 +220,7 @@ class Constructed(Pictured):
         )
         self._has_info = own.get_info or self._pool_tells
         self._input_writer = InputWriter(interface.inputs)
+        self._as_constructed = plain_attributes(vars(self), self._own_names)
 
     def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
         if options is None:

@@ -34,7 +34,7 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMULoadError, LicenceError
+from fmugym.errors import FMULoadError, LicenceError, unknown_name
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
@@ -45,12 +45,20 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = [
     "Candidate",
+    "Outcome",
     "Request",
     "Stage",
+    "content_of",
     "examine",
+    "is_known_to_harm",
+    "known_resuming",
     "known_verdict",
+    "marks_of",
     "meet",
+    "note_harm",
+    "note_resuming",
     "revise",
+    "run",
 ]
 
 logger = logging.getLogger(__name__)
@@ -61,6 +69,10 @@ _ALONE: Final = {"loading and instantiation", "initialization", "the first step"
 """The stages of a single instance. If a worker ends there only when memory is checked, the FMU
 writes to memory that it must not touch."""
 
+
+_ON: Final = ("on", "1", "yes", "true")
+_OFF: Final = ("off", "0", "no", "false")
+"""The values of ``FMUGYM_PROBE``; an empty one is none."""
 
 _LOOK: Final = 0.1
 """Seconds between two looks at a worker."""
@@ -92,9 +104,20 @@ class Candidate:
 
     @property
     def exempt(self) -> bool:
-        """Whether to skip the trial: trials are turned off, or this package bundles the FMU."""
-        off = os.environ.get("FMUGYM_PROBE", "").lower() in {"0", "off", "no", "false"}
-        return off or self.timeout is None or is_bundled(self.path)
+        """Whether to skip the trial: trials are turned off, or this package bundles the FMU.
+
+        Raises:
+            ConfigError: If the environment variable ``FMUGYM_PROBE`` has an unknown value.
+        """
+        return _trials_are_off() or self.timeout is None or is_bundled(self.path)
+
+
+def _trials_are_off() -> bool:
+    given = os.environ.get("FMUGYM_PROBE", "").strip().lower()
+    if given not in (*_ON, *_OFF, ""):
+        known = (*_ON, *_OFF)
+        raise unknown_name("value of the environment variable FMUGYM_PROBE", given, known)
+    return given in _OFF
 
 
 class Stage(StrEnum):
@@ -107,6 +130,7 @@ class Stage(StrEnum):
     LIBRARY = "the rehearsal of libraries loaded anew"
     STATE = "the serialization of an initial state"
     RESUMED = "the rehearsal of an initial state from another process"
+    HALFWAY = "the rehearsal of a state in the middle of an episode"
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
     THREADS = "the comparison with an instance in another thread"
@@ -131,6 +155,8 @@ class Request:
         skip: The stages in which an earlier worker died.
         sample: The ``Sample`` of an initial state that another worker has made, if this one has to
             try only that.
+        resume: Whether to try a state in the middle of an episode; or a ``Halfway`` that another
+            worker has made.
         check_memory: Whether the C library checks for memory errors (glibc only).
     """
 
@@ -141,11 +167,12 @@ class Request:
     alone: bool = False
     skip: frozenset[str] = frozenset()
     sample: Any = None
+    resume: Any = None
     check_memory: bool = True
 
 
 @dataclass(frozen=True)
-class _Outcome:
+class Outcome:
     """How a trial ended.
 
     ``stage`` is what the worker was doing; None before it touched the FMU. If the process survived
@@ -201,6 +228,15 @@ def state_files(fmu: FMU) -> str:
         return ""
 
 
+def marks_of(candidate: Candidate) -> tuple[Path, str]:
+    """The folder and the key of an FMU's marks; see ``fmugym.pool.mark``.
+
+    Raises:
+        RuntimeError: If there is no folder for caches.
+    """
+    return cache_folder() / "marks", _content_key(candidate.path)
+
+
 def examine(
     candidate: Candidate,
     spec: Any,
@@ -231,7 +267,7 @@ def examine(
     key = _verdict_key(candidate, spec, starts)
     known = Verdict.from_text(recall(key))
     if known is not None and _answers(known, spec, several):
-        return known
+        return _with_harm(known, candidate)
     found = _examine(Request(candidate, spec, starts, several, alone), must_survive)
     if found.complete:
         remember(key, found.to_text())
@@ -244,17 +280,77 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
     return knows_states and (verdict.neighbours is not None or not several)
 
 
+def is_known_to_harm(candidate: Candidate) -> bool:
+    """Whether the cache says that an FMU harms its process."""
+    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    return known is not None and known.isolate
+
+
+def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
+    """Add the harm to its process that the FMU has done with any other config."""
+    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    if known is None or not known.isolate or verdict.isolate:
+        return verdict
+    reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
+    return replace(verdict, isolate=True, reasons=tuple(reasons))
+
+
+def known_resuming(candidate: Candidate, spec: Any, starts: Any) -> Grade | None:
+    """The grade of states in the middle of an episode; None if they were not tried."""
+    try:
+        return Grade(recall(_resuming_key(candidate, spec, starts)) or "")
+    except ValueError:
+        return None
+
+
+def note_resuming(candidate: Candidate, spec: Any, starts: Any, grade: Grade) -> None:
+    """Keep this grade, unless the FMU has failed, which may have passing causes."""
+    if grade is not Grade.FAILS:
+        remember(_resuming_key(candidate, spec, starts), str(grade))
+
+
+def _resuming_key(candidate: Candidate, spec: Any, starts: Any) -> str:
+    return f"{_verdict_key(candidate, spec, starts)}-resuming"
+
+
 def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> None:
-    """Replace the verdict that ``examine`` has cached for the same arguments."""
+    """Replace the verdict that ``examine`` has cached for the same arguments.
+
+    An FMU that is found to harm its process counts as harmful with every other config, too.
+    """
+    verdict = _with_harm(verdict, candidate)
     for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path)):
         remember(key, verdict.to_text())
+
+
+def note_harm(
+    candidate: Candidate, spec: Any, starts: Any, verdict: Verdict, reason: str
+) -> Verdict:
+    """Add to the cached verdict that an FMU harms its process.
+
+    Args:
+        candidate: As for ``examine``.
+        spec: As for ``examine``.
+        starts: As for ``examine``.
+        verdict: The verdict if nothing is cached.
+        reason: What the FMU has done, in one sentence.
+
+    Returns:
+        The new verdict.
+    """
+    known = Verdict.from_text(recall(_verdict_key(candidate, spec, starts))) or verdict
+    if known.isolate:
+        return known
+    harmful = replace(known, isolate=True, reasons=(*known.reasons, reason))
+    revise(candidate, spec, starts, harmful)
+    return harmful
 
 
 def _examine(request: Request, must_survive: bool) -> Verdict:
     """Start workers until one finishes. Each skips the stages in which earlier ones crashed."""
     name, notes = request.candidate.path.name, _Notes()
     while True:
-        outcome = _run(request)
+        outcome = run(request)
         if outcome.stage is None:
             logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
             return Verdict()
@@ -273,6 +369,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
     verdict = notes.verdict
     if request.spec is not None and request.spec.keep_states and verdict.complete:
         verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
+    verdict = _with_harm(verdict, request.candidate)
     logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
@@ -285,7 +382,7 @@ def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -
         return Grade.ABSENT
     if sample is None:
         return Grade.FAILS
-    outcome = _run(replace(request, sample=pickle.loads(sample)))
+    outcome = run(replace(request, sample=pickle.loads(sample)))
     _Notes().require_licence(request.candidate.path.name, outcome)
     return Grade(outcome.answer.get("states", Grade.FAILS))
 
@@ -295,10 +392,10 @@ class _Notes:
 
     def __init__(self) -> None:
         self._answer: dict[str, Any] = {}
-        self._deaths: list[_Outcome] = []
+        self._deaths: list[Outcome] = []
         self.sample: bytes | None = None
 
-    def add(self, outcome: _Outcome) -> None:
+    def add(self, outcome: Outcome) -> None:
         """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
         self.sample = outcome.sample or self.sample
@@ -320,7 +417,7 @@ class _Notes:
             reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
 
-    def require_licence(self, name: str, outcome: _Outcome) -> None:
+    def require_licence(self, name: str, outcome: Outcome) -> None:
         """Give up if an instance got no licence: this tells nothing about the FMU itself.
 
         Raises:
@@ -353,7 +450,8 @@ class _Notes:
         return replace(self.verdict, isolate=True, neighbours=Neighbours.PROCESSES)
 
 
-def _run(request: Request) -> _Outcome:
+def run(request: Request) -> Outcome:
+    """Let a worker try what is requested; returns how that ended."""
     with tempfile.TemporaryDirectory(prefix="fmugym-probe-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         (folder / "request").write_bytes(pickle.dumps(request))
@@ -361,7 +459,7 @@ def _run(request: Request) -> _Outcome:
             end, last_lines = _watch(folder, request)
         except OSError as error:
             end, last_lines = f"found no Python to start: {error}", []
-        return _Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
+        return Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
 
 
 def _stage(folder: Path) -> str | None:
@@ -508,11 +606,15 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     return f"{_content_key(candidate.path)}-{asked}"
 
 
+def content_of(path: Path) -> str:
+    """The SHA-256 of a file; it is read again only when it has changed."""
+    status = path.stat()
+    return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
+
+
 def _content_key(path: Path) -> str:
     """The scope of a verdict: this content, this platform, and this version of the package."""
-    status = path.stat()
-    content = _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
-    return _digest(f"{content} {fmpy.platform_tuple} {_version()}".encode())
+    return _digest(f"{content_of(path)} {fmpy.platform_tuple} {_version()}".encode())
 
 
 @functools.lru_cache(maxsize=256)

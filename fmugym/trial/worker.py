@@ -34,6 +34,7 @@ from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
+from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
 from fmugym.trial.trial import Request, Stage, patience
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -66,7 +67,7 @@ class Notes:
         (self._folder / "call").write_text(call)
         _end_after(patience(call, self._timeout))
 
-    def keep(self, sample: Sample | None) -> None:
+    def keep(self, sample: Sample | Halfway | None) -> None:
         """Leave a sample for another process, if there is one."""
         if sample is not None:
             (self._folder / "sample").write_bytes(pickle.dumps(sample))
@@ -101,6 +102,9 @@ def main(folder: Path) -> None:
 def _try(request: Request, notes: Notes) -> None:
     if request.sample is not None:
         _try_sample(request, notes)
+        return
+    if request.resume is not None:
+        _try_resuming(request, notes)
         return
     complete = _try_alone(request, notes)
     notes.answer(complete=complete)
@@ -208,6 +212,16 @@ def _try_sample(request: Request, notes: Notes) -> None:
     starts = request.starts or Starts()
     rehearsal = Rehearsal(request.candidate, request.spec, starts, request.sample)
     notes.answer(states=rehearsal.grade_sample())
+
+
+def _try_resuming(request: Request, notes: Notes) -> None:
+    """Try a state in the middle of an episode: make one, or go on from that of another process."""
+    notes.stage(Stage.HALFWAY)
+    found = make_halfway(request) if request.resume is True else try_halfway(request)
+    if isinstance(found, Halfway):
+        notes.keep(found)
+    else:
+        notes.answer(resuming=found)
 
 
 def _methods(request: Request) -> list[ResetMethod]:

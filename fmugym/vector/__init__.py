@@ -1,6 +1,13 @@
 """Many environments over one pool of FMU instances."""
 
+from typing import TYPE_CHECKING
+
+from fmugym.lazy import lazily
 from fmugym.vector.entry_points import vectorized
-from fmugym.vector.env import FMUVectorEnv
+
+if TYPE_CHECKING:
+    from fmugym.vector.env import FMUVectorEnv
 
 __all__ = ["FMUVectorEnv", "vectorized"]
+
+__getattr__ = lazily(__name__, {"FMUVectorEnv": "fmugym.vector.env"})

@@ -11,6 +11,7 @@ from fmugym.archive.description import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["PoolColumn"]
@@ -74,6 +75,22 @@ class PoolColumn(Pool):
         """See ``Pool.restore``."""
         self._pool.restore(snapshot, self._mask(True))
         return self.outputs, self.statuses
+
+    @property
+    def save_method(self) -> SaveMethod | None:
+        """See ``Pool.save_method``."""
+        return self._pool.save_method
+
+    def save_instances(self, indices: IndexArray) -> Bundle:
+        """See ``Pool.save_instances``."""
+        return self._pool.save_instances(indices + self._index)
+
+    def restore_instances(
+        self, bundle: Bundle, sources: IndexArray, indices: IndexArray
+    ) -> StatusArray:
+        """See ``Pool.restore_instances``."""
+        self._pool.restore_instances(bundle, sources, indices + self._index)
+        return self.statuses
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""

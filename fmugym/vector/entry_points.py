@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
-from fmugym.vector.arguments import POOL_OPTIONS
-from fmugym.vector.env import FMUVectorEnv
+if TYPE_CHECKING:
+    from fmugym.vector.env import FMUVectorEnv
 
 __all__ = ["vector_entry_point", "vectorized"]
 
@@ -52,6 +52,9 @@ class VectorEntryPoint:
         **kwargs: Any,
     ) -> FMUVectorEnv:
         """Make a vector environment; see ``FMUVectorEnv``."""
+        from fmugym.vector.arguments import POOL_OPTIONS  # registration shall be quick
+        from fmugym.vector.env import FMUVectorEnv
+
         pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
         env_class = self._env_class
         creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class

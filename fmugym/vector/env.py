@@ -6,6 +6,7 @@ import copy
 import logging
 import pickle
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,11 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.interface import checked_value
+from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.vector.arguments import (
     UnknownAttributeError,
     autoreset_mode_of,
@@ -36,6 +40,7 @@ from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
+from fmugym.vector.saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv"]
 
@@ -50,7 +55,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     Seeded with ``s``, environment i reproduces a single environment seeded with ``s + i``, step by
     step and episode after episode.
 
-    A copy, or what is loaded from a pickle, is a new vector environment of the same arguments.
+    A copy, or what is loaded from a pickle, is a new vector environment of the same arguments. A
+    deep copy goes on with the same episodes.
 
     Args:
         make_env: A function without arguments, or a class, that returns a new environment in each
@@ -277,11 +283,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         result: StepResult = self._background.finish(timeout)
         return result
 
-    def _require_ready(self, method: str) -> None:
+    def _require_ready(self, method: str, *, ended: bool = False) -> None:
+        """Refuse a call before the first reset and so on; ``ended`` episodes may be allowed."""
         if not self._is_ready or self.closed or self._background.is_pending:
             self._refuse_step(method)
         engine = self._engine
-        if engine.any_ended and self.autoreset_mode is _DISABLED:
+        if not ended and engine.any_ended and self.autoreset_mode is _DISABLED:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
@@ -349,6 +356,64 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 pictures.append(env.render())
                 self._prototype._renderer = env._renderer
         return tuple(pictures)
+
+    # Snapshots.
+
+    def save_state(self, where: Any = None) -> Snapshot:
+        """Save the episodes of environments at this moment; see ``FMUEnv.save_state``.
+
+        Args:
+            where: Which environments: a Boolean mask of shape (N,), an index, or a list of indices;
+                None for all.
+
+        Raises:
+            ConfigError: If ``where`` does not fit.
+            SimulationError: Before the first reset, after ``close``, if real systems stand in for
+                the FMUs, or if an FMU fails.
+        """
+        self._require_ready("save_state", ended=True)
+        indices = chosen(where, self.num_envs)
+        bundle = self._pool.save_instances(indices)
+        return Snapshot(self._scope, self._engine.columns(indices), bundle)
+
+    def restore_state(self, snapshot: Snapshot, where: Any = None) -> Any:
+        """Let environments go on from a snapshot, with their random streams.
+
+        Args:
+            snapshot: Of single or vector environments with the same FMU and config. If it is of one
+                environment, all in ``where`` go on from it, with the same random streams.
+                Otherwise it has one episode for each in ``where``.
+            where: As for ``save_state``.
+
+        Returns:
+            The observations of all environments.
+
+        Raises:
+            ConfigError: If the snapshot or ``where`` does not fit, or if it is not of all
+                environments before the first reset.
+            SimulationError: If an FMU fails, or if real systems stand in for the FMUs.
+        """
+        self._open_pool("restore_state")
+        indices = chosen(where, self.num_envs)
+        sources = sources_for(checked_snapshot(snapshot), indices)
+        columns = snapshot.columns_for(self._scope)
+        if not self._is_ready and len(indices) < self.num_envs:
+            raise ConfigError("before a reset of all, a snapshot must be restored in all")
+        self._engine.require_fit(columns)
+        self._is_ready = False
+        self._restore(snapshot.bundle, sources, indices)
+        self._engine.place(columns, sources, indices)
+        self._started = self._is_ready = True
+        return self._engine.observe(indices)
+
+    def _restore(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        statuses = self._pool.restore_instances(bundle, sources, indices)
+        for index in indices[statuses[indices] > Status.WARNING].tolist():
+            raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+
+    @cached_property
+    def _scope(self) -> dict[str, str]:
+        return scope_of(self._prototype)
 
     # Single environments.
 
@@ -486,7 +551,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUVectorEnv:
         arguments = copy.deepcopy(self._arguments, memo)
-        return _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
+        twin = _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
+        if self._is_ready and not self.closed:
+            twin.restore_state(self.save_state())
+        return twin
 
     def __reduce__(self) -> tuple[Callable[..., FMUVectorEnv], tuple[bytes]]:
         construction: Any = type(self), self._arguments, self.spec

@@ -16,6 +16,7 @@ from fmugym.distributions import Recipe
 from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.generators import row_of, state_of
 
 if TYPE_CHECKING:
     from fmugym._native import Draws
@@ -24,7 +25,6 @@ __all__ = ["EpisodeStreams", "given_draws"]
 
 IndexArray = npt.NDArray[np.intp]
 
-_WORD: Final = 2**64
 _NONE: Final = -1
 _SEED_BITS: Final = 128
 """The bits of entropy that numpy takes from the system where no seed is given."""
@@ -48,15 +48,16 @@ class EpisodeStreams:
 
     def __init__(self, num_envs: int) -> None:
         self.states = np.zeros((num_envs, 6), np.uint64)
-        self._seeds = [_NONE] * num_envs
+        self._seeds: npt.NDArray[Any] = np.full(num_envs, _NONE, object)
         self._all_seeded = False
         self._generator = np.random.Generator(np.random.PCG64(0))
         self._latest: tuple[EpisodePlan, Draws | None] | None = None
 
-    def seed_of(self, index: int) -> int:
-        """The seed of an environment."""
+    def seed_of(self, index: int) -> int | None:
+        """The seed of an environment; None if it goes on with a stream of unknown seed."""
         self._seed_others([index])
-        return self._seeds[index]
+        seed: int | None = self._seeds[index]
+        return seed
 
     def seed(self, seeds: Sequence[int | None] | None, indices: IndexArray) -> None:
         """Seed some of the environments anew; None leaves a stream, or all, as it is."""
@@ -64,6 +65,18 @@ class EpisodeStreams:
             return
         chosen = ((index, seeds[index]) for index in indices.tolist())
         self._seed({index: seed for index, seed in chosen if seed is not None})
+
+    def taken(self, indices: IndexArray) -> tuple[npt.NDArray[np.uint64], npt.NDArray[Any]]:
+        """The streams and the seeds of some environments."""
+        self.require_seeds()
+        return self.states[indices], self._seeds[indices]
+
+    def put(
+        self, indices: IndexArray, rows: npt.NDArray[np.uint64], seeds: npt.NDArray[Any]
+    ) -> None:
+        """Let environments go on with other streams, shape (M, 6), and their seeds."""
+        self.states[indices] = rows
+        self._seeds[indices] = seeds
 
     def require_seeds(self) -> None:
         """Seed all that have no seed yet; native code may then draw from the streams."""
@@ -93,20 +106,20 @@ class EpisodeStreams:
             _native.seed(self.states, np.array(indices), words.astype(np.uint32).tobytes())
             return
         for index, seed in zip(indices, seeds, strict=True):
-            self.states[index] = _row_of(np.random.PCG64(seed).state)
+            self.states[index] = row_of(np.random.PCG64(seed).state)
 
     def draw(self, plan: EpisodePlan, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
 
         Returns:
-            The values in the order of ``plan.drawn_names``, shape (draws, M).
+            The values in the order of ``plan.draws``, shape (draws, M).
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
         self.require_seeds()
         draws = self.native_draws(plan)
-        values = np.empty((len(plan.drawn_names), len(indices)))
+        values = np.empty((len(plan.draws), len(indices)))
         if draws is not None:
             draws.take(self.states, indices, values)
             return values
@@ -125,28 +138,16 @@ class EpisodeStreams:
     def _as_generator(self, index: int) -> Iterator[np.random.Generator]:
         """Lend a generator that goes on with a stream."""
         bits: Any = self._generator.bit_generator
-        bits.state = _state_of(self.states[index].tolist())
+        bits.state = state_of(self.states[index].tolist())
         try:
             yield self._generator
         finally:
-            self.states[index] = _row_of(bits.state)
-
-
-def _row_of(state: Any) -> list[int]:
-    inner = state["state"]
-    numbers = [*divmod(inner["state"], _WORD), *divmod(inner["inc"], _WORD)]
-    return [*numbers, state["has_uint32"], state["uinteger"]]
-
-
-def _state_of(row: list[int]) -> dict[str, Any]:
-    high, low, increment_high, increment_low, has_half, half = row
-    numbers = {"state": high * _WORD + low, "inc": increment_high * _WORD + increment_low}
-    return {"bit_generator": "PCG64", "state": numbers, "has_uint32": has_half, "uinteger": half}
+            self.states[index] = row_of(bits.state)
 
 
 def given_draws(plan: EpisodePlan) -> Draws:
     """The draws of a plan as values that are drawn before the C extension needs them."""
-    return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.drawn_names), plan.drawn_rows)
+    return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.draws), plan.drawn_rows)
 
 
 def _native_draws(plan: EpisodePlan) -> Draws | None:

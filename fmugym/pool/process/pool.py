@@ -12,7 +12,7 @@ import itertools
 import logging
 import math
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import Any
@@ -25,7 +25,6 @@ from fmugym.archive.fmu import FMU
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status
-from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -34,18 +33,20 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
+from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
 from fmugym.pool.process.supervisor import Supervisor
 from fmugym.pool.process.worker import Setup
+from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["ProcessPool"]
 
 
-class ProcessPool(AttendedPool):
+class ProcessPool(SavingPool):
     """N instances in blocks of supervised processes; see ``Pool`` for the contract.
 
     Args:
@@ -62,6 +63,7 @@ class ProcessPool(AttendedPool):
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
+        note_crash: Is told how a worker has crashed, in a part of a sentence.
 
     Attributes:
         workers: How many processes there are.
@@ -84,6 +86,7 @@ class ProcessPool(AttendedPool):
         threads: int | None = None,
         own_files: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
+        note_crash: Callable[[str], None] | None = None,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -97,6 +100,7 @@ class ProcessPool(AttendedPool):
         except BaseException:
             fmu.close()
             raise
+        self._prepare_saving(fmu.description, spec)
         arrays = make_arrays(memory, spec, num_instances)
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
@@ -105,7 +109,7 @@ class ProcessPool(AttendedPool):
         setup = replace(setup, native=native, threads=threads, own_files=own_files)
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
-        self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
+        self._crew = Crew(fmu, setups, memory, arrays, log, timeout, note_crash)
 
     # The contract of Pool.
 
@@ -241,6 +245,7 @@ class ProcessPool(AttendedPool):
             self._spec = replace(self._spec, reset_method=method)
             for supervisor in self._crew.supervisors:
                 supervisor.begin_by(method)
+            self._mistrust_states()
             able = self._crew.able
             self._crew.run("a change", able, lambda s: s.tell("begin_by", str(method)))
         return True
@@ -276,6 +281,59 @@ class ProcessPool(AttendedPool):
             )
             self._crew.note_lost()
         return self.outputs, self.statuses
+
+    def serialize_states(self, indices: IndexArray) -> Serialized:
+        """See ``SavingPool.serialize_states``; lost instances get empty states."""
+        with self._lock:
+            parts = self._by_worker(indices[~self._crew.lost[indices]])
+            replies = self._crew.run(
+                "saving states", list(parts), lambda s: s.tell("bundle", _within(s, parts[s]))
+            )
+        states: dict[int, tuple[bytes, int]] = {}
+        for supervisor, (data, ends, steps) in replies.items():
+            one = Bundle(np.zeros((0, len(ends))), steps, data, ends)
+            for place, index in enumerate(parts[supervisor].tolist()):
+                states[index] = one.state(place), int(steps[place])
+        found = [states.get(index, (b"", 0)) for index in indices.tolist()]
+        data, ends = joined(state for state, _ in found)
+        return data, ends, np.array([steps for _, steps in found], np.int64)
+
+    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``SavingPool.deserialize_states``; a lost worker is replaced."""
+        with self._lock:
+            parts = self._by_worker(indices)
+            places = {
+                int(index): int(source) for index, source in zip(indices, sources, strict=True)
+            }
+            alive = self._crew.revive(parts)
+
+            def tell(supervisor: Supervisor) -> None:
+                wanted = parts[supervisor]
+                states = bundle.take([places[index] for index in wanted.tolist()])
+                supervisor.tell("unbundle", states, _within(supervisor, wanted))
+
+            for supervisor in self._crew.run("restoring states", alive, tell):
+                supervisor.note_success()
+                self._crew.lost[parts[supervisor]] = False
+            self._crew.note_lost()
+
+    def _by_worker(self, indices: IndexArray) -> dict[Supervisor, IndexArray]:
+        """Divide instances among their workers."""
+        blocks = {
+            s: (indices >= s.block.start) & (indices < s.block.stop) for s in self._crew.supervisors
+        }
+        return {s: indices[own] for s, own in blocks.items() if own.any()}
+
+    def record_of(self, index: int) -> Record | None:
+        """See ``SavingPool.record_of``."""
+        with self._lock:
+            supervisor = self._crew.of(index)
+            within = index - supervisor.block.start
+            replies = self._crew.run(
+                "a question", [supervisor], lambda s: s.tell("record_of", within)
+            )
+            record: Record | None = replies.get(supervisor)
+            return record
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
@@ -334,6 +392,12 @@ class _Snapshot:
     def __init__(self, parts: dict[Supervisor, tuple[int, int]]) -> None:
         self.parts = parts
         weakref.finalize(self, _release, parts).atexit = False
+
+
+def _within(supervisor: Supervisor, indices: IndexArray) -> IndexArray:
+    """The numbers of instances within the block of their worker."""
+    within: IndexArray = indices - supervisor.block.start
+    return within
 
 
 def _require_generation(supervisor: Supervisor, generation: int) -> None:

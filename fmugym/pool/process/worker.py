@@ -27,12 +27,14 @@ from fmugym.archive.fmu import FMU, ExtractedFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMUGymError, FMULoadError
 from fmugym.fmi.status import Status
-from fmugym.pool.base import FloatArray, MaskArray, Pool, PoolSpec
+from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
+from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.health import HealthArray
 from fmugym.pool.leaks import ProcessGrowth
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
+from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
@@ -278,6 +280,19 @@ class BlockWorker:
         self._pool.restore(self._snapshots[number], mask)
         self._publish()
 
+    def bundle(self, indices: IndexArray) -> Serialized:
+        """See ``SavingPool.serialize_states``."""
+        return self._pool.serialize_states(indices)
+
+    def unbundle(self, bundle: Bundle, indices: IndexArray) -> None:
+        """See ``SavingPool.deserialize_states``; instance i of the indices gets the state i."""
+        self._pool.deserialize_states(bundle, np.arange(len(indices)), indices)
+        self._publish()
+
+    def record_of(self, index: int) -> Record | None:
+        """See ``SavingPool.record_of``."""
+        return self._pool.record_of(index)
+
     def count_steps(self) -> None:
         """Add the steps until now to the shared counts."""
         self._pool.health()
@@ -304,7 +319,7 @@ def _native_echo_to(memory: npt.NDArray[np.uint8]) -> None:
     _native.echo_to(memory)
 
 
-def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> Pool:
+def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> SavingPool:
     return local_pool(
         ExtractedFMU(setup.path, setup.description, setup.preload, setup.folder),
         setup.spec,

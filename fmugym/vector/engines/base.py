@@ -11,6 +11,8 @@ import numpy as np
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.bundle import IndexArray
+from fmugym.task.snapshot import Columns
 
 __all__ = ["Engine", "StepResult"]
 
@@ -110,3 +112,25 @@ class Engine(ABC):
     @abstractmethod
     def set_parameter(self, name: str, values: FloatArray) -> None:
         """Give a parameter one value for each environment, from its next episode on."""
+
+    # Snapshots
+
+    @abstractmethod
+    def columns(self, indices: IndexArray) -> Columns:
+        """Copy what makes the episodes of some environments, except for the FMUs' states."""
+
+    def require_fit(self, columns: Columns) -> None:
+        """Refuse columns that these environments cannot have.
+
+        Raises:
+            ConfigError: If there are such columns.
+        """
+        return
+
+    @abstractmethod
+    def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
+        """Let environments go on from columns; environment ``indices[i]`` from ``sources[i]``."""
+
+    @abstractmethod
+    def observe(self, indices: IndexArray) -> Any:
+        """The observations of all environments; those of the given ones may have changed."""

@@ -22,6 +22,7 @@ from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
+from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
@@ -30,6 +31,7 @@ from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results
 from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
+from fmugym.vector.saving import columns_of, place_columns, require_fit, values_of
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, column, take
 
@@ -217,7 +219,7 @@ class BatchEngine(Engine):
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
         self._forget(indices, plan)
-        return plan.told | dict(zip(plan.drawn_names, drawn, strict=True))
+        return plan.told | plan.named(drawn)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""
@@ -247,17 +249,18 @@ class BatchEngine(Engine):
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env._plan
+        if plan.constant_variables:
+            starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
+            self._place(plan.constant_variables, starts, indices)
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
         else:
-            self._place(plan.drawn_names, drawn, indices)
+            rows = {n: results.environments_last(v) for n, v in plan.named(drawn).items()}
+            self._place(rows, rows.values(), indices)
         if not default or self._any_foreign:
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
             self._note_foreign(indices, not default)
-        if plan.constant_variables:
-            starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
-            self._place(plan.constant_variables, starts, indices)
         if self._given:
             self._place_given(indices, plan)
         if default:
@@ -285,6 +288,52 @@ class BatchEngine(Engine):
             row = np.full(self._n, np.nan) if known is None else known
             self._parameters[name] = row
         return row
+
+    # Snapshots.
+
+    def columns(self, indices: IndexArray) -> Columns:
+        """See ``Engine.columns``."""
+        return columns_of(self.env, self._parameters, indices) | {
+            "ended": self.ended[indices],
+            **dict(zip(("streams", "seeds"), self._streams.taken(indices), strict=True)),
+        }
+
+    def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``Engine.place``."""
+        place_columns(self.env, columns, sources, indices)
+        for name, values in (columns["parameters"] | columns["variables"]).items():
+            rows = np.moveaxis(values_of(values, sources), 0, -1)
+            self._row(name)[..., indices] = rows
+        if isinstance(columns["streams"], np.ndarray):
+            seeds = np.array(columns["seeds"], object)[sources]
+            self._streams.put(indices, columns["streams"][sources], seeds)
+        self.ended[indices] = columns["ended"][sources]
+        self.any_ended = bool(np.count_nonzero(self.ended))
+        self._longest = max(self._longest, int(self.env.step_count.max()))
+        self._note_foreign(indices, self._has_other_constants(columns["parameters"], indices))
+
+    def _has_other_constants(self, names: Iterable[str], indices: IndexArray) -> bool:
+        """Whether these parameters of environments are not all those of the plan."""
+        plan = self.env._plan
+        known = plan.constant_parameters.items()
+        own = all((self._parameters[name][indices] == value).all() for name, value in known)
+        return not own or not set(names) <= set(plan.parameter_names)
+
+    def require_fit(self, columns: Columns) -> None:
+        """See ``Engine.require_fit``."""
+        require_fit(columns)
+
+    def observe(self, indices: IndexArray) -> Any:
+        """See ``Engine.observe``."""
+        self.env._in_hooks = True
+        try:
+            observations = self._observe()
+        finally:
+            self.env._in_hooks = False
+        mask = np.zeros(self._n, np.bool_)
+        mask[indices] = True
+        self._require_finite_start(observations, mask)
+        return observations
 
     # Steps.
 

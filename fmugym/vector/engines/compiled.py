@@ -115,8 +115,8 @@ class CompiledEngine(BatchEngine):
         self._prepared = False
         if task is None or not _can_draw(task, plan):
             return
-        self._names, self._left = plan.drawn_names, task.left
-        self._drawn_shape = len(self._names), self._n
+        self._left = task.left
+        self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
         self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
@@ -228,9 +228,9 @@ class CompiledEngine(BatchEngine):
                 for name, start in env._start_inputs
             ),
             "drawn_variables": tuple(
-                (flat[name][0], number)
-                for number, name in enumerate(plan.drawn_names)
-                if name in flat
+                (flat[draw.name][draw.element or 0], number)
+                for number, draw in enumerate(plan.draws)
+                if draw.name in flat
             ),
             "variable_starts": tuple(
                 (row, np.array(value, row.dtype).tobytes())
@@ -272,7 +272,7 @@ class CompiledEngine(BatchEngine):
         troubled = self._start(mask, seen, drawn)
         observations, own = self._layout.divided(seen)
         infos = restricted(own, mask) if own else own
-        infos |= _start_infos(self._names, drawn, mask)
+        infos |= _start_infos(self.env._plan, drawn, mask)
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -332,7 +332,7 @@ class CompiledEngine(BatchEngine):
         troubled, begun = self._do(play, actions, seen, *judged, drawn, last, started)
         observations, infos = self._layout.divided(seen)
         if resetting is not None:
-            infos |= _start_infos(self._names, drawn, resetting)
+            infos |= _start_infos(self.env._plan, drawn, resetting)
         elif begun:
             infos = self._with_ends(infos, drawn, last, started)
         result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
@@ -388,7 +388,7 @@ class CompiledEngine(BatchEngine):
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
         final = final_infos(objects, restricted(infos, started), started)
-        return _start_infos(self._names, drawn, started) | final
+        return _start_infos(self.env._plan, drawn, started) | final
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -556,9 +556,9 @@ class _Layout:
         return tree["observation"], infos
 
 
-def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return {"drawn": LateDict.of(_told, names, drawn, mask), "_drawn": mask}  # rarely read
+def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
 
 
-def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(dict(zip(names, drawn, strict=True)), mask)
+def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return coded(plan.named(drawn), mask)

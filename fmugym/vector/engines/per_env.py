@@ -16,6 +16,9 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.bundle import IndexArray
+from fmugym.task.saving import columns_of, place_columns
+from fmugym.task.snapshot import Columns, stacked
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered
@@ -206,6 +209,24 @@ class PerEnvEngine(Engine):
         if len(items) != len(self._envs):
             raise ConfigError(f"there are {len(items)} actions, expected {len(self._envs)}")
         return items
+
+    def columns(self, indices: IndexArray) -> Columns:
+        """See ``Engine.columns``."""
+        parts = [columns_of(self._envs[index]) for index in indices.tolist()]
+        return stacked(parts) | {"ended": self.ended[indices]}
+
+    def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
+        """See ``Engine.place``."""
+        for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
+            place_columns(self._envs[index], columns, source)
+            self.ended[index] = columns["ended"][source]
+        self.any_ended = bool(self.ended.any())
+
+    def observe(self, indices: IndexArray) -> Any:
+        """See ``Engine.observe``."""
+        for index in indices.tolist():
+            self._observations[index] = self._envs[index]._observation_and_info()[0]
+        return self._stacked()
 
     def _stacked(self) -> Any:
         empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)

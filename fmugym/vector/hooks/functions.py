@@ -431,7 +431,15 @@ _REARRANGING: Final = frozenset(
 _COMPOSED: Final = frozenset(
     {np.sum, np.prod, np.mean, np.std, np.var, np.any, np.all, np.max, np.min, np.amax, np.amin}
     | {np.round, np.around, np.cumsum, np.cumprod, np.ptp, np.diff, np.polyval, np.isclose}
-    | {np.sinc, np.average, np.trapezoid, np.gradient, np.append, np.angle, np.count_nonzero}
+    | {
+        np.sinc,
+        np.average,
+        getattr(np, "trapezoid", None),
+        np.gradient,
+        np.append,
+        np.angle,
+        np.count_nonzero,
+    }
     | {np.fix, np.real_if_close}
 )
 """Functions that numpy composes of others."""

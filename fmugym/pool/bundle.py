@@ -1,0 +1,103 @@
+"""States of instances as values: they fit any instance of the same FMU, in any process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Bundle", "Record", "SaveMethod", "joined"]
+
+FloatArray = npt.NDArray[np.float64]
+IndexArray = npt.NDArray[np.int64]
+
+
+class SaveMethod(StrEnum):
+    """How a pool saves the states of its instances."""
+
+    STATE = "state"
+    """The FMU serializes its state. Saving and restoring cost about as much as a step."""
+    REPLAY = "replay"
+    """The inputs of the episode are kept. Saving costs nothing, restoring plays the episode again.
+    """
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The episode of an instance until now.
+
+    Attributes:
+        names: The variables that were set before initialization.
+        starts: Their values, shape (P,).
+        inputs: The inputs of each step, shape (steps, k_in).
+    """
+
+    names: tuple[str, ...]
+    starts: FloatArray
+    inputs: FloatArray
+
+    @property
+    def content(self) -> tuple[object, ...]:
+        """What two equal records have in common."""
+        return self.names, self.starts.tobytes(), self.inputs.shape, self.inputs.tobytes()
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """The states of M instances.
+
+    An instance that could not be stepped any more has an empty state.
+
+    Attributes:
+        outputs: Their outputs, shape (k, M).
+        steps: Their communication steps, shape (M,).
+        data: The serialized states one after the other; ``b""`` if there are records.
+        ends: Where each of them ends in the data, shape (M,).
+        records: Or a record for each; None for an empty state.
+    """
+
+    outputs: FloatArray
+    steps: IndexArray
+    data: bytes
+    ends: IndexArray
+    records: tuple[Record | None, ...] | None = None
+
+    @property
+    def method(self) -> SaveMethod:
+        """How the states were saved."""
+        return SaveMethod.STATE if self.records is None else SaveMethod.REPLAY
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def state(self, place: int) -> bytes:
+        """One of the serialized states."""
+        begin = int(self.ends[place - 1]) if place else 0
+        return self.data[begin : int(self.ends[place])]
+
+    def take(self, places: Sequence[int] | IndexArray) -> Bundle:
+        """The states at these places."""
+        chosen = np.asarray(places, np.int64)
+        outputs = np.ascontiguousarray(self.outputs[:, chosen])
+        if self.records is not None:
+            records = tuple(self.records[place] for place in chosen.tolist())
+            return Bundle(outputs, self.steps[chosen], b"", self.ends[chosen], records)
+        data, ends = joined(map(self.state, chosen.tolist()))
+        return Bundle(outputs, self.steps[chosen], data, ends)
+
+    @property
+    def content(self) -> tuple[object, ...]:
+        """What two equal bundles have in common."""
+        records = self.records
+        held = None if records is None else tuple(None if r is None else r.content for r in records)
+        arrays = self.outputs.shape, self.outputs.tobytes(), self.steps.tobytes()
+        return (*arrays, self.data, self.ends.tobytes(), held)
+
+
+def joined(states: Iterable[bytes]) -> tuple[bytes, IndexArray]:
+    """Put serialized states into one piece; returns it and where each of them ends."""
+    parts = list(states)
+    return b"".join(parts), np.cumsum([len(part) for part in parts], dtype=np.int64)

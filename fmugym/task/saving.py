@@ -1,0 +1,105 @@
+"""What makes the episode of a single environment, as columns of a snapshot."""
+
+from __future__ import annotations
+
+import copy
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from fmugym.errors import ConfigError
+from fmugym.task.construction import Constructed
+from fmugym.task.generators import row_of, state_of
+from fmugym.task.plain import changed, plain_attributes
+from fmugym.task.snapshot import Columns
+
+__all__ = ["columns_of", "native_value", "place_columns"]
+
+
+def columns_of(env: Constructed) -> Columns:
+    """Copy what makes the episode, except for the FMU's state.
+
+    Returns:
+        Columns of one environment.
+    """
+    attributes = plain_attributes(vars(env), env._own_names)
+    streams, seeds = _stream_of(env)
+    return {
+        "values": np.array([env._values]),
+        "previous_state": np.array([env.previous_state]),
+        "inputs": np.array([env.inputs], np.float64),
+        "action": [copy.deepcopy(env.action)],
+        "previous_action": [copy.deepcopy(env.previous_action)],
+        "step_count": np.array([env.step_count]),
+        "done": np.array([env.done]),
+        "after_end": np.array([env.after_end]),
+        "ended": np.array([env._ended]),
+        "parameters": {name: [value] for name, value in env.parameters.items()},
+        "variables": {name: [copy.deepcopy(v)] for name, v in env.variables.items()},
+        "streams": streams,
+        "seeds": seeds,
+        "pictured": [(env._last_reward, env._return)],
+        "attributes": [changed(attributes, env._as_constructed)],
+    }
+
+
+def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
+    """The random stream and its seed; None if there is none yet."""
+    generator = env._np_random
+    if generator is None:
+        return [None], [None]
+    state = generator.bit_generator.state
+    seed = None if env._np_random_seed == -1 else env._np_random_seed
+    if state["bit_generator"] != "PCG64":
+        return [copy.deepcopy(state)], [seed]
+    return np.array([row_of(state)], np.uint64), [seed]
+
+
+def place_columns(env: Constructed, columns: Columns, place: int) -> None:
+    """Let an environment go on from the columns, except for the FMU's state."""
+    values = tuple(np.asarray(columns["values"][place], np.float64).tolist())
+    env._values = values
+    env.state = values[: env._output_count]
+    env.previous_state = tuple(np.asarray(columns["previous_state"][place], np.float64).tolist())
+    env.inputs = tuple(np.asarray(columns["inputs"][place], np.float64).tolist())
+    env.action = native_value(columns["action"], place)
+    env.previous_action = native_value(columns["previous_action"], place)
+    env.step_count = int(columns["step_count"][place])
+    env.done = bool(columns["done"][place])
+    env.after_end = bool(columns["after_end"][place])
+    parameters = {name: native_value(c, place) for name, c in columns["parameters"].items()}
+    env.parameters = MappingProxyType({n: v for n, v in parameters.items() if v is not None})
+    env.variables.update(
+        {name: native_value(column, place) for name, column in columns["variables"].items()}
+    )
+    pictured, attributes = columns["pictured"], columns["attributes"]
+    env._last_reward, env._return = (None, 0.0) if pictured is None else pictured[place]
+    vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
+    _place_stream(env, columns, place)
+    env._was_reset, env._ended = True, bool(columns["ended"][place])
+
+
+def native_value(column: Any, place: int) -> Any:
+    """One value of a column as the hooks of a single environment read it."""
+    value = column[place]
+    if isinstance(column, list):
+        return copy.deepcopy(value)
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    return value.item() if value.dtype.kind == "f" else value
+
+
+def _place_stream(env: Constructed, columns: Columns, place: int) -> None:
+    stream = columns["streams"][place]
+    if stream is None:
+        env._np_random, env._np_random_seed = None, None
+        return
+    state = stream if isinstance(stream, dict) else state_of([int(word) for word in stream])
+    bits = getattr(np.random, state["bit_generator"], None)
+    if bits is None:
+        raise ConfigError(f"the snapshot has a generator {state['bit_generator']!r}")
+    generator = np.random.Generator(bits())
+    generator.bit_generator.state = state
+    seed = columns["seeds"][place]
+    env._np_random, env._np_random_seed = generator, -1 if seed is None else seed

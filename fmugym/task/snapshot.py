@@ -1,0 +1,246 @@
+"""Snapshots: episodes at one moment, as values."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
+from fmugym.trial.trial import content_of
+
+if TYPE_CHECKING:
+    from fmugym.task.construction import Constructed
+
+__all__ = [
+    "Column",
+    "Columns",
+    "Scope",
+    "Snapshot",
+    "checked_snapshot",
+    "scope_of",
+    "stacked",
+    "taken",
+]
+
+_VERSION: Final = 1
+"""Of pickles; it changes with their content."""
+
+_OPERATION: Final = {
+    *("on_fault", "fault_retries", "fault_reward", "leak_limit", "reset_method", "rehearsals"),
+    *("archive_limits", "preload", "probe_timeout", "isolation", "call_timeout", "max_instances"),
+    *("max_initializations_per_second", "keep_initial_states", "licence_wait"),
+}
+"""Config keys on which no state depends."""
+
+_WIDE: Final = {"b": np.int64, "i": np.int64, "u": np.uint64, "f": np.float64}
+"""By kind, the type in which numbers are compared."""
+
+Column = npt.NDArray[Any] | list[Any]
+"""One value for each environment, which comes first."""
+
+Columns = dict[str, Any]
+"""Columns by name; those of the parameters, variables and attributes are dicts again."""
+
+Scope = dict[str, str]
+"""What an environment must have in common with those of a snapshot, as texts by name."""
+
+
+class Snapshot:
+    """The episodes of M environments at one moment; ``save_state`` returns one.
+
+    A snapshot is a value. It can be compared, copied and pickled. It fits every environment with
+    the same FMU and the same config, single or in a vector environment, in any process. It holds
+    the state of the FMU, time, step count, action, previous values, drawn parameters, episode
+    variables and random streams. It also holds what hooks have assigned to attributes of a single
+    environment, as far as these are numbers, texts, arrays, and lists or dicts of them.
+
+    ``snapshot[i]`` is the snapshot of environment i. A mask, a slice or a list of indices chooses
+    several.
+
+    Attributes:
+        method: ``"state"`` if the FMU has serialized its state. ``"replay"`` if the inputs of the
+            episode were kept: restoring such a snapshot plays the episode again.
+        step_count: Steps since the reset of each environment, shape (M,).
+    """
+
+    __slots__ = ("_bundle", "_columns", "_scope")
+
+    def __init__(self, scope: Scope, columns: Columns, bundle: Bundle) -> None:
+        self._scope, self._columns, self._bundle = scope, columns, bundle
+
+    @property
+    def method(self) -> SaveMethod:
+        """How the FMU's states were saved."""
+        return self._bundle.method
+
+    @property
+    def step_count(self) -> npt.NDArray[np.int64]:
+        """Steps since the reset of each environment, shape (M,)."""
+        return np.array(self._columns["step_count"], np.int64)
+
+    def __len__(self) -> int:
+        return len(self._bundle)
+
+    def __getitem__(self, which: Any) -> Snapshot:
+        places = self._places(which)
+        return Snapshot(self._scope, taken(self._columns, places), self._bundle.take(places))
+
+    def _places(self, which: Any) -> IndexArray:
+        try:
+            places = np.atleast_1d(np.arange(len(self))[which])
+        except (IndexError, TypeError, ValueError):
+            raise ConfigError(
+                f"{shown(which)} are no environments of a snapshot of {len(self)}"
+            ) from None
+        return places.astype(np.int64)
+
+    def __iter__(self) -> Iterator[Snapshot]:
+        return (self[index] for index in range(len(self)))
+
+    @property
+    def _content(self) -> tuple[Any, ...]:
+        return self._scope, _content(self._columns), self._bundle.content
+
+    def __eq__(self, other: object) -> bool:
+        return self._content == other._content if isinstance(other, Snapshot) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash((tuple(self._scope.items()), self._bundle.content))
+
+    def __repr__(self) -> str:
+        return f"Snapshot({len(self)} environment(s), method={str(self.method)!r})"
+
+    def __copy__(self) -> Snapshot:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Snapshot:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (_VERSION, self._scope, self._columns, self._bundle)
+
+    # For the environments.
+
+    def columns_for(self, scope: Scope) -> Columns:
+        """The columns, for an environment with this scope.
+
+        Raises:
+            ConfigError: If the snapshot is of another FMU or of another config.
+        """
+        for name, text in self._scope.items():
+            if scope.get(name) != text:
+                raise ConfigError(
+                    f"the snapshot is of environments with another {name}: {shown(text)}, expected "
+                    f"{shown(scope.get(name))}"
+                )
+        return self._columns
+
+    @property
+    def bundle(self) -> Bundle:
+        """The states of the FMU instances."""
+        return self._bundle
+
+
+def _unpickled(version: int, scope: Scope, columns: Columns, bundle: Bundle) -> Snapshot:
+    if version != _VERSION:
+        raise SimulationError(
+            f"the snapshot was pickled in version {version} of the format, expected {_VERSION}"
+        )
+    return Snapshot(scope, columns, bundle)
+
+
+def checked_snapshot(snapshot: Any, length: int | None = None) -> Snapshot:
+    """Return a snapshot.
+
+    Args:
+        snapshot: What a caller has given.
+        length: The number of environments that it must have; None for any.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
+    if not isinstance(snapshot, Snapshot):
+        raise ConfigError(f"expected a snapshot from save_state, got {shown(snapshot)}")
+    if length is not None and len(snapshot) != length:
+        raise ConfigError(
+            f"the snapshot is of {len(snapshot)} environments, expected {length}; snapshot[i] "
+            "chooses one"
+        )
+    return snapshot
+
+
+# Columns
+
+
+def taken(columns: Columns, places: Sequence[int] | IndexArray) -> Columns:
+    """Take some environments of the columns."""
+    return {name: _taken(column, places) for name, column in columns.items()}
+
+
+def _taken(column: Any, places: Any) -> Any:
+    if isinstance(column, dict):
+        return taken(column, places)
+    if isinstance(column, list):
+        return [column[place] for place in places]
+    return None if column is None else column[places]
+
+
+def stacked(parts: Sequence[Columns]) -> Columns:
+    """Put the columns of single environments together."""
+    return {name: _stacked([part.get(name) for part in parts]) for name in parts[0]}
+
+
+def _stacked(parts: list[Any]) -> Any:
+    if isinstance(parts[0], dict):
+        names = dict.fromkeys(name for part in parts for name in part)
+        return {name: [_first(part.get(name)) for part in parts] for name in names}
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts)
+    return [value for part in parts for value in part]
+
+
+def _first(column: Any) -> Any:
+    return None if column is None else column[0]
+
+
+def _content(column: Any) -> Any:
+    """What two equal columns have in common, whatever the type of their numbers is."""
+    if isinstance(column, dict):
+        return {name: _content(part) for name, part in column.items()}
+    try:
+        array = np.asarray(column)
+    except ValueError:  # arrays of different shapes
+        array = np.empty(0, object)
+    wide = _WIDE.get(array.dtype.kind)
+    return pickle.dumps(column) if wide is None else (array.shape, array.astype(wide).tobytes())
+
+
+# What must be the same
+
+
+def scope_of(env: Constructed) -> Scope:
+    """What a snapshot's environment must have in common with this one."""
+    config = env.config
+    scope = {
+        "FMU": content_of(env.fmu.path),
+        "action space": str(env.action_space),
+    }
+    names = [f.name for f in fields(config) if f.name not in _OPERATION]
+    return scope | {f"config key {name!r}": _text(getattr(config, name)) for name in names}
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key!r}: {_text(part)}' for key, part in value.items())}}}"
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(value.tobytes()).hexdigest()[:16]
+        return f"array of {value.dtype}, shape {value.shape}, content {digest}"
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))

@@ -1,0 +1,168 @@
+"""Trials that show whether states saved in the middle of an episode work, here and elsewhere.
+
+One process plays an episode, saves its state, plays on, restores the state and plays on again. A
+second process restores the same bytes in an instance that has never been initialized. Serialized
+states may hold addresses of the first process, so the second one may crash.
+"""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.errors import FMUGymError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, PoolSpec
+from fmugym.pool.bundle import Bundle
+from fmugym.pool.local import local_pool
+from fmugym.pool.patience import require_licence
+from fmugym.pool.saving import SavingPool
+from fmugym.pool.spec import ResetMethod
+from fmugym.trial.inputs import moving_inputs
+from fmugym.trial.rehearsal import Starts
+from fmugym.trial.trial import Candidate, Request, known_resuming, note_resuming, run
+from fmugym.trial.verdict import Grade
+
+__all__ = ["Halfway", "do_states_work", "known_to_work", "make_halfway", "try_halfway"]
+
+logger = logging.getLogger(__name__)
+
+_BEFORE, _AFTER = 5, 25
+"""The steps before and after the state."""
+
+_AMPLITUDES: Final = (0.3, 0.05, 0.0)
+"""How far inputs move, as fractions of their range; the smaller ones for FMUs that fail."""
+
+_ONE: Final = np.zeros(1, np.int64)
+
+
+@dataclass(frozen=True)
+class Halfway:
+    """A state in the middle of an episode, and what followed it.
+
+    Attributes:
+        state: The state.
+        inputs: The inputs of the steps after it, shape (steps, k_in).
+        rows: The outputs after each of them, shape (steps, k).
+    """
+
+    state: Bundle
+    inputs: FloatArray
+    rows: FloatArray
+
+
+def known_to_work(candidate: Candidate, spec: PoolSpec, starts: Starts | None) -> bool | None:
+    """What an earlier trial has shown; None if there was none."""
+    grade = known_resuming(candidate, spec, starts)
+    return None if grade is None else grade is Grade.BITWISE
+
+
+def do_states_work(candidate: Candidate, spec: PoolSpec, starts: Starts | None) -> bool:
+    """Find out in two processes whether restored states lead to the same outputs, bit by bit.
+
+    Args:
+        candidate: The FMU.
+        spec: The ``PoolSpec`` to try it with.
+        starts: The ``Starts`` of episodes.
+    """
+    known = known_to_work(candidate, spec, starts)
+    if known is not None:
+        return known
+    grade = _grade(Request(candidate, spec, starts, resume=True))
+    note_resuming(candidate, spec, starts, grade)
+    if grade is not Grade.BITWISE:
+        logger.warning(
+            "%s: its saved states do not work (%s); snapshots keep the inputs of the episode "
+            "instead, and restoring one plays the episode again",
+            candidate.path.name,
+            grade,
+        )
+    return grade is Grade.BITWISE
+
+
+def _grade(request: Request) -> Grade:
+    first = run(request)
+    if first.sample is None:
+        return Grade(first.answer.get("resuming", Grade.FAILS))
+    second = run(replace(request, resume=pickle.loads(first.sample)))
+    return Grade(second.answer.get("resuming", Grade.FAILS))
+
+
+# In the worker
+
+
+def make_halfway(request: Request) -> Halfway | Grade:
+    """Save a state and restore it in the same instance; returns a grade if that does not work."""
+    for amplitude in _AMPLITUDES:
+        pool = _open(request)
+        try:
+            halfway = _play(pool, request, amplitude)
+            if halfway is not None:
+                again = _rows(pool, halfway)
+                same = again.tobytes() == halfway.rows.tobytes()
+                return halfway if same else Grade.WRONG
+        except FMUGymError:
+            return Grade.FAILS
+        finally:
+            pool.close()
+    return Grade.FAILS
+
+
+def try_halfway(request: Request) -> Grade:
+    """Restore the state of another process in an instance that was never initialized."""
+    halfway: Halfway = request.resume
+    pool = _open(request)
+    try:
+        rows = _rows(pool, halfway)
+    except FMUGymError:
+        return Grade.FAILS
+    finally:
+        pool.close()
+    return Grade.BITWISE if rows.tobytes() == halfway.rows.tobytes() else Grade.WRONG
+
+
+def _open(request: Request) -> SavingPool:
+    spec = replace(
+        request.spec,
+        num_observed=0,
+        leak_limit=None,
+        fault_retries=0,
+        reset_method=ResetMethod.RESTORE,
+        state_files="",
+    )
+    return local_pool(request.candidate.open(), spec, 1, logger, threads=1)
+
+
+def _play(pool: SavingPool, request: Request, amplitude: float) -> Halfway | None:
+    """Play an episode with a state in its middle; None if the FMU does not get that far."""
+    starts = request.starts or Starts()
+    inputs = moving_inputs(request.spec, _BEFORE + _AFTER, amplitude)
+    pool.reset(starts.variables, starts.column(0))
+    require_licence(pool)
+    if not _step(pool, inputs[:_BEFORE], []):
+        return None
+    state, rows = pool.save_instances(_ONE), list[Any]()
+    _step(pool, inputs[_BEFORE:], rows)
+    return Halfway(state, inputs[_BEFORE:], np.array(rows))
+
+
+def _rows(pool: SavingPool, halfway: Halfway) -> FloatArray:
+    pool.restore_instances(halfway.state, _ONE, _ONE)
+    rows: list[Any] = []
+    if pool.statuses[0] <= Status.WARNING:
+        _step(pool, halfway.inputs, rows)
+    return np.array(rows)
+
+
+def _step(pool: SavingPool, inputs: FloatArray, rows: list[Any]) -> bool:
+    """Do steps until one fails; returns whether none has failed."""
+    for row in inputs:
+        outputs, statuses = pool.step(row[:, None])
+        rows.append(outputs[:, 0].copy())
+        if statuses[0] > Status.WARNING:
+            return False
+    return bool(pool.statuses[0] <= Status.WARNING)

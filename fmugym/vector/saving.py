@@ -1,0 +1,125 @@
+"""What makes the episodes of a batch of environments, as columns of a snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.checks import integer_of
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown
+from fmugym.pool.bundle import IndexArray
+from fmugym.task.snapshot import Columns, Snapshot
+
+__all__ = ["chosen", "columns_of", "place_columns", "require_fit", "sources_for", "values_of"]
+
+_FIRST = ("_values", "previous_state", "inputs", "action", "previous_action", "done", "after_end")
+"""The attributes of a batch with the environments on their last axis."""
+
+
+def chosen(where: Any, num_envs: int) -> IndexArray:
+    """The indices of environments.
+
+    Args:
+        where: A Boolean mask of shape (N,), an index, or a sequence of indices; None for all.
+        num_envs: N.
+
+    Raises:
+        ConfigError: If it fits none of these, or is empty, or names an environment twice.
+    """
+    indices = np.arange(num_envs)
+    if where is None:
+        return indices
+    try:
+        is_index = integer_of(where) is not None
+        array = np.asarray([where] if is_index else where)
+        mask = array.dtype == np.bool_ and array.shape == (num_envs,)
+        if not mask and (array.dtype.kind not in "iu" or array.ndim != 1):
+            raise IndexError
+        found: IndexArray = indices[array]
+    except Exception:  # the indices are out of range, or the caller's object fails
+        found = indices[:0]
+    if not len(found) or len(set(found.tolist())) < len(found):
+        raise ConfigError(
+            f"expected a Boolean mask of shape ({num_envs},), an index or different indices below "
+            f"{num_envs}, got {shown(where)}"
+        )
+    return found
+
+
+def sources_for(snapshot: Snapshot, indices: IndexArray) -> IndexArray:
+    """Which episode of a snapshot each of some environments gets.
+
+    Raises:
+        ConfigError: If it has neither one nor as many episodes.
+    """
+    if len(snapshot) == 1:
+        return np.zeros(len(indices), np.int64)
+    if len(snapshot) != len(indices):
+        raise ConfigError(
+            f"the snapshot is of {len(snapshot)} environments, but {len(indices)} are to go on "
+            "from it; expected as many, or one"
+        )
+    return np.arange(len(indices))
+
+
+def columns_of(env: FMUEnv, parameters: Mapping[str, Any], indices: IndexArray) -> Columns:
+    """Copy what hooks read in some environments of a batch.
+
+    Args:
+        env: The prototype.
+        parameters: The parameters, arrays of shape (N,).
+        indices: The environments, shape (M,).
+    """
+    first = {name.lstrip("_"): _rows(getattr(env, name), indices) for name in _FIRST}
+    return first | {
+        "step_count": env.step_count[indices],
+        "parameters": {name: row[indices] for name, row in parameters.items()},
+        "variables": {name: _rows(row, indices) for name, row in env.variables.items()},
+        "pictured": None,
+        "attributes": None,
+    }
+
+
+def _rows(values: Any, indices: IndexArray) -> npt.NDArray[Any]:
+    """Values with environments on the last axis, as a new array with them on the first."""
+    return np.ascontiguousarray(np.moveaxis(np.asarray(values)[..., indices], -1, 0))
+
+
+def place_columns(env: FMUEnv, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
+    """Let hooks read the columns; parameters and variables are placed elsewhere."""
+    env.done = env.done.copy()  # the caller holds this array
+    for name in _FIRST:
+        values = values_of(columns[name.lstrip("_")], sources)
+        getattr(env, name)[..., indices] = np.moveaxis(values, 0, -1)
+    env.step_count[indices] = values_of(columns["step_count"], sources)
+
+
+def require_fit(columns: Columns) -> None:
+    """Refuse what single environments may have, but not those of a batch.
+
+    Raises:
+        ConfigError: If hooks have assigned attributes, or the random generator is not a
+            ``numpy.random.PCG64``.
+    """
+    attributes, streams = columns["attributes"] or (), columns["streams"]
+    for name in (name for part in attributes for name in part):
+        raise ConfigError(
+            f"the snapshot has the attribute {name!r}, which the environments of a vector "
+            "environment share; keep it under 'episode_variables', or use hooks='per_env'"
+        )
+    if isinstance(streams, list) and any(isinstance(stream, dict) for stream in streams):
+        raise ConfigError(
+            "the snapshot has a random generator other than numpy.random.PCG64; reset the "
+            "environment with a seed before"
+        )
+
+
+def values_of(column: Any, sources: IndexArray) -> npt.NDArray[Any]:
+    """The values of a column at these places, as an array."""
+    if isinstance(column, np.ndarray):
+        return column[sources]
+    return np.array([column[source] for source in sources.tolist()])

@@ -1,0 +1,59 @@
+"""What ``import fmugym`` imports, and the names that come later."""
+
+import subprocess
+import sys
+
+import pytest
+
+import fmugym
+from fmugym import vector
+
+HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.env", "fmugym.envs")
+
+
+def run(program):
+    """The output of a program in a new interpreter, as words."""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    return done.stdout.split()
+
+
+def test_importing_the_package_imports_little():
+    assert run(f"import sys, fmugym; print(*(m for m in {HEAVY} if m in sys.modules))") == []
+
+
+def test_a_class_brings_neither_vector_environments_nor_pictures():
+    program = "import sys, fmugym; fmugym.FMI2CSEnv; print(*(m for m in sys.modules))"
+    imported = set(run(program))
+    assert "fmugym.env" in imported
+    assert not {"pygame", "fmugym.vector.env", "fmugym.lab"} & imported
+
+
+def test_the_environments_are_registered():
+    program = """
+import gymnasium, fmugym
+print(*(name for name in gymnasium.registry if name.startswith("fmugym/")))
+"""
+    assert "fmugym/CartPole-v0" in run(program)
+
+
+def test_every_public_name_is_there():
+    assert dir(fmugym) == sorted(dir(fmugym))
+    for name in fmugym.__all__:
+        assert getattr(fmugym, name) is not None
+        assert name in dir(fmugym)
+    program = "from fmugym import *; print(CartPole := envs.CartPoleEnv, FMUVectorEnv, register)"
+    assert "fmugym.vector.env.FMUVectorEnv" in " ".join(run(program))
+
+
+@pytest.mark.parametrize("name", ["lab", "testing", "identification", "rendering", "vector"])
+def test_rooms_are_imported_by_name(name):
+    assert run(f"import fmugym; print(fmugym.{name}.__name__)") == [f"fmugym.{name}"]
+
+
+@pytest.mark.parametrize("module", [fmugym, vector])
+def test_other_names_are_refused(module):
+    with pytest.raises(AttributeError, match=rf"module '{module.__name__}' has no attribute 'Foo'"):
+        module.Foo  # noqa: B018 (the access is what is tested)
+    assert not hasattr(module, "__wrapped__")
