@@ -168,6 +168,7 @@ class Variables(TypedDict):
     outputs: Access
     num_observed: int
     strings: tuple[tuple[int, bytes], ...]
+    sampling: bytes
 
 class Arrays(TypedDict):
     """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""

@@ -28,6 +28,7 @@ from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
+    SAMPLINGS,
     ResetMethod,
 )
 
@@ -105,6 +106,9 @@ class EnvConfig:
             that take long to initialize.
         licence_wait: Seconds of real time to wait for a licence that the FMU does not get; 0 to
             give up at once.
+        samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
+            default), or the ``"mean"``, ``"integral"`` over time, ``"min"`` or ``"max"`` of the
+            values after each substep. After a reset an integral is 0.
 
     Raises:
         ConfigError: For a value of the wrong type or range.
@@ -140,6 +144,7 @@ class EnvConfig:
     max_initializations_per_second: float | None = None
     keep_initial_states: bool = False
     licence_wait: float = 0.0
+    samplings: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any] | EnvConfig) -> EnvConfig:
@@ -203,6 +208,9 @@ class EnvConfig:
         variables = {name: _variable(name, v) for name, v in self.episode_variables.items()}
         self._set("episode_variables", variables)
         self._set("bounds", {name: _bounds(name, limits) for name, limits in self.bounds.items()})
+        samplings = check_mapping("samplings", self.samplings).items()
+        checked = {name: check_option("sampling", value, SAMPLINGS) for name, value in samplings}
+        self._set("samplings", checked)
 
     def _take_floats(self) -> None:
         for key in _REWARDS:
@@ -236,6 +244,9 @@ class EnvConfig:
                 raise ConfigError(f"{key}: {twice[0]!r} is named twice")
         if not self.model_output_names:
             raise ConfigError("config key 'model_output_names' names no output")
+        for name in self.samplings:
+            if name not in read:
+                raise unknown_name("output in 'samplings'", name, read)
         for name in self.episode_variables:
             if name in self.model_parameters:
                 raise ConfigError(f"{name!r} is both a model parameter and an episode variable")

@@ -120,7 +120,8 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     pool->pace.turns = (uint64_t)settings->turns;
     pool->step_size = settings->time_step / (double)settings->substeps;
     pool->no_return = !settings->restores && settings->retries == 0;
-    pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
+    pool->direct = settings->substeps == 1 && settings->retries == 0 &&
+                   settings->sampling == NULL && settings->inputs->direct &&
                    settings->outputs->direct;
     pool->open = true;
     pool->floats = floats_now();

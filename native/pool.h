@@ -23,6 +23,10 @@ typedef struct {
     const char *text;
 } StringValue;
 
+/* What a step gives of the values that an output has after each of its substeps.
+ * fmugym/pool/spec.py lists their names in this order. */
+typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX } Sampling;
+
 /* The settings of a pool. Everything they point to must stay in place as long as the pool
  * exists. */
 typedef struct {
@@ -51,6 +55,7 @@ typedef struct {
     const StringValue *strings;
     size_t number_of_strings;
     const Access *inputs, *outputs;
+    const unsigned char *sampling; /* one Sampling for each output, or NULL if all are the last */
     size_t num_observed;
     size_t count;
     size_t threads;

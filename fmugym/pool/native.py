@@ -46,7 +46,7 @@ from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
 from fmugym.pool.saving import SavingPool, Serialized
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -199,6 +199,7 @@ class NativePool(SavingPool):
                     "outputs": self._access(spec.outputs),
                     "num_observed": spec.num_observed,
                     "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                    "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
                 },
                 arrays={
                     "inputs": self.inputs,
@@ -533,14 +534,14 @@ class NativePool(SavingPool):
                 of a start value, or -1 and a constant.
 
         Returns:
-            A function of actions, observations (float32, or a tuple of the arrays that the second
-            program stores), rewards, terminated, truncated, drawn values (draws, N), last
-            observations and started (Booleans). It does a step and fills all but the actions; of
-            the drawn values, only those of episodes that start; ``given`` ones are read. If the
-            last two are arrays, which needs observations of float32, an episode that ends without
-            a fault is followed by the next in the same step; if they are None, in the next step.
-            It returns how many instances had trouble (a status worse than a warning, or numbers
-            that are not finite), how many episodes have ended, and how many of these were followed.
+            A function of actions, observations (float32, or the array that the second program
+            stores, or a tuple of several), rewards, terminated, truncated, drawn values (draws,
+            N), last observations and started (Booleans). It does a step and fills all but the
+            actions; of the drawn values, only those of episodes that start; ``given`` ones are
+            read. If the last two are arrays, an episode that ends without a fault is followed by
+            the next in the same step; if they are None, in the next step. It returns how many
+            instances had trouble (a status worse than a warning, or numbers that are not finite),
+            how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(

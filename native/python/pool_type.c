@@ -199,6 +199,8 @@ typedef struct {
     int version, private_libraries, logging, can_save;
     int restores, rebuilds, reloads, one_initialization;
     long long substeps, warm_up_steps, retries;
+    const char *sampling;
+    Py_ssize_t samplings;
 } Arguments;
 
 bool parse_group(PyObject *group, const char *format, char **names, ...) {
@@ -236,9 +238,10 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
-    static char *names[] = {"inputs", "outputs", "num_observed", "strings", NULL};
-    return parse_group(group, "$O!O!nO!:variables", names, access_type, &a->inputs, access_type,
-                       &a->outputs, &a->num_observed, &PyTuple_Type, &a->strings);
+    static char *names[] = {"inputs", "outputs", "num_observed", "strings", "sampling", NULL};
+    return parse_group(group, "$O!O!nO!y#:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &PyTuple_Type, &a->strings, &a->sampling,
+                       &a->samplings);
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
@@ -265,7 +268,8 @@ static bool check_numbers(const Arguments *a) {
     const bool sound = a->count >= 1 && a->count <= INT32_MAX && a->threads >= 1 &&
                        a->substeps >= 1 && a->warm_up_steps >= 0 && a->num_observed >= 0 &&
                        a->retries >= 0 && a->retries < 31 && (a->retries == 0 || a->can_save) &&
-                       (size_t)a->num_observed <= a->outputs->access.count;
+                       (size_t)a->num_observed <= a->outputs->access.count &&
+                       (a->samplings == 0 || (size_t)a->samplings == a->outputs->access.count);
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a number is out of range");
     }
@@ -396,6 +400,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->one_initialization = a->one_initialization;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
+    s->sampling = a->samplings == 0 ? NULL : (const unsigned char *)a->sampling;
     s->num_observed = (size_t)a->num_observed;
     s->count = (size_t)a->count;
     s->threads = (size_t)a->threads;
