@@ -48,6 +48,7 @@ class Plan:
     Attributes:
         config: The config for ``FMUEnv``.
         hooks: Functions of the environment by the names of the hooks that they are.
+        observation_names: The names of the elements of the observation.
         cost_limits: What the costs of an episode may add up to, by name.
 
     Raises:
@@ -69,6 +70,7 @@ class Plan:
         self._seen = observed_values(declared, self._naming, self._kept, self._time_step)
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
+        self.observation_names = tuple(name for _, name in declared.observed)
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 

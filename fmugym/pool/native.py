@@ -37,6 +37,7 @@ from fmugym.pool.base import (
     FloatArray,
     MaskArray,
     PoolSpec,
+    SingleCalls,
     StatusArray,
     available_processors,
 )
@@ -190,6 +191,9 @@ class NativePool(SavingPool):
                     "reloads": method == ResetMethod.LIBRARY,
                     "one_initialization": spec.one_initialization,
                     "pace": (spec.initialization_interval, *spec.turn),
+                    "start_outputs": (
+                        np.array(spec.start_outputs).tobytes() if spec.blind_start else None
+                    ),
                 },
                 variables={
                     "inputs": self._access(spec.inputs),
@@ -531,14 +535,14 @@ class NativePool(SavingPool):
                 of a start value, or -1 and a constant.
 
         Returns:
-            A function of actions, observations (float32, or a tuple of the arrays that the second
-            program stores), rewards, terminated, truncated, drawn values (draws, N), last
-            observations and started (Booleans). It does a step and fills all but the actions; of
-            the drawn values, only those of episodes that start; ``given`` ones are read. If the
-            last two are arrays, which needs observations of float32, an episode that ends without
-            a fault is followed by the next in the same step; if they are None, in the next step.
-            It returns how many instances had trouble (a status worse than a warning, or numbers
-            that are not finite), how many episodes have ended, and how many of these were followed.
+            A function of actions, observations (float32, or the array that the second program
+            stores, or a tuple of several), rewards, terminated, truncated, drawn values (draws,
+            N), last observations and started (Booleans). It does a step and fills all but the
+            actions; of the drawn values, only those of episodes that start; ``given`` ones are
+            read. If the last two are arrays, an episode that ends without a fault is followed by
+            the next in the same step; if they are None, in the next step. It returns how many
+            instances had trouble (a status worse than a warning, or numbers that are not finite),
+            how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(
@@ -553,6 +557,29 @@ class NativePool(SavingPool):
             **surroundings,
         )
         return self._pool.play
+
+    def prepare_single(self, **groups: Any) -> SingleCalls:
+        """Prepare a pool of one instance to do whole steps of a single environment.
+
+        This replaces what was prepared before. Every step uses the given arrays in place. A row is
+        an array of one element.
+
+        Args:
+            groups: ``inputs`` and ``judgement``, the programs (see ``Program.with_rows``): from
+                the action to the rows of ``wanted``; from the outputs to done, truncated, reward.
+                ``actions``, the class, shape and letter of an action; whether it is an integer,
+                and then its lowest and highest value; and flat arrays for the ``next``, the
+                ``current`` and the ``previous`` one. ``rows``, pairs of episode variables and what
+                they were before the step; ``kept``, for the outputs before the step; ``episode``,
+                the number of its steps; ``limit``, after how many it is truncated. ``seen``, the
+                arrays that the second program stores; ``copies``, functions that make the parts of
+                an observation, and ``names``, their keys, or None for a single part; ``observed``,
+                whether it is the pool's own of float32. ``watched``, names of attributes, their
+                values, and None, an equal copy, or the bytes of an array.
+        """
+        self._pool.prepare_single(**groups)
+        own = self._pool
+        return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
     def start_of_play(self) -> Callable[..., int]:
         """The function that starts episodes after ``prepare_play``, outside of a step.
