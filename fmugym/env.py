@@ -418,6 +418,12 @@ class FMUEnv(Constructed):
         return {name: int(values[0]) for name, values in counts.items()}
 
     @property
+    def observation_names(self) -> tuple[str, ...] | None:
+        """The names of the observation's elements; None if a hook of the class makes it."""
+        is_default = type(self)._get_observation is FMUEnv._get_observation
+        return tuple(self.config.model_output_names) if is_default else None
+
+    @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
         """The goal reward in the form that hindsight replay calls; see ``_goal_reward``.
 

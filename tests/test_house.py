@@ -22,6 +22,7 @@ STOREYS = [
     {"vector", "lab", "identification"},
     {"registration", "testing", "sb3", "declared"},
     {"envs", "tools"},
+    {"baselines"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

@@ -531,14 +531,14 @@ class NativePool(SavingPool):
                 of a start value, or -1 and a constant.
 
         Returns:
-            A function of actions, observations (float32, or a tuple of the arrays that the second
-            program stores), rewards, terminated, truncated, drawn values (draws, N), last
-            observations and started (Booleans). It does a step and fills all but the actions; of
-            the drawn values, only those of episodes that start; ``given`` ones are read. If the
-            last two are arrays, which needs observations of float32, an episode that ends without
-            a fault is followed by the next in the same step; if they are None, in the next step.
-            It returns how many instances had trouble (a status worse than a warning, or numbers
-            that are not finite), how many episodes have ended, and how many of these were followed.
+            A function of actions, observations (float32, or the array that the second program
+            stores, or a tuple of several), rewards, terminated, truncated, drawn values (draws,
+            N), last observations and started (Booleans). It does a step and fills all but the
+            actions; of the drawn values, only those of episodes that start; ``given`` ones are
+            read. If the last two are arrays, an episode that ends without a fault is followed by
+            the next in the same step; if they are None, in the next step. It returns how many
+            instances had trouble (a status worse than a warning, or numbers that are not finite),
+            how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(
