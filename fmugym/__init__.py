@@ -88,7 +88,7 @@ _MODULES = {
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),
     *("errors", "fmi", "identification", "lab", "pool", "registration", "rendering", "sb3"),
-    *("task", "testing", "tools", "trial", "vector"),
+    *("single", "task", "testing", "tools", "trial", "vector"),
 ]
 """Modules and packages that ``fmugym.name`` imports."""
 

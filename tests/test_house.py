@@ -20,7 +20,7 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification"},
-    {"registration", "testing", "sb3", "declared"},
+    {"registration", "single", "testing", "sb3", "declared"},
     {"envs", "tools"},
     {"baselines"},
     {"__init__", "__main__", "clock"},
