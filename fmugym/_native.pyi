@@ -282,6 +282,34 @@ class Pool:
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
+    def prepare_single(
+        self,
+        *,
+        inputs: tuple[Any, ...],
+        judgement: tuple[Any, ...],
+        actions: dict[str, Any],
+        rows: tuple[tuple[Array, Array], ...],
+        wanted: Array,
+        kept: Array,
+        episode: Array,
+        limit: int,
+        seen: tuple[Array, ...],
+        copies: tuple[Callable[[], Any], ...],
+        names: tuple[str, ...] | None,
+        observed: bool,
+        watched: tuple[tuple[str, Any, Any], ...],
+    ) -> None:
+        """Take over what surrounds the steps of a single environment; see ``NativePool``."""
+
+    def step_single(self, action: Any, attributes: dict[str, Any], count: int, /) -> Any:
+        """Do a step, with all that was taken over; see ``SingleCalls.step``."""
+
+    def begin_single(self, action: Any, /) -> None:
+        """Take what counts as the action of the step before."""
+
+    def actions_of_single(self) -> tuple[Any, Any]:
+        """The actions of the last step and of the one before."""
+
     def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 

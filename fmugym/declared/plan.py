@@ -47,6 +47,7 @@ class Plan:
     Attributes:
         config: The config for ``FMUEnv``.
         hooks: Functions of the environment by the names of the hooks that they are.
+        observation_names: The names of the elements of the observation.
         cost_limits: What the costs of an episode may add up to, by name.
 
     Raises:
@@ -66,6 +67,7 @@ class Plan:
             self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
+        self.observation_names = tuple(name for _, name in declared.observed)
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 

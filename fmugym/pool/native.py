@@ -37,6 +37,7 @@ from fmugym.pool.base import (
     FloatArray,
     MaskArray,
     PoolSpec,
+    SingleCalls,
     StatusArray,
     available_processors,
 )
@@ -553,6 +554,29 @@ class NativePool(SavingPool):
             **surroundings,
         )
         return self._pool.play
+
+    def prepare_single(self, **groups: Any) -> SingleCalls:
+        """Prepare a pool of one instance to do whole steps of a single environment.
+
+        This replaces what was prepared before. Every step uses the given arrays in place. A row is
+        an array of one element.
+
+        Args:
+            groups: ``inputs`` and ``judgement``, the programs (see ``Program.with_rows``): from
+                the action to the rows of ``wanted``; from the outputs to done, truncated, reward.
+                ``actions``, the class, shape and letter of an action; whether it is an integer,
+                and then its lowest and highest value; and flat arrays for the ``next``, the
+                ``current`` and the ``previous`` one. ``rows``, pairs of episode variables and what
+                they were before the step; ``kept``, for the outputs before the step; ``episode``,
+                the number of its steps; ``limit``, after how many it is truncated. ``seen``, the
+                arrays that the second program stores; ``copies``, functions that make the parts of
+                an observation, and ``names``, their keys, or None for a single part; ``observed``,
+                whether it is the pool's own of float32. ``watched``, names of attributes, their
+                values, and None, an equal copy, or the bytes of an array.
+        """
+        self._pool.prepare_single(**groups)
+        own = self._pool
+        return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
     def start_of_play(self) -> Callable[..., int]:
         """The function that starts episodes after ``prepare_play``, outside of a step.

@@ -185,6 +185,9 @@ static void pool_dealloc(PyObject *object) {
     free(self->categories);
     free(self->strings);
     Py_XDECREF(self->playing);
+    Py_XDECREF(self->single);
+    Py_XDECREF(self->actions[0]);
+    Py_XDECREF(self->actions[1]);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -465,6 +468,11 @@ static PyMethodDef methods[] = {
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
     FAST("play", py_play),
+    {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
+     METH_VARARGS | METH_KEYWORDS, NULL},
+    FAST("step_single", py_step_single),
+    {"begin_single", py_begin_single, METH_O, NULL},
+    {"actions_of_single", py_actions_of_single, METH_NOARGS, NULL},
     FAST("start", py_start),
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),

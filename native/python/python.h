@@ -44,6 +44,8 @@ typedef struct {
     const char **paths, **categories;
     StringValue *strings;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
+    PyObject *single;  /* another one */
+    PyObject *actions[2]; /* of a single environment, in the last step and in the one before */
 } PyPool;
 
 extern PyTypeObject *access_type, *draws_type, *mark_type, *snapshot_type;
@@ -112,5 +114,10 @@ PyObject *py_seed(PyObject *module, PyObject *args);
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+
+PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs);
+PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_begin_single(PyObject *object, PyObject *action);
+PyObject *py_actions_of_single(PyObject *object, PyObject *unused);
 
 #endif

@@ -65,6 +65,8 @@ def _into(out: Any, result: Symbols) -> Any:
 
 def _kind_of(value: Any) -> Any:
     """The type of an operand; the numbers of Python adapt to the other operands."""
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak
     return type(value) if type(value) in (int, float) else np.asarray(value).dtype
 
 
@@ -244,6 +246,8 @@ def _dummy(graph: Graph, value: Any) -> Any:
     """A number or array of the same type, of which numpy makes the same type of result."""
     if type(value) in (int, float, bool):
         return value
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak(1)
     return np.ones(1, as_symbols(graph, value).dtype)
 
 
@@ -455,7 +459,7 @@ def _patched(function: Any, own: Callable[..., Any]) -> Callable[..., Any]:
         graph = getattr(_tracing, "graph", None)
         if graph is None:
             return function(*args, **keywords)
-        return own(graph, function, *args, **keywords)
+        return graph.patched(own, function, args, keywords)
 
     return functools.update_wrapper(call, function)
 
