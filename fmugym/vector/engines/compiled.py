@@ -492,7 +492,7 @@ class CompiledEngine(BatchEngine):
         self._outputs_before, self._variables_before = self._kept, self._before
         env._in_hooks = True
         try:
-            self._handle_faults(result, statuses, True)
+            self._handle_faults(result, statuses, True, not_finite(result.observations))
         finally:
             env._in_hooks = False
         self.note_ends(result.terminated, result.truncated)
