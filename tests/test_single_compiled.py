@@ -453,8 +453,8 @@ class TestLife:
             found += [env.step(action) for action in actions[2:]]
             results.append(found)
         assert all(map(same, *results))
-        require_readings(one, other)
         assert one._play is not None
+        require_readings(one, other)
 
     def test_draws_in_hooks_are_refused(self):
         class Random(Drawing):
