@@ -224,6 +224,14 @@ class Pool(ABC):
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
+    def roll_out(self, *arrays: Any) -> int:
+        """Do many steps of the prepared play in one call; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``can_play``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+
     def rehearse_with(self, judge: Judge) -> None:
         """Record episodes now and then, and let them be judged; see ``fmugym.pool.tape``."""
         return

@@ -548,6 +548,19 @@ class NativePool(SavingPool):
         )
         return self._pool.play
 
+    def roll_out(self, *arrays: Any) -> int:
+        """Do many steps of the prepared play in one call; episodes that end are not followed.
+
+        Args:
+            arrays: Actions, observations, rewards, terminated and truncated as for the function
+                that ``prepare_play`` returns, each with a first axis for the steps; and memory for
+                drawn values, which are not drawn.
+
+        Returns:
+            How many instances or numbers were in trouble; if there are any, not all steps are done.
+        """
+        return self._open_pool().rollout(*arrays)
+
     def start_of_play(self) -> Callable[..., int]:
         """The function that starts episodes after ``prepare_play``, outside of a step.
 

@@ -459,6 +459,7 @@ static PyMethodDef methods[] = {
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
     FAST("play", py_play),
+    FAST("rollout", py_rollout),
     FAST("start", py_start),
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),

@@ -365,6 +365,20 @@ class CompiledEngine(BatchEngine):
         self.any_ended = ended > begun
         return troubled, begun
 
+    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
+        """See ``Engine.roll_out``."""
+        if not self._prepared or self._left:
+            return None
+        horizon = len(actions)
+        shape = horizon, self._n
+        judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
+        seen = self._layout.new_arrays(horizon)
+        self.has_moved = True
+        troubled = self._pool.roll_out(
+            np.ascontiguousarray(actions), seen, *judged, np.zeros(self._drawn_shape)
+        )
+        return None if troubled else (self._layout.divided(seen)[0], *judged)
+
     def _completed(
         self, result: StepResult, resetting: MaskArray | None, started: MaskArray | None
     ) -> StepResult:
@@ -507,8 +521,8 @@ class _Layout:
         env: The environment, with the arrays of N.
 
     Attributes:
-        new_arrays: Makes the arrays of a step: those that the program stores in, or else one for
-            the observations of the pool.
+        new_arrays: Makes the arrays of a step, or of so many steps: those that the program stores
+            in, or else one for the observations of the pool.
         divided: Returns the observations and a new dict of infos that such arrays hold.
     """
 
@@ -519,7 +533,7 @@ class _Layout:
         self._paths = [array.path for array in task.seen]
         self._names = [path[-1] for path in self._paths]
         stores = bool(task.seen) or not env._pool_observes
-        self.new_arrays: Callable[[], Any] = self._stored if stores else self._observed
+        self.new_arrays: Callable[..., Any] = self._stored if stores else self._observed
         self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] = self._alone
         if stores and self._paths == [("observation",)]:
             self.divided = self._only
@@ -528,11 +542,11 @@ class _Layout:
         elif stores:
             self.divided = self._tree
 
-    def _observed(self) -> npt.NDArray[Any]:
-        return np.empty(self._shape, _FLOAT32)
+    def _observed(self, *steps: int) -> npt.NDArray[Any]:
+        return np.empty((*steps, *self._shape), _FLOAT32)
 
-    def _stored(self) -> tuple[npt.NDArray[Any], ...]:
-        return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
+    def _stored(self, *steps: int) -> tuple[npt.NDArray[Any], ...]:
+        return tuple([np.empty((*steps, *shape), dtype) for shape, dtype in self._shapes])
 
     def _alone(self, array: Any) -> tuple[Any, dict[str, Any]]:
         return array, {}
