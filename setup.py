@@ -15,7 +15,10 @@ if sysconfig.get_config_var("Py_GIL_DISABLED"):
     sys.exit("fmugym needs Python with the GIL: free-threaded Python is not supported")
 
 WINDOWS = sys.platform == "win32"
-REQUIRED = os.environ.get("FMUGYM_REQUIRE_NATIVE", "0") not in ("", "0")
+WISH = os.environ.get("FMUGYM_REQUIRE_NATIVE", "")
+if WISH not in ("", "0", "1"):
+    sys.exit(f"FMUGYM_REQUIRE_NATIVE must be 0 or 1, not {WISH!r}")
+REQUIRED = WISH == "1"
 
 # One wheel for all versions of Python from 3.11 on, the first to have buffers in its stable ABI.
 # Results must not depend on the compiler: no contraction, no relaxed floating-point arithmetic.

@@ -86,9 +86,9 @@ _MODULES = {
     "vector": ["FMUVectorEnv"],
 }
 _ROOMS = [
-    *("archive", "checks", "config", "declared", "distributions", "env", "envs", "errors", "fmi"),
-    *("identification", "lab", "pool", "registration", "rendering", "sb3", "task", "testing"),
-    *("tools", "trial", "vector"),
+    *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),
+    *("errors", "fmi", "identification", "lab", "pool", "registration", "rendering", "sb3"),
+    *("single", "task", "testing", "tools", "trial", "vector"),
 ]
 """Modules and packages that ``fmugym.name`` imports."""
 

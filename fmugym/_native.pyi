@@ -109,6 +109,24 @@ class Draws:
         """
 
 @final
+class Mark:
+    """A mapped page of a file, in which a crash inside an FMU leaves its signal and the call.
+
+    Args:
+        file: The descriptor of a file of at least 4096 bytes; not needed afterwards.
+
+    Raises:
+        OSError: If the system cannot do so.
+    """
+
+    def __new__(cls, file: int, /) -> Mark: ...
+    def begin(self, call: int, /) -> None:
+        """Note that this thread is inside an FMU that Python calls; see ``enum FmuCall``."""
+
+    def end(self) -> None:
+        """End that."""
+
+@final
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
 
@@ -124,6 +142,7 @@ class Library(TypedDict):
     logging: bool
     states: bool
     categories: tuple[bytes, ...]
+    mark: Mark | None
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -148,6 +167,7 @@ class Variables(TypedDict):
     outputs: Access
     num_observed: int
     strings: tuple[tuple[int, bytes], ...]
+    sampling: bytes
 
 class Arrays(TypedDict):
     """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
@@ -261,6 +281,34 @@ class Pool:
             ValueError: If one of them is out of range or NaN.
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
+
+    def prepare_single(
+        self,
+        *,
+        inputs: tuple[Any, ...],
+        judgement: tuple[Any, ...],
+        actions: dict[str, Any],
+        rows: tuple[tuple[Array, Array], ...],
+        wanted: Array,
+        kept: Array,
+        episode: Array,
+        limit: int,
+        seen: tuple[Array, ...],
+        copies: tuple[Callable[[], Any], ...],
+        names: tuple[str, ...] | None,
+        observed: bool,
+        watched: tuple[tuple[str, Any, Any], ...],
+    ) -> None:
+        """Take over what surrounds the steps of a single environment; see ``NativePool``."""
+
+    def step_single(self, action: Any, attributes: dict[str, Any], count: int, /) -> Any:
+        """Do a step, with all that was taken over; see ``SingleCalls.step``."""
+
+    def begin_single(self, action: Any, /) -> None:
+        """Take what counts as the action of the step before."""
+
+    def actions_of_single(self) -> tuple[Any, Any]:
+        """The actions of the last step and of the one before."""
 
     def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""

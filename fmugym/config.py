@@ -28,6 +28,7 @@ from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
+    SAMPLINGS,
     ResetMethod,
 )
 
@@ -72,7 +73,7 @@ class EnvConfig:
         monitor_names: Variables that are read along with the outputs; they are in ``out`` but not
             in ``state``.
         episode_variables: Values of the task itself by name (targets, integrals, histories):
-            numbers, arrays of numbers, or distributions drawn at each reset. ``_update`` may write
+            numbers, distributions drawn at each reset, or arrays of both. ``_update`` may write
             them; it assigns new arrays.
         bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
@@ -105,6 +106,9 @@ class EnvConfig:
             that take long to initialize.
         licence_wait: Seconds of real time to wait for a licence that the FMU does not get; 0 to
             give up at once.
+        samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
+            default), or the ``"mean"``, ``"integral"`` over time, ``"min"`` or ``"max"`` of the
+            values after each substep. After a reset an integral is 0.
 
     Raises:
         ConfigError: For a value of the wrong type or range.
@@ -140,6 +144,7 @@ class EnvConfig:
     max_initializations_per_second: float | None = None
     keep_initial_states: bool = False
     licence_wait: float = 0.0
+    samplings: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any] | EnvConfig) -> EnvConfig:
@@ -203,6 +208,9 @@ class EnvConfig:
         variables = {name: _variable(name, v) for name, v in self.episode_variables.items()}
         self._set("episode_variables", variables)
         self._set("bounds", {name: _bounds(name, limits) for name, limits in self.bounds.items()})
+        samplings = check_mapping("samplings", self.samplings).items()
+        checked = {name: check_option("sampling", value, SAMPLINGS) for name, value in samplings}
+        self._set("samplings", checked)
 
     def _take_floats(self) -> None:
         for key in _REWARDS:
@@ -236,6 +244,9 @@ class EnvConfig:
                 raise ConfigError(f"{key}: {twice[0]!r} is named twice")
         if not self.model_output_names:
             raise ConfigError("config key 'model_output_names' names no output")
+        for name in self.samplings:
+            if name not in read:
+                raise unknown_name("output in 'samplings'", name, read)
         for name in self.episode_variables:
             if name in self.model_parameters:
                 raise ConfigError(f"{name!r} is both a model parameter and an episode variable")
@@ -261,22 +272,54 @@ def _variable(name: str, value: Any) -> Any:
     what = f"episode variable {name!r}"
     if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
         return _variable_array(what, value)
-    value = as_distribution(what, value)
-    if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
-        raise ConfigError(f"{what} must be a number or an array of numbers, got {shown(value)}")
-    return value if is_distribution(value) else check_number(what, value)
+    return _variable_element(what, as_distribution(what, value))
 
 
-def _variable_array(what: str, value: Any) -> npt.NDArray[np.float64]:
-    """Return an array that cannot be changed, because all episodes start with it."""
+def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
+    """Return an array that cannot be changed, because all episodes start with it.
+
+    It is of floats, or of floats and distributions as objects.
+    """
     try:
-        array = np.array(value, np.float64)
-    except Exception:  # lists that make no array, or objects that are no numbers
-        raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}") from None
-    if not array.size or not np.isfinite(array).all():
+        array: npt.NDArray[Any] = np.array(value, np.float64)
+    except Exception:  # lists that make no array, distributions, or objects that are no numbers
+        array = _drawn_array(what, value)
+    is_float = array.dtype != object
+    if not array.size or (is_float and not np.isfinite(array).all()):
         raise ConfigError(f"{what} must be an array of finite numbers, got {shown(value)}")
     array.setflags(write=False)
     return array
+
+
+def _drawn_array(what: str, value: Any) -> npt.NDArray[Any]:
+    """Return an array of objects for an array with distributions in it."""
+    shape, elements = _flattened(value)
+    elements = [as_distribution(what, one) for one in elements]
+    if shape is None or not any(map(is_distribution, elements)):
+        raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}")
+    array = np.empty(len(elements), object)
+    for place, one in enumerate(elements):
+        array[place] = _variable_element(f"element {place} of {what}", one)
+    return array.reshape(shape)
+
+
+def _variable_element(what: str, value: Any) -> Any:
+    if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
+        raise ConfigError(f"{what} must be a number, got {shown(value)}")
+    return value if is_distribution(value) else check_number(what, value)
+
+
+def _flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
+    """The shape of nested lists, and their elements; no shape if the lists differ in length."""
+    if isinstance(value, np.ndarray) and value.ndim:
+        value = list(value)
+    if not isinstance(value, list | tuple):
+        return (), [value]
+    parts = [_flattened(one) for one in value]
+    shapes = {shape for shape, _ in parts}
+    elements = [element for _, own in parts for element in own]
+    inner = shapes.pop() if len(shapes) == 1 else None
+    return (None if inner is None else (len(parts), *inner)), elements
 
 
 def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final, Never
 import numpy as np
 from gymnasium import logger as gymnasium_logger
 
-from fmugym.checks import check_seed
+from fmugym.checks import check_option, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, FMUGymError, SimulationError, shown, unknown_argument
 from fmugym.fmi.status import Status
@@ -24,17 +24,23 @@ from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
+from fmugym.task.readings import LateReading
 from fmugym.task.results import FLOAT32_LIMIT, as_info
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
+from fmugym.task.waiting import Waiting
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
 _INTEGERS: Final = frozenset({int, np.int64})
 _WARNING: Final = int(Status.WARNING)
 _TERMINATED: Final = int(Status.TERMINATED)
-_ARGUMENTS: Final = ("fmu_path", "config", "log_level", "render_mode", "backend", "isolation")
+_ARGUMENTS: Final = (
+    *("fmu_path", "config", "log_level", "render_mode", "backend", "isolation", "hooks"),
+)
+
+_WAYS: Final = ("auto", "compiled", "python")
 
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated and info."""
@@ -67,6 +73,10 @@ class FMUEnv(Constructed):
             with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
             it. Or the name of a way to step the FMU, see ``fmugym.trial.opening.make_pool``.
         isolation: Where the FMU runs; by default where the config says.
+        hooks: The way of calling hooks. ``"auto"`` compiles them after 1,000 steps if that gives
+            the same results, so that the native pool runs them in its step. ``"compiled"`` does so
+            in the first step, and it is an error where that is not possible. ``"python"`` never
+            does.
 
     Attributes:
         fmu: The FMU; ``fmu.description`` is its model description.
@@ -101,6 +111,25 @@ class FMUEnv(Constructed):
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters",)
     """The keys that ``reset`` takes in its options."""
 
+    _way = "auto"
+    _player: Any = None
+    """Steps the environment if its hooks are compiled, see ``fmugym.single``; or None."""
+
+    _play: Callable[..., Any] | None = None
+    _width = 0
+    _tells = False
+
+    # Where these are not attributes of the environment, the pool keeps them.
+    _values = LateReading()
+    state = LateReading()
+    previous_state = LateReading()
+    inputs = LateReading()
+    action = LateReading()
+    previous_action = LateReading()
+    step_count = LateReading()
+    done = LateReading()
+    variables = LateReading()
+
     def __init__(
         self,
         fmu_path: str | os.PathLike[str],
@@ -110,10 +139,12 @@ class FMUEnv(Constructed):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
+        hooks: str = "auto",
         **unknown: Never,
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
+        self._way = check_option("way of calling hooks", hooks, _WAYS)
         self._construct(fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
 
@@ -144,6 +175,7 @@ class FMUEnv(Constructed):
         pool = self._open_pool("reset")
         if not self._was_reset:
             self._prepare_hooks()  # the constructor of the class may have set some as attributes
+            self._prepare_player(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
         episode = plan.draw(self.np_random)
@@ -163,7 +195,23 @@ class FMUEnv(Constructed):
             self.render()
         return observation, info
 
+    def _prepare_player(self, pool: Pool) -> None:
+        """Prepare to compile the hooks, where that may be possible."""
+        obstacle = None
+        if self._own.step or self._own.reset:
+            obstacle = f"{'step' if self._own.step else 'reset'} is overridden"
+        elif not pool.can_play or pool.num_instances > 1:
+            obstacle = "the pool is not a native one of its own"
+        if obstacle is None and self._way != "python":
+            self._play, self._width, self._tells = None, 0, False
+            self._player = Waiting(required=self._way == "compiled")
+        if obstacle is not None and self._way == "compiled":
+            name = type(self).__name__
+            raise ConfigError(f"the hooks of {name} cannot be compiled: {obstacle}")
+
     def _begin_episode(self, episode: Episode) -> None:
+        if self._play is not None:
+            self._player.begin(self)
         self.parameters = episode.parameters
         self.variables.update(episode.variables)
         self.step_count = 0
@@ -203,6 +251,10 @@ class FMUEnv(Constructed):
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
                 and, with ``on_fault="raise"``, after a fault.
         """
+        if self._player is not None and not self._ended:
+            result = self._step_compiled(action)
+            if result is not None:
+                return result
         pool = self._pool
         if pool is None or self._ended:
             pool = self._checked_before_step()
@@ -219,6 +271,55 @@ class FMUEnv(Constructed):
         except BaseException:  # a real system must not go on without its controller
             self._halt()
             raise
+        finally:
+            self._in_hooks = False
+        if self.render_mode is not None:
+            self._note_for_picture(result[1])
+        return result
+
+    def _step_compiled(self, action: Any) -> Result | None:
+        """Let the pool do the whole step; None if Python must do it."""
+        play = self._play or self._player.ready(self, action)
+        if play is None:
+            return None
+        try:
+            result = play(action, self.__dict__, self._width)
+            if result:
+                return self._completed(result)
+            if result is not None:
+                return self._judged_again()
+        except BaseException:  # as in ``step``: the FMU may have moved
+            self._ended = True
+            self._halt()
+            raise
+        if self._play is not None:
+            self._player.give_back(self)
+        return None
+
+    def _completed(self, result: Result) -> Result:
+        """Add what the pool does not do to the result of a step."""
+        if self._play is None:
+            self._player.forget(self)
+        if result[2] or result[3]:
+            self._ended = True
+            self._player.note_end(result[2])
+        if self._has_info:
+            self._in_hooks = self._tells = True
+            try:
+                result = (*result[:4], self._info())
+            finally:
+                self._in_hooks = self._tells = False
+        if self.render_mode is not None:
+            self._note_for_picture(result[1])
+        return result
+
+    def _judged_again(self) -> Result:
+        """Judge a step in Python: its status or a number is not good, or a hook raises."""
+        self._player.go_back(self)
+        self._in_hooks = True
+        try:
+            pool = self._open_pool("step")
+            result = self._conclude(pool, pool.statuses.item(0))
         finally:
             self._in_hooks = False
         if self.render_mode is not None:
@@ -363,6 +464,7 @@ class FMUEnv(Constructed):
         pool = self._open_pool("save_state")
         if not self._was_reset:
             raise SimulationError("save_state was called before the first reset")
+        self._keep_readings()
         bundle = pool.save_instances(np.zeros(1, np.int64))
         return Snapshot(self._scope, columns_of(self), bundle)
 
@@ -382,13 +484,20 @@ class FMUEnv(Constructed):
         pool = self._open_pool("restore_state")
         columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
         if not self._was_reset:
-            self._prepare_hooks()
+            self._prepare_hooks()  # as in ``reset``
+            self._prepare_player(pool)
+        self._keep_readings()
         self._ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)
         if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         return self._observation_and_info()[0]
+
+    def _keep_readings(self) -> None:
+        """Keep what hooks read in the environment itself until the next step."""
+        if self._play is not None:
+            self._player.give_back(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
         """Make a new environment in the middle of the same episode, if there is one."""
@@ -416,6 +525,12 @@ class FMUEnv(Constructed):
         """
         counts = self._open_pool("health").health()
         return {name: int(values[0]) for name, values in counts.items()}
+
+    @property
+    def observation_names(self) -> tuple[str, ...] | None:
+        """The names of the observation's elements; None if a hook of the class makes it."""
+        is_default = type(self)._get_observation is FMUEnv._get_observation
+        return tuple(self.config.model_output_names) if is_default else None
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
@@ -459,6 +574,9 @@ class FMUEnv(Constructed):
     def close(self) -> None:
         """Free the FMU and its temporary folder; more than one call is fine."""
         self._is_closed = True
+        if self._play is not None:
+            self._player.give_back(self)
+        self._player = None
         self._close_pool()
         if self._renderer is not None:
             self._renderer.close()

@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used (PEP 562)."""
+"""Names of packages that are imported when they are first used, and SciPy, which is optional."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-__all__ = ["lazily"]
+__all__ = ["lazily", "scipy_module"]
 
 
 def lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Make the ``__getattr__`` of a package.
+    """Make the ``__getattr__`` of a package (PEP 562).
 
     Args:
         package: Its name.
@@ -31,3 +31,17 @@ def lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
         return value
 
     return get
+
+
+def scipy_module(name: str) -> Any:
+    """Import a module of SciPy.
+
+    Raises:
+        ImportError: If SciPy is not installed; the text names the extra that installs it.
+    """
+    try:
+        return import_module(f"scipy.{name}")
+    except ImportError:
+        raise ImportError(
+            'this needs SciPy: pip install "fmugym-toolbox[identification]"'
+        ) from None

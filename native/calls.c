@@ -6,6 +6,7 @@
 
 #include "failures.h"
 #include "initial_states.h"
+#include "inside.h"
 #include "instances.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */
@@ -117,8 +118,10 @@ static Status read_instance(Pool *pool, Instance *me, const Access *access, doub
     if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
         return instance_refuse(me, "the instance needs a reset before anything can be read");
     }
+    begin_call(CALL_READ);
     const Status status = access_get(access, me->library, me->component, memory,
                                      memory + access->count, &pool->floats);
+    end_call();
     if (status > STATUS_WARNING) {
         return instance_fail(pool, me, "reading variables", status);
     }

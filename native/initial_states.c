@@ -3,6 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "inside.h"
 #include "instances.h"
 #include "records.h"
 
@@ -72,8 +73,10 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     }
     pace_wait(&pool->pace);
     instance_begin_turn(pool);
+    begin_call(CALL_INITIALIZE);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);
+    end_call();
     instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {

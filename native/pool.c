@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "failures.h"
+#include "inside.h"
 #include "instances.h"
 #include "records.h"
 #include "snapshots.h"
@@ -74,11 +75,13 @@ static bool load_libraries(Pool *pool, char *error, size_t size) {
     const Settings *s = &pool->settings;
     bool loaded = true;
 
+    begin_call(CALL_LOAD);
     for (size_t i = 0; i < number_of_libraries(s) && loaded; i++) {
         pool->libraries[i].identifier = s->model;
         loaded = library_open(&pool->libraries[i], s->paths[i], error, size) &&
                  s->fmi->bind(&pool->libraries[i], error, size);
     }
+    end_call();
     floats_restore(&pool->floats);
     return loaded;
 }
@@ -106,7 +109,7 @@ static bool build_all(Pool *pool, char *error, size_t size) {
     return true;
 }
 
-bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
+static bool open_inside(Pool *pool, const Settings *settings, char *error, size_t size) {
     memset(pool, 0, sizeof *pool);
     mutex_reset(&pool->lock);
     mutex_reset(&pool->own_making);
@@ -117,7 +120,8 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     pool->pace.turns = (uint64_t)settings->turns;
     pool->step_size = settings->time_step / (double)settings->substeps;
     pool->no_return = !settings->restores && settings->retries == 0;
-    pool->direct = settings->substeps == 1 && settings->retries == 0 && settings->inputs->direct &&
+    pool->direct = settings->substeps == 1 && settings->retries == 0 &&
+                   settings->sampling == NULL && settings->inputs->direct &&
                    settings->outputs->direct;
     pool->open = true;
     pool->floats = floats_now();
@@ -132,6 +136,13 @@ bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
     return load_libraries(pool, error, size) && build_all(pool, error, size);
 }
 
+bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {
+    begin_inside(pool);
+    const bool opened = open_inside(pool, settings, error, size);
+    end_inside();
+    return opened;
+}
+
 /* Frees the instances that exist. Memory may have run out before all were made. */
 static void free_instances(Pool *pool) {
     const Settings *s = &pool->settings;
@@ -140,9 +151,11 @@ static void free_instances(Pool *pool) {
         instance_discard(pool, &pool->instances[i]);
         failure_drop(&pool->instances[i]);
     }
+    begin_call(CALL_FREE);
     for (size_t i = 0; i < number_of_libraries(s) && pool->libraries != NULL; i++) {
         library_close(&pool->libraries[i]);
     }
+    end_call();
     floats_restore(&pool->floats);
 }
 

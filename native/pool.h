@@ -12,6 +12,7 @@
 #include "floats.h"
 #include "fmi.h"
 #include "log.h"
+#include "mark.h"
 #include "pace.h"
 #include "platform.h"
 #include "play.h"
@@ -21,6 +22,10 @@ typedef struct {
     uint32_t reference;
     const char *text;
 } StringValue;
+
+/* What a step gives of the values that an output has after each of its substeps.
+ * fmugym/pool/spec.py lists their names in this order. */
+typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX } Sampling;
 
 /* The settings of a pool. Everything they point to must stay in place as long as the pool
  * exists. */
@@ -50,12 +55,14 @@ typedef struct {
     const StringValue *strings;
     size_t number_of_strings;
     const Access *inputs, *outputs;
+    const unsigned char *sampling; /* one Sampling for each output, or NULL if all are the last */
     size_t num_observed;
     size_t count;
     size_t threads;
     double *output_values; /* one row of count per output */
     int8_t *status;
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
+    const Mark *mark; /* where a crash is noted, or NULL */
 } Settings;
 
 /* The health counters of each instance. fmugym/pool/health.py lists their names in this order. */

@@ -525,6 +525,22 @@ WIDE static void compute(uint16_t operation, const void *first, const void *seco
     }
 }
 
+/* The power of scalars, which is that of the C library in Python and in numpy. */
+static void power(uint16_t operation, size_t count, const void *bases, const void *exponents,
+                  Register *to) {
+    if (operation == POWER_D) {
+        const double *base = bases, *exponent = exponents;
+        for (size_t j = 0; j < count; j++) {
+            to->doubles[j] = pow(base[j], exponent[j]);
+        }
+        return;
+    }
+    const float *base = bases, *exponent = exponents;
+    for (size_t j = 0; j < count; j++) {
+        to->floats[j] = powf(base[j], exponent[j]);
+    }
+}
+
 static inline size_t whole_blocks(size_t count) {
     return (count + PROGRAM_BLOCK - 1) / PROGRAM_BLOCK * PROGRAM_BLOCK;
 }
@@ -593,6 +609,11 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
         case INTERPOLATE:
             interpolate(&program->tables[i.extra], places[i.a], count, to->doubles);
             clear_rest(to, count, lanes, sizeof(double));
+            break;
+        case POWER_D:
+        case POWER_F:
+            power(i.operation, count, places[i.a], places[i.b], to);
+            clear_rest(to, count, lanes, i.operation == POWER_D ? sizeof(double) : sizeof(float));
             break;
         default:
             compute(i.operation, places[i.a], places[i.b], places[i.c], lanes / PROGRAM_BLOCK, to);

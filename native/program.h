@@ -74,7 +74,9 @@ enum {
     X(WHERE_8, "where 8")                                                                          \
     X(WHERE_4, "where 4")                                                                          \
     X(WHERE_2, "where 2")                                                                          \
-    X(WHERE_1, "where 1")
+    X(WHERE_1, "where 1")                                                                          \
+    X(POWER_D, "scalar_power d")                                                                   \
+    X(POWER_F, "scalar_power f")
 
 #define NUMBER_IT(operation, name) operation,
 typedef enum { EACH_OPERATION(NUMBER_IT) NUMBER_OF_OPERATIONS } Operation;

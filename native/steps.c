@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "inside.h"
 #include "instances.h"
 
 static const char *const BAD_INPUTS = "the inputs are not finite";
@@ -94,6 +95,64 @@ Status instance_advance(Pool *pool, Instance *me) {
     return status;
 }
 
+/* Adds what the outputs are after a substep to what is collected of the step. */
+static void collect(const Settings *s, bool first, const double *values, double *collected) {
+    for (size_t i = 0; i < s->outputs->count; i++) {
+        const double value = values[i], before = collected[i];
+        switch (first ? SAMPLE_LAST : s->sampling[i]) {
+        case SAMPLE_MEAN:
+        case SAMPLE_INTEGRAL:
+            collected[i] = before + value;
+            break;
+        case SAMPLE_MIN:
+            collected[i] = before <= value ? before : value;
+            break;
+        case SAMPLE_MAX:
+            collected[i] = before >= value ? before : value;
+            break;
+        default:
+            collected[i] = value;
+        }
+    }
+}
+
+/* Turns what is collected of a step into the outputs. */
+static void conclude(const Pool *pool, int64_t substeps, const double *collected, double *values) {
+    const Settings *s = &pool->settings;
+
+    for (size_t i = 0; i < s->outputs->count; i++) {
+        values[i] = collected[i];
+        if (s->sampling[i] == SAMPLE_MEAN) {
+            values[i] /= (double)substeps;
+        } else if (s->sampling[i] == SAMPLE_INTEGRAL) {
+            values[i] *= pool->step_size;
+        }
+    }
+}
+
+/* Does the substeps of a step. Reads the outputs after each of them, and collects them in the
+ * scratch memory for values. */
+static Status advance_sampled(Pool *pool, Instance *me, Scratch scratch) {
+    const Settings *s = &pool->settings;
+    Status status = STATUS_OK;
+    int64_t done = 0;
+
+    while (done < s->substeps && status <= STATUS_WARNING) {
+        status = step_once(pool, me);
+        if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
+            return status;
+        }
+        const Status got = access_get(s->outputs, me->library, me->component, scratch.outputs,
+                                      scratch.typed, &pool->floats);
+        if (got > STATUS_WARNING) {
+            return instance_fail_reading(pool, me, got);
+        }
+        collect(s, done++ == 0, scratch.outputs, scratch.values);
+    }
+    conclude(pool, done, scratch.values, scratch.outputs);
+    return status;
+}
+
 WIDE bool all_within(const double *values, size_t count, double limit) {
     int64_t bad = 0; /* as wide as the values, so that the compiler can vectorize */
 
@@ -119,9 +178,11 @@ void instance_copy_outputs(const Pool *pool, const Instance *me, double *values)
 Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
     const size_t count = s->outputs->count;
+    begin_call(CALL_READ);
     const Status got = access_get(s->outputs, me->library, me->component, scratch.values,
                                   scratch.typed, &pool->floats);
 
+    end_call();
     if (got > STATUS_WARNING) {
         return instance_fail(pool, me, "reading the outputs", got);
     }
@@ -130,7 +191,8 @@ Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch) {
     }
     double *place = s->output_values + index_of(pool, me);
     for (size_t i = 0; i < count; i++, place += s->count) {
-        *place = scratch.values[i];
+        const bool is_integral = s->sampling != NULL && s->sampling[i] == SAMPLE_INTEGRAL;
+        *place = is_integral ? 0.0 : scratch.values[i];
     }
     return STATUS_OK;
 }
@@ -168,6 +230,9 @@ Status instance_step(Pool *pool, Instance *me, Scratch scratch) {
                                   scratch.typed, &pool->floats);
     if (set > STATUS_WARNING) {
         return instance_fail_setting(pool, me, set);
+    }
+    if (s->sampling != NULL) {
+        return advance_sampled(pool, me, scratch);
     }
     const Status status = instance_advance(pool, me);
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {

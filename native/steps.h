@@ -32,7 +32,8 @@ static inline void instance_count_from(Instance *me, int64_t steps) {
 Status instance_step(Pool *pool, Instance *me, Scratch scratch);
 /* Does the substeps of a step. */
 Status instance_advance(Pool *pool, Instance *me);
-/* Reads the outputs into the pool's array, if they are finite. */
+/* Reads the outputs between two steps into the pool's array, if they are finite. Integrals over a
+ * step are 0 there. */
 Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch);
 /* Copies the outputs from the pool's array. */
 void instance_copy_outputs(const Pool *pool, const Instance *me, double *values);

@@ -16,6 +16,7 @@
 #include <string.h>
 
 #include "floats.h"
+#include "mark.h"
 #include "platform.h"
 
 #if !defined _WIN32
@@ -262,6 +263,7 @@ static bool start_helper(size_t number) {
 #else
 
 static void *helper_entry(void *number) {
+    mark_prepare_thread();
     helper_main((size_t)(uintptr_t)number);
     return NULL;
 }

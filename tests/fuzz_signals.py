@@ -7,7 +7,7 @@ environment: steps, resets, or opening and closing it. The handler raises ``Keyb
 an ordinary exception. Nothing else may come out. Afterwards a reset begins an episode that equals
 one without a signal, bit for bit, and no file is left.
 
-Two things are not the package's to mend. Python drops what is raised in a destructor, lxml does so
+Some things are not the package's to mend. Python drops what is raised in a destructor, lxml does so
 while it reads a file, and ``zipfile`` may raise something else. And an ordinary exception that
 arrives while an environment is opened may count as one of what is being tried then, such as a hook
 on arrays.
@@ -16,14 +16,20 @@ When and where a signal arrives depends on the machine, so a case cannot be repe
 ``fuzz_driver.py``. Not for Windows, which has no such timers.
 """
 
+import atexit
 import collections
 import contextlib
 import functools
 import gc
+import logging
+import shutil
 import signal
 import sys
+import tempfile
 import traceback
 
+import fmu_tools
+import gymnasium as gym
 import numpy as np
 from fuzz_driver import Case, CaseError, main, require
 
@@ -31,6 +37,7 @@ import fmugym
 from fmugym.envs import CartPoleEnv
 
 NUM_ENVS = 3
+LOGGING = {"model_parameters": {"log_status": 1}}
 LOSING = ("weakref.py", "_weakrefset.py", "in __del__", "etree.parse(", "zipfile.py")
 """Where Python or lxml may drop or replace what a signal handler raises, as a stack names it."""
 
@@ -110,7 +117,29 @@ def vector(**options):
     return fmugym.FMUVectorEnv(CartPoleEnv, NUM_ENVS, **options)
 
 
+class Talkative(fmu_tools.PlainEnv):
+    """Its FMU logs in every step."""
+
+    def __init__(self, **options):
+        super().__init__(_probe(), fmu_tools.probe_config(**LOGGING), logging.CRITICAL, **options)
+
+    def _get_action_space(self):
+        return gym.spaces.Discrete(2)
+
+    def _get_inputs(self):
+        return 0.5 * self.action
+
+
+@functools.cache
+def _probe():
+    folder = tempfile.mkdtemp(prefix="fmugym-fuzz-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return fmu_tools.probe_fmu(folder)
+
+
 WAYS = {
+    "logs": Talkative,
+    "logs in Python": functools.partial(Talkative, backend="python"),
     "single": single,
     "single in Python": functools.partial(single, backend="python"),
     "single isolated": functools.partial(single, isolation="process"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fmu_tools import MAJOR_VERSIONS, probe_config, probe_fmu
 
-from fmugym import FMU, ConfigError, EnvConfig, Uniform
+from fmugym import FMU, Choice, ConfigError, EnvConfig, Uniform
 from fmugym.task.interface import checked_value, resolve
 
 
@@ -165,6 +165,17 @@ class TestRefused:
             ({"episode_variables": {"past": [[1.0], [1.0, 2.0]]}}, "'past' must be an array of"),
             ({"episode_variables": {"past": [math.inf]}}, "'past' must be an array of finite"),
             ({"episode_variables": {"past": []}}, "'past' must be an array of finite"),
+            (
+                {"episode_variables": {"past": [Uniform(0, 1), "x"]}},
+                "element 1 of .*'past' must be",
+            ),
+            ({"episode_variables": {"past": [Uniform(0, 1), math.inf]}}, "'past' must be finite"),
+            (
+                {"episode_variables": {"past": [Choice(["a"])]}},
+                "element 0 of .*'past' must be a num",
+            ),
+            ({"episode_variables": {"past": [[Uniform(0, 1)], [1, 2]]}}, "'past' must be an array"),
+            ({"episode_variables": {"past": [{"low": 1}]}}, "'past' must be .*distribution"),
             ({"time_step": 0}, r"time_step must be .*positive.*, got 0"),
             ({"time_step": -1}, r"time_step must be .*positive"),
             ({"time_step": math.nan}, r"time_step must be .*positive"),

@@ -188,6 +188,34 @@ def test_all_hooks_of_a_task_with_memory_and_costs_are_compiled():
     envs.close()
 
 
+def test_samples_over_the_substeps_of_a_step():
+    variables = {
+        "energy": {"name": "q_dot", "sample": "integral", "unit": "deg"},
+        "q": {"sample": "max", "unit": "deg"},
+    }
+    task = changed(
+        substeps=4,
+        variables=variables,
+        agent={"actions": "tau", "observations": ["energy", "q"]},
+        memory={},
+        expressions={},
+        reward="energy - previous(q)",
+        costs={},
+        terminated=False,
+    )
+    env, fine = fmugym.load(task), fmugym.load(task | {"time_step": 0.005, "substeps": 1})
+    start, _ = env.reset(seed=3)
+    fine.reset(seed=3)
+    assert start[0] == 0.0
+    steps = [fine.step([0.01])[0] for _ in range(4)]
+    seen, reward, *_ = env.step([0.01])
+    np.testing.assert_allclose(seen[0], sum(step[0] for step in steps), rtol=1e-6)
+    assert seen[1] == max(step[1] for step in steps)
+    assert reward == pytest.approx(float(seen[0]) - float(start[1]), rel=1e-6)
+    env.close()
+    fine.close()
+
+
 def test_an_expression_writes_an_input():
     task = changed(
         variables={"gain": {"min": 0, "max": 1}},
@@ -335,6 +363,14 @@ MISTAKES = {
     "duration": ('"20ms"', '"20 msec"', "line 2", "20 msec"),
     "missing FMU": ('{ bundled = "Pendulum" }', '"Pendlum.fmu"', "line 1", "Pendlum"),
     "bundled FMU": ('"Pendulum"', '"Pendlum"', "line 1", "'Pendulum'"),
+    "sample": ("[agent]", 'q = { sample = "avg" }\n[agent]', "line 6", "'last', 'mean'"),
+    "sample of an action": ("max = 1", 'max = 1, sample = "mean"', "line 5", "read from"),
+    "read twice": (
+        '"-abs(q)"\n[variables]',
+        '"p"\n[variables]\np = { name = "q" }',
+        "line 5|variables.q",
+        "'q'.*'p'|'p'.*'q'",
+    ),
     "two meanings": ("[agent]", "[memory]\ntau = 1\n[agent]", "line 7", "'tau'"),
     "reserved": ("[agent]", "[memory]\ntime = 1\n[agent]", "line 7", "'time'"),
     "circle": ("[agent]", '[expressions]\na = "b"\nb = "a"\n[agent]', "line [78]", "itself"),

@@ -20,8 +20,9 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification"},
-    {"registration", "testing", "sb3", "declared"},
+    {"registration", "single", "testing", "sb3", "declared"},
     {"envs", "tools"},
+    {"baselines"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

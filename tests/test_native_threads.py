@@ -1,5 +1,6 @@
 """The native pool against threads, exceptions and signals: nothing that callers do breaks it."""
 
+import concurrent.futures
 import contextlib
 import gc
 import json
@@ -287,6 +288,51 @@ def test_an_exception_comes_out_of_the_step_that_was_done(pool_class, probe, err
     pool.close()
 
 
+def test_an_exception_comes_out_in_its_own_thread(pool_class, probe):
+    """That of the other thread, whose step lasts longer, is not for this one."""
+    raised, done = threading.Event(), threading.Event()
+    mine, my_handler = logging_pool(pool_class, probe, None, at=0, count=1)
+    other, handler = logging_pool(pool_class, probe, None, at=0, count=2)
+    my_handler.emit = lambda _: raised.wait(30)
+
+    def emit(_):
+        if not raised.is_set():
+            raised.set()
+            raise ValueError("the other's")
+        done.wait(30)
+
+    def step_the_other():
+        with pytest.raises(ValueError, match="the other's"):
+            other.step()
+        other.step()  # what was left
+
+    handler.emit = emit
+    with concurrent.futures.ThreadPoolExecutor(1) as executor:
+        future = executor.submit(step_the_other)
+        raised.wait(30)
+        mine.step()
+        done.set()
+        future.result(30)
+    mine.close()
+    other.close()
+
+
+def test_other_lost_exceptions_go_where_they_went_before(pool_class, probe, monkeypatch):
+    class Odd:
+        def __del__(self):
+            raise ValueError("in a destructor")
+
+    lost = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: lost.append(str(unraisable[1])))
+    hook = sys.unraisablehook
+    pool, handler = logging_pool(pool_class, probe, None, at=0, count=1)
+    handler.emit = lambda _: Odd() and None
+    pool.step()
+    pool.close()
+    assert lost == ["in a destructor"]
+    assert sys.unraisablehook is hook
+
+
 class Talkative(PlainEnv):
     """Its FMU says something in each step."""
 
@@ -326,44 +372,58 @@ def test_an_exception_while_closing_leaves_nothing_open(pool_class, probe, temp_
 
 
 SIGNALS = """
-import builtins, contextlib, logging, signal, sys, time
+import builtins, logging, random, signal, sys
 import numpy as np
 from fmugym import FMU
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
+from fmugym.pool.python import PythonPool
 
-error = getattr(builtins, sys.argv[2])
+error, count = getattr(builtins, sys.argv[2]), int(sys.argv[4])
 log = logging.Logger("signals")
 log.addHandler(logging.NullHandler())
+logging.logMultiprocessing = logging.logAsyncioTasks = False  # logging drops exceptions in there
 fmu = FMU(sys.argv[1])
-pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), 3, log)
+pool_class = {"native": NativePool, "python": PythonPool}[sys.argv[3]]
+pool = pool_class(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), 3, log)
 pool.reset((fmu.variable("log_status"),), np.ones((1, 3)))
+rung = came_out = 0
 
 def handle(*_):
+    global rung
+    rung += 1
     raise error
 
+def step_until(number):
+    while rung < number:
+        pool.step_own()
+
 signal.signal(signal.SIGALRM, handle)
-for _ in range(10):
-    end = time.monotonic() + 10
-    with contextlib.suppress(error):
-        signal.setitimer(signal.ITIMER_REAL, 0.01)
-        while time.monotonic() < end:
-            pool.step_own()
-    assert time.monotonic() < end, "the signal was lost"
+hook, random = sys.unraisablehook, random.Random(0)
+for number in range(1, count + 1):
+    try:
+        signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-4, 1e-3))
+        step_until(number)
+    except error:
+        came_out += 1
+pool.step_own()
+assert sys.unraisablehook is hook
 pool.close()
-print("ten signals")
+print(came_out, "of", count)
 """
 
 
 @on_posix
 @pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemExit", "TimeoutError"])
-def test_a_signal_ends_a_loop_of_steps_that_log(probe, error):
-    """Each step logs, so the handler mostly runs inside of the receiver.
+@pytest.mark.parametrize("pool", ["python", "native"])
+def test_a_signal_ends_a_loop_of_steps_that_log(probe, pool, error):
+    """Each step logs, so the handler mostly runs inside of the receiver, or just before it.
 
     In a process of its own: an exception out of a signal handler leaves coverage's lock locked.
     """
-    done = run_python("-c", SIGNALS, str(probe()), error)
-    assert done.stdout == "ten signals\n", done.stderr
+    done = run_python("-c", SIGNALS, str(probe()), error, pool, "400")
+    assert done.stdout == "400 of 400\n", done.stdout + done.stderr
+    assert done.stderr == ""
 
 
 def test_closing_from_inside_of_the_receiver(probe):

@@ -217,3 +217,21 @@ def test_how_often(monkeypatch):
         assert count * 2 * tape.TAPE_ROWS <= 1e-3 * 8 * steps
         rehearsals.count += 1
     assert 8 * steps < 11 * 2**24
+
+
+def test_a_spare_that_crashes(make_fmu, caplog):
+    """The training has survived by luck; later environments do not depend on it."""
+    path = make_fmu("crash")
+    env = TiringEnv(path, **WAYS["native"])
+    env.reset()
+    env.step(np.full(1, 0.5, np.float32))
+    play(env, 40)
+    env.close()
+    found = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert (
+        len([text for text in found if "with signal SIGSEGV in a step when it played" in text]) == 1
+    )
+    env = TiringEnv(path, **WAYS["native"])
+    assert type(env._pool).__name__ == "ProcessPool"
+    env.close()
+    assert "harms its process: in a rehearsal, a worker process ended with" in caplog.text

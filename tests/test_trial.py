@@ -216,6 +216,19 @@ class TestExemptions:
         assert step_once(make_fmu()) == [1.0]
         assert started == []
 
+    @pytest.mark.parametrize(("value", "count"), [("", 1), ("on", 1), ("TRUE ", 1), ("No", 0)])
+    def test_by_other_values(self, make_fmu, started, monkeypatch, value, count):
+        monkeypatch.setenv("FMUGYM_PROBE", value)
+        assert step_once(make_fmu()) == [1.0]
+        assert len(started) == count
+
+    @pytest.mark.parametrize("value", ["offf", "2", "none"])
+    def test_not_by_unknown_values(self, make_fmu, started, monkeypatch, value):
+        monkeypatch.setenv("FMUGYM_PROBE", value)
+        with pytest.raises(ConfigError, match=f"variable FMUGYM_PROBE '{value}'; .*'o"):
+            step_once(make_fmu())
+        assert started == []
+
     def test_reading_is_no_meeting(self, make_fmu, started):
         assert FMU(make_fmu("licence")).variable("y").causality == "output"
         assert started == []

@@ -6,6 +6,7 @@ from gymnasium.vector import AutoresetMode
 from vector_tools import (
     Drawing,
     each_backend,
+    each_mode,
     each_way,
     make_pair,
     require_equal,
@@ -15,6 +16,7 @@ from vector_tools import (
 )
 
 from fmugym import Choice, Normal, Uniform
+from fmugym.distributions import draw, is_distribution
 from fmugym.vector import FMUVectorEnv
 
 UNIFORM = {"q_0": Uniform(-1.0, 1.0), "m": Uniform(0.05, 0.07)}
@@ -95,3 +97,103 @@ def test_an_unseeded_reset_draws_from_somewhere(backend, hooks):
         starts += vector.reset()[0][:, 0].tolist()
         vector.close()
     assert len(set(starts)) == 6
+
+
+# Arrays with a distribution for each element
+
+
+class OwnUniform(Uniform):
+    """Only Python can draw from it."""
+
+
+ELEMENTS = {
+    "target": [Uniform(-1, 1), Uniform(0, 2), 0.5],
+    "gain": Uniform(3.0, 4.0),
+    "offset": 1.5,
+    "grid": [
+        [1.0, Choice([1, 2, 3])],
+        [Normal(0.0, 1.0), {"distribution": "uniform", "low": 0, "high": 1}],
+    ],
+    "old": [0.0, 0.0],
+}
+
+
+class Targets(Drawing):
+    """Reads arrays of which some elements are drawn, and writes one of them."""
+
+    def __init__(self, variables=ELEMENTS, **changes):
+        super().__init__(episode_variables=variables, **changes)
+
+    def _update(self):
+        self.variables["grid"] = 0.5 * self.variables["grid"]
+        self.variables["old"] = np.array([self.state[0], self.variables["old"][0]])
+
+    def _reward_policy(self):
+        target, grid = self.variables["target"], self.variables["grid"]
+        return target[0] * self.state[0] + target[1] - grid[1, 0] + grid[0, 1] * target[2]
+
+    def _get_info(self):
+        return {"grid": self.variables["grid"], "gain": self.variables["gain"]}
+
+
+@each_mode
+@each_way
+def test_a_distribution_for_each_element(backend, hooks, mode):
+    """Drawn, reset, told and seen as in single environments, whatever way hooks are called."""
+    way = "compiled" if hooks == "auto" else hooks
+    ours, theirs = make_pair(Targets, mode, num_envs=5, hooks=way, backend=backend)
+    assert run_side_by_side(ours, theirs, mode, 20) >= 20
+    for first, second in zip(ours.get_attr("variables"), theirs.get_attr("variables"), strict=True):
+        require_equal(dict(first), dict(second))
+    ours.close()
+    theirs.close()
+
+
+@each_mode
+@each_way
+def test_elements_that_only_python_can_draw(backend, hooks, mode):
+    variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
+    ours, theirs = make_pair(
+        Targets, mode, num_envs=3, hooks=hooks, backend=backend, variables=variables
+    )
+    assert run_side_by_side(ours, theirs, mode, 12) >= 6
+    ours.close()
+    theirs.close()
+
+
+def test_elements_are_drawn_in_the_documented_order():
+    """First the parameters, then the variables in the order of their dict, then the elements."""
+    env = Targets()
+    _, info = env.reset(seed=7)
+    variables = {n: np.array(v, object) for n, v in env.config.episode_variables.items()}
+    rng = np.random.default_rng(7)
+    drawn = [draw(one, rng) for one in env.config.model_parameters.values()]
+    for name, value in variables.items():
+        expected = [draw(one, rng) for one in value.reshape(-1)]
+        assert np.ravel(env.variables[name]).tolist() == expected
+        if any(map(is_distribution, value.reshape(-1))):
+            assert np.ravel(info["drawn"][name]).tolist() == expected
+        else:
+            assert name not in info["drawn"]
+    assert list(info["drawn"].values())[:2] == drawn
+    assert env.variables["grid"].shape == info["drawn"]["grid"].shape == (2, 2)
+    with pytest.raises(ValueError, match="read-only"):
+        env.variables["target"][0] = 1.0  # as for constant arrays: assign a new one
+    env.close()
+
+
+@each_way
+def test_options_and_arrays_with_distributions(backend, hooks):
+    ours, theirs = make_pair(Targets, hooks=hooks, backend=backend)
+    options = {"model_parameters": {"b": Uniform(0.0, 1e-5)}}
+    for given in (options, {}):
+        first = ours.reset(seed=3, options=dict(given))
+        second = theirs.reset(seed=3, options=dict(given))
+        require_equal(first[0], second[0])
+        require_same_infos(first[1], second[1])
+        for actions in sampled_actions(ours, 5):
+            first, second = ours.step(actions), theirs.step(actions)
+            require_equal(first[1], second[1])
+            require_same_infos(first[4], second[4])
+    ours.close()
+    theirs.close()

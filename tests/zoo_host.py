@@ -17,6 +17,7 @@ import zoo_tools
 
 from fmugym.pool import has_native_pool
 from fmugym.pool.process.last_words import describe_exit
+from fmugym.trial.cache import cache_folder
 
 
 def main(folder, *modes):
@@ -58,7 +59,14 @@ def visit_in_fork(cell, path):
         return [("hangs", "")], []
     if path.exists():
         return json.loads(path.read_text())
+    forget_crashes()
     return [("dies", describe_exit(code))], []
+
+
+def forget_crashes():
+    """Let the next cell meet the FMU as if it had not crashed; ``test_crashes.py`` tests that."""
+    for mark in (cache_folder() / "marks").glob("*"):
+        mark.unlink()
 
 
 def wait(child, patience):

@@ -57,6 +57,7 @@ class TaskEnv(FMUEnv):
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
         self.cost_limits = plan.cost_limits
+        self._observation_names = plan.observation_names
         for name, function in plan.hooks.items():
             if name not in _own_hooks(type(self)):
                 setattr(self, name, MethodType(function, self))
@@ -69,6 +70,13 @@ class TaskEnv(FMUEnv):
                 backend=backend,
                 isolation=isolation,
             )
+
+    @property
+    def observation_names(self) -> tuple[str, ...] | None:
+        """The names of the observation's elements; None if a hook of a class makes it."""
+        if "_get_observation" in _own_hooks(type(self)):
+            return None
+        return self._observation_names
 
     def _is_done(self) -> Any:
         """Episodes of a task that says nothing about their end are only truncated."""

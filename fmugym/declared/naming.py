@@ -55,7 +55,20 @@ class Naming:
         used = sorted(set().union(*(e.names for e in expressions)))
         wanted = dict.fromkeys(filter(declared.is_output, observed + previous))
         others = [name for name in used if declared.is_output(name) and name not in wanted]
+        self._check_distinct([*wanted, *others])
         return (list(wanted), others) if wanted else (others, [])
+
+    def _check_distinct(self, names: list[str]) -> None:
+        """A step gives one value of each variable of the FMU."""
+        seen: dict[str, str] = {}
+        for name in names:
+            record = self._declared.records[name]
+            first = seen.setdefault(record.fmu_name, name)
+            if first != name:
+                raise record.entry.error(
+                    f"{first!r} and {name!r} are both {record.fmu_name!r} of the FMU, which can be "
+                    "read in one way only; write one as an expression of the other"
+                )
 
     def code(self, entry: Entry, expression: Expression, moment: Moment) -> Code:
         """Make code of an expression.

@@ -25,6 +25,7 @@ __all__ = ["Plan"]
 
 _OF_SECTIONS: Final = frozenset(
     {"model_input_names", "model_output_names", "model_parameters", "monitor_names"}
+    | {"samplings"}
     | {"episode_variables", "bounds", "time_step", "substeps", "max_episode_steps", "warm_up"}
     | {"start_time", "positive_reward", "negative_reward"}
 )
@@ -46,6 +47,7 @@ class Plan:
     Attributes:
         config: The config for ``FMUEnv``.
         hooks: Functions of the environment by the names of the hooks that they are.
+        observation_names: The names of the elements of the observation.
         cost_limits: What the costs of an episode may add up to, by name.
 
     Raises:
@@ -65,6 +67,7 @@ class Plan:
             self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
+        self.observation_names = tuple(name for _, name in declared.observed)
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 
@@ -81,6 +84,7 @@ class Plan:
             "model_parameters": {r.fmu_name: value for r, value in declared.parameters.values()},
             "episode_variables": {name: one.start for name, one in declared.memory.items()},
             "bounds": self._bounds(),
+            "samplings": self._samplings(),
         }
 
     def _own_config(self) -> dict[str, Any]:
@@ -109,6 +113,11 @@ class Plan:
                 "s"
             )
         return count
+
+    def _samplings(self) -> dict[str, str]:
+        names = [*self._naming.outputs, *self._naming.monitors]
+        records = [self._declared.records[name] for name in names]
+        return {r.fmu_name: r.sample for r in records if r.sample != "last"}
 
     def _bounds(self) -> dict[str, tuple[float, float]]:
         """The limits that the base class needs in order to make spaces."""

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.checks import check_mapping, number_of
+from fmugym.checks import check_mapping, check_option, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
 from fmugym.declared.quantities import IDENTITY, Conversion, conversion_between
 from fmugym.distributions import Choice, Normal, Uniform, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.pool.spec import SAMPLINGS
 from fmugym.task.interface import checked, input_variable, output_variable
 
 __all__ = [
@@ -28,7 +29,7 @@ __all__ = [
     "start_value",
 ]
 
-VARIABLE_KEYS: Final = ("name", "unit", "min", "max", "levels", "description")
+VARIABLE_KEYS: Final = ("name", "unit", "min", "max", "levels", "sample", "description")
 """The keys of a variable."""
 
 
@@ -56,6 +57,7 @@ class Record:
         conversion: From the FMU's unit to that of the task.
         low, high: The limits in the unit of the task; infinite where there are none.
         levels: The values that an action chooses from; empty for a continuous one.
+        sample: What a step gives of the values after each substep, one of ``SAMPLINGS``.
     """
 
     alias: str
@@ -66,6 +68,7 @@ class Record:
     low: float
     high: float
     levels: tuple[float, ...] = ()
+    sample: str = "last"
 
     @property
     def fmu_name(self) -> str:
@@ -141,6 +144,8 @@ class Records:
         Raises:
             ConfigError: If it cannot.
         """
+        if record.sample != "last":
+            raise record.entry.error("'sample' is for variables that are read from the FMU")
         if record.variable is not None:
             with entry.placing():
                 input_variable(self._description, record.fmu_name)
@@ -162,13 +167,17 @@ class Records:
             return self._record(alias, entry, self._description.variable(table["name"].text()))
 
     def _record(self, alias: str, entry: Entry, variable: Variable | None) -> Record:
+        sample = _sample(entry)
         own = None if variable is None else variable.unit
+        if sample == "integral" and own is not None:
+            own = f"({own}).s"
         unit = entry.child("unit")
         wanted = own if unit.value is None else unit.text()
         with unit.placing():
             conversion = conversion_between(own, wanted, self._description.units)
-        low, high = _limits(entry, variable, conversion)
-        return Record(alias, entry, variable, wanted, conversion, low, high, _levels(entry))
+        limited = None if sample == "integral" else variable
+        low, high = _limits(entry, limited, conversion)
+        return Record(alias, entry, variable, wanted, conversion, low, high, _levels(entry), sample)
 
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
@@ -191,6 +200,14 @@ def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[floa
     limits = (min(values), max(values)) if values else (variable.minimum, variable.maximum)
     low, high = sorted(map(conversion, limits))
     return low, high
+
+
+def _sample(entry: Entry) -> str:
+    sample = entry.child("sample")
+    if sample.value is None:
+        return "last"
+    with sample.placing():
+        return check_option("sample", sample.value, SAMPLINGS)
 
 
 def _levels(entry: Entry) -> tuple[float, ...]:

@@ -12,9 +12,12 @@ from __future__ import annotations
 import ctypes
 import itertools
 import logging
+import sys
+import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, ParamSpec
+from types import FunctionType, TracebackType
+from typing import Any, Final, ParamSpec, cast
 
 import fmpy
 from fmpy.fmi1 import fmi1CallbackFunctions
@@ -32,7 +35,7 @@ __all__ = [
     "fmi1_callbacks",
     "fmi2_callbacks",
     "fmi3_log_message",
-    "raise_caught",
+    "fmu_calls",
 ]
 
 P = ParamSpec("P")
@@ -42,7 +45,11 @@ logger = logging.getLogger(__name__)
 _LEVELS = (logging.INFO, logging.WARNING, logging.WARNING, logging.ERROR, logging.CRITICAL)
 _receivers: dict[int, MessageLog] = {}
 _ids = itertools.count(1)
-_caught: list[BaseException] = []
+_calling: list[int] = []
+"""The threads that are inside ``fmu_calls``."""
+
+_caught: deque[tuple[int, BaseException]] = deque()
+"""What callbacks have raised, with the thread."""
 
 
 _IDLE_LIMIT: Final = 1000
@@ -125,28 +132,82 @@ class MessageLog:
         _receivers.pop(self.environment, None)
 
 
-def raise_caught() -> None:
-    """Raise the first exception that a receiver of messages has raised since the last call.
+class _Calls:
+    """Surrounds calls of FMUs, and raises afterwards what receivers of messages have raised.
 
-    It may come from a signal handler, such as that of Ctrl-C. ctypes cannot pass it through the
-    FMU, so it has to be raised after the FMU has returned.
+    No exception can pass through an FMU, so the callbacks catch all. Often it is that of a signal
+    handler, such as Ctrl-C. Python may run the handler even before the first line of a callback.
+    ctypes then gives the exception to ``sys.unraisablehook``, which usually prints and drops it.
+    So this class replaces that hook in the main thread, the only one with signal handlers.
     """
-    if _caught:
-        first = _caught[0]
-        _caught.clear()
-        raise first
+
+    def __init__(self) -> None:
+        self._hook = sys.unraisablehook
+
+    def __enter__(self) -> None:
+        _calling.append(threading.get_ident())
+        if _is_main() and sys.unraisablehook is not _keep_lost:
+            self._hook = sys.unraisablehook
+            sys.unraisablehook = _keep_lost
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if _is_main() and sys.unraisablehook is _keep_lost:
+            sys.unraisablehook = self._hook
+        _calling.remove(threading.get_ident())
+        if _caught:
+            _raise_caught()
+
+    def pass_on(self, unraisable: sys.UnraisableHookArgs) -> None:
+        """Call the hook that was there before."""
+        self._hook(unraisable)
 
 
-def _keeping_errors(function: Callable[P, None]) -> Callable[P, None]:
-    """Make a callback of a function: it keeps what the function raises for ``raise_caught``."""
+fmu_calls: Final = _Calls()
+
+
+def _is_main() -> bool:
+    return threading.get_ident() == threading.main_thread().ident
+
+
+def _raise_caught() -> None:
+    """Raise the first exception of this thread, or of one that an FMU has started."""
+    this = threading.get_ident()
+    mine = [pair for pair in tuple(_caught) if pair[0] == this or pair[0] not in _calling]
+    for pair in mine:
+        _caught.remove(pair)
+    if mine:
+        raise mine[0][1]
+
+
+def _keep_lost(unraisable: sys.UnraisableHookArgs, /) -> None:
+    """Keep what came out of a callback; anything else is for the hook that was there before."""
+    traceback, error = unraisable.exc_traceback, unraisable.exc_value
+    is_ours = traceback is not None and traceback.tb_frame.f_code is _CALLBACK_CODE
+    if is_ours and error is not None:
+        _caught.append((threading.get_ident(), error))
+    else:
+        fmu_calls.pass_on(unraisable)
+
+
+def _catching(function: Callable[P, None]) -> Callable[P, None]:
+    """Make a callback of a function: it keeps what the function raises for ``fmu_calls``."""
 
     def called(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
             function(*args, **kwargs)
         except BaseException as error:
-            _caught.append(error)
+            _caught.append((threading.get_ident(), error))
 
     return called
+
+
+_CALLBACK_CODE: Final = cast(FunctionType, _catching(print)).__code__
+"""That of every callback; its frame is the first where an exception comes before its lines."""
 
 
 def _deliver(environment: int | None, status: int, category: bytes, message: bytes) -> None:
@@ -168,7 +229,7 @@ def _make_callbacks(structure: Any) -> Any:
     """Fill a callback structure. The members used here are the same in FMI 1.0 and 2.0."""
     types = dict(structure._fields_)
     callbacks = structure()
-    callbacks.logger = types["logger"](_keeping_errors(_by_name))
+    callbacks.logger = types["logger"](_catching(_by_name))
     callbacks.allocateMemory = ctypes.cast(fmpy.calloc, types["allocateMemory"])
     callbacks.freeMemory = ctypes.cast(fmpy.free, types["freeMemory"])
     addLoggerProxy(ctypes.byref(callbacks))
@@ -177,4 +238,4 @@ def _make_callbacks(structure: Any) -> Any:
 
 fmi1_callbacks = _make_callbacks(fmi1CallbackFunctions)
 fmi2_callbacks = _make_callbacks(fmi2CallbackFunctions)
-fmi3_log_message = fmi3LogMessageCallback(_keeping_errors(_deliver))
+fmi3_log_message = fmi3LogMessageCallback(_catching(_deliver))

@@ -19,11 +19,11 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_number, check_text, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
-from fmugym.identification._scipy import scipy_module
 from fmugym.identification.results import Comparison
 from fmugym.identification.simulation import Simulator
 from fmugym.identification.statistics import information_inverse
 from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.lazy import scipy_module
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Experiment", "Limits", "Problem"]

@@ -10,7 +10,7 @@ import numpy as np
 from fmugym.checks import check_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
-from fmugym.identification._scipy import scipy_module
+from fmugym.lazy import scipy_module
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ __all__ = [
     "MaskArray",
     "Pool",
     "PoolSpec",
+    "SingleCalls",
     "StatusArray",
     "available_processors",
 ]
@@ -33,6 +34,23 @@ MaskArray = npt.NDArray[np.bool_]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+class SingleCalls(NamedTuple):
+    """The functions that ``Pool.prepare_single`` makes.
+
+    Attributes:
+        step: Takes an action, the attributes of the environment, and how many there must be. It
+            returns the result of the step. It returns None if nothing was done: the action is not
+            of the type that was prepared, an attribute has changed, or inputs are not finite. It
+            returns False if the instance has stepped, but its status or a number is not good.
+        begin: Takes what counts as the action of the step before.
+        actions: Returns the actions of the last step and of the one before.
+    """
+
+    step: Callable[[Any, dict[str, Any], int], Any]
+    begin: Callable[[Any], None]
+    actions: Callable[[], tuple[Any, Any]]
 
 
 class Pool(ABC):
@@ -226,6 +244,14 @@ class Pool(ABC):
 
     def roll_out(self, *arrays: Any) -> int:
         """Do many steps of the prepared play in one call; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``can_play``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+
+    def prepare_single(self, **groups: Any) -> SingleCalls:
+        """Make the functions that do whole steps of a single environment; see ``NativePool``.
 
         Raises:
             SimulationError: If the pool does not support it; see ``can_play``.

@@ -9,6 +9,7 @@ from fmugym.errors import FMULoadError
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
+from fmugym.pool.mark import Mark
 from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.python import PythonPool
@@ -32,6 +33,7 @@ def local_pool(
     first_index: int = 0,
     counts: HealthArray | None = None,
     attended: bool = True,
+    mark: Mark | None = None,
 ) -> SavingPool:
     """Make a pool that loads the FMU into this process.
 
@@ -46,6 +48,7 @@ def local_pool(
         first_index: See ``NativePool``.
         counts: See ``NativePool``.
         attended: Whether an ``Attendant`` goes with resets where one is needed.
+        mark: Where a crash inside the FMU is noted.
 
     Raises:
         LicenceError: If the FMU gets no licence.
@@ -73,9 +76,10 @@ def local_pool(
             private_libraries=private_libraries,
             first_index=first_index,
             counts=counts,
+            mark=mark,
         )
     else:
-        pool = PythonPool(fmu, spec, num_instances, log, counts=counts)
+        pool = PythonPool(fmu, spec, num_instances, log, counts=counts, mark=mark)
     states = InitialStates(spec) if spec.state_files else None
     pool.attend(Attendant.of(fmu.path.name, spec, log, states) if attended else states)
     announce(STEP)

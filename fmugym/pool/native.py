@@ -37,6 +37,7 @@ from fmugym.pool.base import (
     FloatArray,
     MaskArray,
     PoolSpec,
+    SingleCalls,
     StatusArray,
     available_processors,
 )
@@ -44,8 +45,9 @@ from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.mark import Mark
 from fmugym.pool.saving import SavingPool, Serialized
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -99,6 +101,7 @@ class NativePool(SavingPool):
             instantiated only once per process. See ``fmugym.trial.shared_globals``.
         first_index: The number of the first instance in messages.
         counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
+        mark: Where a crash inside the FMU is noted.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -122,6 +125,7 @@ class NativePool(SavingPool):
         private_libraries: bool | None = None,
         first_index: int = 0,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
         if private_libraries is None:
@@ -136,6 +140,7 @@ class NativePool(SavingPool):
         self._counts = no_counts(num_instances) if counts is None else counts
         self._result = self.outputs, self.statuses
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
+        self._mark = mark
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
         self._listener = _Listener(fmu.description, spec)
         try:
@@ -171,6 +176,7 @@ class NativePool(SavingPool):
                     "logging": log.isEnabledFor(logging.INFO),
                     "states": description.capabilities.can_get_and_set_fmu_state,
                     "categories": tuple(c.encode() for c in description.error_categories),
+                    "mark": None if self._mark is None else self._mark.page,
                 },
                 experiment={
                     "start_time": spec.start_time,
@@ -191,6 +197,7 @@ class NativePool(SavingPool):
                     "outputs": self._access(spec.outputs),
                     "num_observed": spec.num_observed,
                     "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
+                    "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
                 },
                 arrays={
                     "inputs": self.inputs,
@@ -525,14 +532,14 @@ class NativePool(SavingPool):
                 of a start value, or -1 and a constant.
 
         Returns:
-            A function of actions, observations (float32, or a tuple of the arrays that the second
-            program stores), rewards, terminated, truncated, drawn values (draws, N), last
-            observations and started (Booleans). It does a step and fills all but the actions; of
-            the drawn values, only those of episodes that start; ``given`` ones are read. If the
-            last two are arrays, which needs observations of float32, an episode that ends without
-            a fault is followed by the next in the same step; if they are None, in the next step.
-            It returns how many instances had trouble (a status worse than a warning, or numbers
-            that are not finite), how many episodes have ended, and how many of these were followed.
+            A function of actions, observations (float32, or the array that the second program
+            stores, or a tuple of several), rewards, terminated, truncated, drawn values (draws,
+            N), last observations and started (Booleans). It does a step and fills all but the
+            actions; of the drawn values, only those of episodes that start; ``given`` ones are
+            read. If the last two are arrays, an episode that ends without a fault is followed by
+            the next in the same step; if they are None, in the next step. It returns how many
+            instances had trouble (a status worse than a warning, or numbers that are not finite),
+            how many episodes have ended, and how many of these were followed.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(
@@ -560,6 +567,29 @@ class NativePool(SavingPool):
             How many instances or numbers were in trouble; if there are any, not all steps are done.
         """
         return self._open_pool().rollout(*arrays)
+
+    def prepare_single(self, **groups: Any) -> SingleCalls:
+        """Prepare a pool of one instance to do whole steps of a single environment.
+
+        This replaces what was prepared before. Every step uses the given arrays in place. A row is
+        an array of one element.
+
+        Args:
+            groups: ``inputs`` and ``judgement``, the programs (see ``Program.with_rows``): from
+                the action to the rows of ``wanted``; from the outputs to done, truncated, reward.
+                ``actions``, the class, shape and letter of an action; whether it is an integer,
+                and then its lowest and highest value; and flat arrays for the ``next``, the
+                ``current`` and the ``previous`` one. ``rows``, pairs of episode variables and what
+                they were before the step; ``kept``, for the outputs before the step; ``episode``,
+                the number of its steps; ``limit``, after how many it is truncated. ``seen``, the
+                arrays that the second program stores; ``copies``, functions that make the parts of
+                an observation, and ``names``, their keys, or None for a single part; ``observed``,
+                whether it is the pool's own of float32. ``watched``, names of attributes, their
+                values, and None, an equal copy, or the bytes of an array.
+        """
+        self._pool.prepare_single(**groups)
+        own = self._pool
+        return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
     def start_of_play(self) -> Callable[..., int]:
         """The function that starts episodes after ``prepare_play``, outside of a step.

@@ -15,7 +15,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import SimulationError
 from fmugym.fmi.library import Library
-from fmugym.fmi.log import raise_caught
+from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.attendant import InitialState
@@ -23,6 +23,7 @@ from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.mark import END, RESET, STEP, Mark, calling
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.slot import Slot, Snapshot
@@ -43,6 +44,7 @@ class PythonPool(SavingPool):
         num_instances: N.
         log: The logger that gets the FMU's messages.
         counts: Gets the counts of ``health``, shape (N, HEALTH_COUNTS).
+        mark: Where a crash inside the FMU is noted.
 
     Raises:
         FMULoadError: If the FMU cannot be loaded or instantiated.
@@ -56,6 +58,7 @@ class PythonPool(SavingPool):
         log: logging.Logger,
         *,
         counts: HealthArray | None = None,
+        mark: Mark | None = None,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -66,14 +69,17 @@ class PythonPool(SavingPool):
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._counts = no_counts(num_instances) if counts is None else counts
-        self._library = Library(fmu, log)
+        self._mark = mark
+        self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
+        with self._resetting:
+            self._library = Library(fmu, log)
         pacer = Pacer(spec)
         try:
-            self._slots = [
-                Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
-                for i in range(num_instances)
-            ]
-            raise_caught()
+            with fmu_calls, self._resetting:
+                self._slots = [
+                    Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
+                    for i in range(num_instances)
+                ]
         except BaseException:
             self._library.close()
             raise
@@ -95,10 +101,10 @@ class PythonPool(SavingPool):
     def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
-        for index, slot in enumerate(self._slots):
-            if mask is None or mask[index]:
-                self._note(index, slot.reset(variables, values[:, index]))
-        raise_caught()
+        with fmu_calls, self._resetting:
+            for index, slot in enumerate(self._slots):
+                if mask is None or mask[index]:
+                    self._note(index, slot.reset(variables, values[:, index]))
         self._note_reset(variables, values, mask)
 
     def step(
@@ -110,12 +116,13 @@ class PythonPool(SavingPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        for index, slot in enumerate(self._slots):
-            if skip is None or not skip[index]:
-                self._note(index, slot.step())
-        if observations is not None:
-            np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
-        raise_caught()
+        with fmu_calls, self._stepping:
+            for index, slot in enumerate(self._slots):
+                if skip is None or not skip[index]:
+                    self._note(index, slot.step())
+            if observations is not None:
+                observed = self.outputs[: self._spec.num_observed]
+                np.copyto(observations, observed.T, casting="same_kind")
         if self._is_recording:
             self._note_step(skip)
         return self.outputs, self.statuses
@@ -136,11 +143,10 @@ class PythonPool(SavingPool):
         if self._watch is not None:
             self._watch.has_snapshots = True
         try:
-            snapshot = [slot.save() for slot in self._slots]
+            with fmu_calls:
+                return [slot.save() for slot in self._slots]
         finally:
             restore_arithmetic()
-        raise_caught()
-        return snapshot
 
     def restore(
         self, snapshot: list[Snapshot], mask: MaskArray | None = None
@@ -152,28 +158,28 @@ class PythonPool(SavingPool):
         for index in chosen:
             self._slots[index].require_own(snapshot[index])
         self._drop_recording()
-        for index in chosen:
-            self._note(index, self._slots[index].restore(snapshot[index]))
-        raise_caught()
+        with fmu_calls:
+            for index in chosen:
+                self._note(index, self._slots[index].restore(snapshot[index]))
         return self.outputs, self.statuses
 
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         chosen = [self._slots[index] for index in indices.tolist()]
         try:
-            data, ends = joined([slot.serialize() for slot in chosen])
+            with fmu_calls:
+                data, ends = joined([slot.serialize() for slot in chosen])
         finally:
             restore_arithmetic()
-        raise_caught()
         return data, ends, np.array([slot.count for slot in chosen], np.int64)
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``."""
-        for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
-            state, outputs = bundle.state(source), bundle.outputs[:, source]
-            count = int(bundle.steps[source])
-            self._note(index, self._slots[index].deserialize(state, count, outputs))
-        raise_caught()
+        with fmu_calls:
+            for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
+                state, outputs = bundle.state(source), bundle.outputs[:, source]
+                count = int(bundle.steps[source])
+                self._note(index, self._slots[index].deserialize(state, count, outputs))
 
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
@@ -190,11 +196,10 @@ class PythonPool(SavingPool):
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         try:
-            values = np.stack([slot.read(variables) for slot in self._slots], axis=1)
+            with fmu_calls:
+                return np.stack([slot.read(variables) for slot in self._slots], axis=1)
         finally:
             restore_arithmetic()
-        raise_caught()
-        return values
 
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
@@ -203,7 +208,8 @@ class PythonPool(SavingPool):
     def pack(self, index: int) -> InitialState | None:
         """See ``AttendedPool.pack``."""
         try:
-            return self._slots[index].pack()
+            with fmu_calls:
+                return self._slots[index].pack()
         finally:
             restore_arithmetic()
 
@@ -216,7 +222,8 @@ class PythonPool(SavingPool):
     ) -> bool:
         """See ``AttendedPool.adopt``."""
         try:
-            return self._slots[index].adopt(variables, values, state)
+            with fmu_calls:
+                return self._slots[index].adopt(variables, values, state)
         finally:
             restore_arithmetic()
 
@@ -244,9 +251,11 @@ class PythonPool(SavingPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._library.close()
-        restore_arithmetic()
-        raise_caught()
+        try:
+            with fmu_calls, calling(self._mark, END):
+                self._library.close()
+        finally:
+            restore_arithmetic()
 
 
 def _recycle(slots: Sequence[Slot]) -> None:

@@ -19,6 +19,7 @@ from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
+from fmugym.pool.samples import Samples
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Slot", "Snapshot"]
@@ -52,6 +53,10 @@ def _all_finite(values: list[float]) -> bool:
 
 def _is_fine(status: int) -> bool:
     return 0 <= status <= _WARNING
+
+
+def _has_failed(status: int) -> bool:
+    return bool(status) and not _is_fine(status) and status != Status.TERMINATED
 
 
 class Slot:
@@ -92,6 +97,7 @@ class Slot:
         self._step_size = spec.communication_step_size
         self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
         self._first_outputs = b""
+        self._integrals = [i for i, name in enumerate(spec.samplings) if name == "integral"]
         self._build()
 
     def _build(self, *, hear_all: bool = False) -> None:
@@ -169,7 +175,7 @@ class Slot:
             return False
         try:
             self._instance.restore_state(self._saved)
-            got = self._outputs.get()
+            got = self._get_between_steps()
         except SimulationError:  # a reset and an initialization may still work
             got = Status.ERROR
         if not _is_fine(got) or self._output_row.tobytes() != self._first_outputs:
@@ -280,24 +286,51 @@ class Slot:
         status = self._inputs.set()
         if status and not _is_fine(status):
             return self._failed_call("setting the inputs", status)
-        status = self._advance()
-        if status and not _is_fine(status) and status != Status.TERMINATED:
-            return status
-        result = self._read_outputs(status)
+        result = self._advance_sampled() if self._spec.samplings else self._advance_and_read()
         if result > _WARNING and result != Status.NOT_FINITE:  # this may have been the last step
             self._instance.forbid_steps()
         return result
 
-    def _advance(self) -> int:
-        spec, status = self._spec, 0
-        do_step = self._step_with_retries if spec.fault_retries else self._instance.step
-        for _ in range(spec.substeps):
-            time = spec.communication_point(self._count)
-            status = do_step(time, self._step_size)
-            self._count += 1
-            if status and not _is_fine(status):
-                self._note_failure(f"the step at t = {time:g} s", status)
+    def _advance_and_read(self) -> int:
+        status = self._advance()
+        if _has_failed(status):
+            return status
+        got = self._outputs.get()
+        return self._take_outputs(status, got)
+
+    def _advance_sampled(self) -> int:
+        """Read the outputs after each substep, and let the row hold what is asked for of them."""
+        samples, status = Samples(self._spec.samplings, self._step_size), 0
+        for _ in range(self._spec.substeps):
+            status = self._step_once()
+            got = 0 if _has_failed(status) else self._outputs.get()
+            if _has_failed(status) or _has_failed(got):
+                self._output_row[:] = self._good_outputs
+                return self._take_outputs(status, got) if _has_failed(got) else status
+            samples.add(self._output_row.tolist())
+            if status == Status.TERMINATED:
                 break
+        self._output_row[:] = samples.conclude()
+        return self._take_outputs(status, 0)
+
+    def _advance(self) -> int:
+        status = 0
+        for _ in range(self._spec.substeps):
+            status = self._step_once()
+            if status and not _is_fine(status):
+                break
+        return status
+
+    def _step_once(self) -> int:
+        spec = self._spec
+        time = spec.communication_point(self._count)
+        if spec.fault_retries:
+            status = self._step_with_retries(time, self._step_size)
+        else:
+            status = self._instance.step(time, self._step_size)
+        self._count += 1
+        if status and not _is_fine(status):
+            self._note_failure(f"the step at t = {time:g} s", status)
         return status
 
     def _step_with_retries(self, time: float, step_size: float) -> int:
@@ -330,9 +363,23 @@ class Slot:
                 break
         return status
 
-    def _read_outputs(self, status: int) -> int:
-        """Read the outputs into the row; if any is not finite, keep the last good ones."""
+    def _get_between_steps(self) -> int:
+        """Get the outputs into the row, where integrals over a step are 0."""
         got = self._outputs.get()
+        self._output_row[self._integrals] = 0.0
+        return got
+
+    def _read_outputs(self, status: int) -> int:
+        """Read the outputs between steps."""
+        return self._take_outputs(status, self._get_between_steps())
+
+    def _take_outputs(self, status: int, got: int) -> int:
+        """Take the outputs in the row; if any is not finite, keep the last good ones.
+
+        Args:
+            status: What to return if all is well.
+            got: The status of reading them.
+        """
         if got and not _is_fine(got):
             return self._failed_call("reading the outputs", got)
         values = self._output_row.tolist()

@@ -14,6 +14,7 @@ __all__ = [
     "DEFAULT_LEAK_LIMIT",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
+    "SAMPLINGS",
     "PoolSpec",
     "ResetMethod",
     "whole_number_of_steps",
@@ -21,6 +22,12 @@ __all__ = [
 
 ISOLATIONS: Final = ("none", "process")
 """Where FMUs run: in the caller's process, or in worker processes."""
+
+SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
+"""What a step gives of the values that an output has after each of its substeps.
+
+The order is that of ``Sampling`` in ``native/pool.h``.
+"""
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
 """How long a call to a worker process may take, in seconds of real time."""
@@ -57,6 +64,8 @@ class PoolSpec:
         time_step: Simulated time of one step, in seconds.
         num_observed: How many of the outputs, from the first, make an observation.
         substeps: Number of communication steps in one step.
+        samplings: For each output, one of ``SAMPLINGS``; empty if all are ``"last"``. Between steps
+            an integral is 0, and the others are the values at that time.
         start_time: First communication point, in seconds.
         stop_time: Passed to the FMU unless it is None, in seconds.
         tolerance: Passed to the FMU unless it is None.
@@ -102,6 +111,7 @@ class PoolSpec:
     licence_wait: float = 0.0
     keep_states: bool = False
     state_files: str = ""
+    samplings: tuple[str, ...] = ()
     records: bool = False
 
     def communication_point(self, count: int) -> float:

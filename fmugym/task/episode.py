@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import islice
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -16,7 +17,19 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.interface import checked_value
 from fmugym.trial.rehearsal import Starts
 
-__all__ = ["Episode", "EpisodePlan", "Sampler"]
+__all__ = ["Draw", "Episode", "EpisodePlan", "Sampler"]
+
+
+class Draw(NamedTuple):
+    """One of the numbers that are drawn for an episode.
+
+    Attributes:
+        name: The parameter or the episode variable.
+        element: Its place in the array, in C order; None if the variable is a single number.
+    """
+
+    name: str
+    element: int | None
 
 
 class Episode(NamedTuple):
@@ -39,11 +52,12 @@ class EpisodePlan:
     """The draws of an episode, prepared once so that a reset only has to draw.
 
     The parameters are drawn first, then the episode variables, each in the order of their dict.
+    The elements of an array are drawn in C order: the last index changes first.
 
     Args:
         model_variables: The FMU's variables for the parameters.
         parameters: Constants (checked) or distributions by name, in the same order.
-        episode_variables: Constants or distributions by name.
+        episode_variables: By name constants, distributions, or arrays of floats and distributions.
         overridden: The parameters that infos report as drawn even if they are constants.
 
     Attributes:
@@ -73,11 +87,18 @@ class EpisodePlan:
             if is_distribution(value)
         ]
         self._all_fit = not any(may_not_fit for *_, may_not_fit in self._random_parameters)
-        self._random_variables = [n for n, v in episode_variables.items() if is_distribution(v)]
-        names = [name for _, name, _ in self._random_parameters]
-        distributions = [parameters[name] for name in names]
-        distributions += [episode_variables[name] for name in self._random_variables]
-        self._sampler = Sampler(distributions)
+        self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
+        self._variables.update((name, array.constants) for name, array in self._arrays.items())
+        self._random_variables = [
+            (name, self._arrays.get(name))
+            for name, value in episode_variables.items()
+            if is_distribution(value) or name in self._arrays
+        ]
+        self._distributions = [parameters[name] for _, name, _ in self._random_parameters]
+        for name, array in self._random_variables:
+            own = [episode_variables[name]] if array is None else array.distributions
+            self._distributions.extend(own)
+        self._sampler = Sampler(self._distributions)
         self._start_values = self.constants.reshape(-1, 1).copy()
 
     @cached_property
@@ -86,29 +107,56 @@ class EpisodePlan:
         return list(self._parameters)
 
     @cached_property
+    def draws(self) -> list[Draw]:
+        """The draws in their order."""
+        draws = [Draw(name, None) for _, name, _ in self._random_parameters]
+        for name, array in self._random_variables:
+            draws.extend(Draw(name, e) for e in ([None] if array is None else array.elements))
+        return draws
+
+    @cached_property
     def drawn_names(self) -> list[str]:
         """The names of the drawn parameters and variables, in the order of the draws."""
-        return [name for _, name, _ in self._random_parameters] + self._random_variables
+        return list(dict.fromkeys(draw.name for draw in self.draws))
 
     @cached_property
     def drawn_rows(self) -> list[int]:
         """For each draw, the index of its parameter; -1 for an episode variable."""
         rows = [index for index, *_ in self._random_parameters]
-        return rows + [-1] * len(self._random_variables)
+        return rows + [-1] * (len(self.draws) - len(rows))
+
+    def named(self, values: FloatArray) -> dict[str, Any]:
+        """The drawn values of M episodes by name.
+
+        Args:
+            values: In the order of the draws, shape (draws, M).
+
+        Returns:
+            For each name, an array of shape (M,), or (M, ...) for a variable that is an array.
+        """
+        named: dict[str, Any] = {}
+        place = 0
+        for name in self.drawn_names:
+            array = self._arrays.get(name)
+            count = 1 if array is None else len(array.elements)
+            rows = values[place : place + count]
+            named[name] = rows[0] if array is None else array.of_episodes(rows)
+            place += count
+        return named
 
     @property
     def recipes(self) -> list[Recipe] | None:
         """The draws for the C extension; None if only Python can draw them."""
-        of_parameters = [
-            _recipe_of(self._parameters[name], self.model_variables[index])
-            for index, name, _ in self._random_parameters
-        ]
-        of_variables = [
-            recipe_of(self._variables[name], partial(check_number, name))
-            for name in self._random_variables
-        ]
-        recipes = [recipe for recipe in of_parameters + of_variables if recipe is not None]
-        return recipes if len(recipes) == len(self.drawn_names) else None
+        recipes = []
+        variables: list[Any] = [self.model_variables[i] for i, *_ in self._random_parameters]
+        variables += [None] * (len(self.draws) - len(variables))
+        for draw_, one, variable in zip(self.draws, self._distributions, variables, strict=True):
+            if variable is None:
+                recipes.append(recipe_of(one, partial(check_number, draw_.name)))
+            else:
+                recipes.append(_recipe_of(one, variable))
+        known = [recipe for recipe in recipes if recipe is not None]
+        return known if len(known) == len(recipes) else None
 
     @cached_property
     def constant_parameters(self) -> dict[str, Any]:
@@ -118,8 +166,8 @@ class EpisodePlan:
 
     @cached_property
     def constant_variables(self) -> dict[str, Any]:
-        """The episode variables that are not drawn."""
-        drawn = set(self.drawn_names)
+        """The episode variables that are not drawn, and arrays with 0 for drawn elements."""
+        drawn = {name for name, array in self._random_variables if array is None}
         return {name: value for name, value in self._variables.items() if name not in drawn}
 
     def starts(self) -> Starts:
@@ -137,19 +185,21 @@ class EpisodePlan:
         if not self._random_parameters and not self._random_variables:
             return self._episode(self._parameters.copy(), self._variables.copy(), {})
         values = iter(self.draw_values(rng))
-        parameters, variables, drawn = self._parameters.copy(), self._variables.copy(), {}
+        parameters, variables = self._parameters.copy(), self._variables.copy()
+        drawn: dict[str, Any] = {}
         for (index, name, _), value in zip(self._random_parameters, values, strict=False):
             drawn[name] = parameters[name] = value
             self._start_values[index, 0] = value
-        for name, value in zip(self._random_variables, values, strict=True):
-            drawn[name] = variables[name] = value
+        for name, array in self._random_variables:
+            own = next(values) if array is None else array.of_episode(values)
+            drawn[name] = variables[name] = own
         return self._episode(parameters, variables, drawn)
 
     def draw_values(self, rng: np.random.Generator) -> list[float]:
         """Draw one episode.
 
         Returns:
-            The drawn values in the order of ``drawn_names``.
+            The drawn values in the order of ``draws``.
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
@@ -160,8 +210,9 @@ class EpisodePlan:
         for place, (index, _, may_not_fit) in enumerate(self._random_parameters):
             if may_not_fit:
                 values[place] = checked_value(self.model_variables[index], values[place])
-        for place, name in enumerate(self._random_variables, len(self._random_parameters)):
+        for place in range(len(self._random_parameters), len(values)):
             if type(values[place]) is not float:
+                name = self.draws[place].name
                 values[place] = check_number(f"episode variable {name!r}", values[place])
         return values
 
@@ -171,6 +222,53 @@ class EpisodePlan:
         if self.told:
             drawn = self.told | drawn
         return Episode(self._start_values, MappingProxyType(parameters), variables, drawn)
+
+
+class _DrawnArray(NamedTuple):
+    """An episode variable that is an array with drawn elements.
+
+    Attributes:
+        constants: The array, with 0 for the drawn elements.
+        elements: The places of the drawn elements in C order.
+        distributions: What they are drawn from.
+    """
+
+    constants: FloatArray
+    elements: list[int]
+    distributions: list[Any]
+
+    @classmethod
+    def of(cls, value: Any) -> _DrawnArray:
+        """Take the distributions out of an array of objects."""
+        flat = value.reshape(-1).tolist()
+        constants = [0.0 if is_distribution(one) else one for one in flat]
+        elements = [place for place, one in enumerate(flat) if is_distribution(one)]
+        shaped = _unchangeable(np.array(constants, np.float64).reshape(value.shape))
+        return cls(shaped, elements, [flat[place] for place in elements])
+
+    def of_episode(self, values: Iterator[float]) -> FloatArray:
+        """The array of one episode, of the next of these values."""
+        array = self.constants.copy()
+        array.reshape(-1)[self.elements] = list(islice(values, len(self.elements)))
+        return _unchangeable(array)
+
+    def of_episodes(self, rows: FloatArray) -> FloatArray:
+        """The arrays of M episodes, shape (M, ...), of rows of drawn values."""
+        count = rows.shape[1]
+        arrays = np.repeat(self.constants[None], count, axis=0)
+        arrays.reshape(count, -1)[:, self.elements] = rows.T
+        return arrays
+
+
+def _unchangeable(array: FloatArray) -> FloatArray:
+    """Let hooks assign new arrays only, as they must with constant ones."""
+    array.setflags(write=False)
+    return array
+
+
+def is_drawn(value: Any) -> bool:
+    """Whether an episode variable of the config is an array with distributions in it."""
+    return isinstance(value, np.ndarray) and value.dtype == object
 
 
 def _always_fits(distribution: Any, variable: Variable) -> bool:

@@ -95,7 +95,15 @@ class Interface:
             initialization_interval=_interval(config.max_initializations_per_second),
             licence_wait=config.licence_wait,
             keep_states=bool(config.keep_initial_states),
+            samplings=self._samplings(),
         )
+
+    def _samplings(self) -> tuple[str, ...]:
+        """One for each output; none if a step gives the last value of all."""
+        given = self.config.samplings
+        if set(given.values()) <= {"last"}:
+            return ()
+        return tuple(given.get(v.name, "last") for v in self.outputs + self.monitors)
 
     def _warm_up_steps(self) -> int:
         duration, step = self.config.warm_up, self.time_step

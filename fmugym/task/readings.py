@@ -12,7 +12,7 @@ from fmugym.task.values import EpisodeVariables
 if TYPE_CHECKING:
     from fmugym.task.hooks import Hooks
 
-__all__ = ["READINGS", "Readings", "reading"]
+__all__ = ["LATE", "READINGS", "LateReading", "Readings", "reading"]
 
 
 @dataclass(slots=True)
@@ -74,3 +74,33 @@ def reading(env: Hooks, readings: Readings) -> Iterator[None]:
         yield
     finally:
         before.place_in(env)
+
+
+class LateReading:
+    """A reading that the environment does not keep while the pool does whole steps.
+
+    As an attribute of the class, it is only found if the environment itself has no attribute of
+    its name. It then makes the value from what the pool keeps.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, env: Any, owner: type | None = None) -> Any:
+        if env is None:
+            return self
+        if env._play is None:
+            raise AttributeError(
+                f"{type(env).__name__!r} object has no attribute {self._name!r}", name=self._name
+            )
+        return env._player.read(env, self._name)
+
+
+LATE: Final = (
+    *("_values", "state", "previous_state", "inputs", "action", "previous_action"),
+    *("step_count", "done"),
+)
+"""The readings that only the pool keeps between compiled steps.
+
+So it does with ``variables`` if hooks use any.
+"""

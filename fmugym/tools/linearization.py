@@ -17,6 +17,7 @@ from fmugym.errors import ConfigError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
+from fmugym.fmi.log import fmu_calls
 from fmugym.task.interface import checked_value, start_variable
 from fmugym.trial.trial import meet
 
@@ -91,7 +92,7 @@ def linearize(
     u = _chosen(description, "continuous input", inputs, _inputs(description))
     start = _start_values(description, at or {})
     meet(fmu)
-    with closing(Library(fmu, logger)) as library:
+    with fmu_calls, closing(Library(fmu, logger)) as library:
         instance = library.instantiate()
         _initialize(instance, description, start)
         return _linear_model(instance, description, x, u)

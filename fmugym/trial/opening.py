@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
+from fmugym.pool.mark import Mark, Remains, remains_of
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
@@ -25,7 +27,15 @@ from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
 from fmugym.trial.resuming import do_states_work, known_to_work
-from fmugym.trial.trial import Candidate, examine, revise, state_files
+from fmugym.trial.trial import (
+    Candidate,
+    examine,
+    is_known_to_harm,
+    marks_of,
+    note_harm,
+    revise,
+    state_files,
+)
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = ["make_pool"]
@@ -95,9 +105,13 @@ def make_pool(
         completed = plan.completed(fmu, verdict, num_instances, log)
         if spec.keep_states:
             completed = completed.with_states(fmu, verdict, log)
+
+        def note_crash(how: str) -> None:
+            _note_crash(fmu, spec, starts, verdict, how, log)
+
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, spec, starts, completed)
-            pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout)
+            pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
         pool.trust_states_if(trust.do_states_work)
         if rehearse and reset_method is None:
             _rehearse(pool, fmu, spec, starts, verdict, completed, log)
@@ -114,6 +128,7 @@ def _open(
     log: logging.Logger,
     plan: _Plan,
     call_timeout: float | None,
+    note_crash: Callable[[str], None],
 ) -> SavingPool:
     spec = replace(
         spec,
@@ -132,6 +147,7 @@ def _open(
             threads=plan.threads,
             own_files=plan.own_files,
             call_timeout=call_timeout,
+            note_crash=note_crash,
         )
         pool.attend(Attendant.of(fmu.path.name, spec, log))
         return pool
@@ -143,7 +159,19 @@ def _open(
         native=plan.native,
         threads=plan.threads,
         private_libraries=plan.private_libraries,
+        mark=_mark(Candidate.of(fmu)),
     )
+
+
+def _note_crash(
+    fmu: FMU, spec: PoolSpec, starts: Starts | None, verdict: Verdict, how: str, log: logging.Logger
+) -> None:
+    """Let later environments run in worker processes, too, if nobody says otherwise."""
+    candidate = Candidate.of(fmu)
+    if not candidate.exempt and not verdict.isolate:
+        log.info("%s: %s, so later environments run in worker processes", fmu.path.name, how)
+        with contextlib.suppress(OSError):  # the file of the FMU may be gone by now
+            note_harm(candidate, _tried(spec), starts, verdict, f"in training, {how}")
 
 
 def _rehearse(
@@ -248,7 +276,8 @@ class _Plan:
                 fmu, verdict.neighbours or Neighbours.INDEPENDENT, num_instances, log
             )
         if verdict.isolate and plan.isolation is None:
-            log.warning("%s harms its process: it runs in worker processes", fmu.path.name)
+            why = f": {verdict.reasons[-1]}" if verdict.reasons else ""
+            log.warning("%s harms its process%s. It runs in worker processes", fmu.path.name, why)
             plan = replace(plan, isolation="process")
         return plan._with_means_of_reset(num_instances)
 
@@ -348,15 +377,49 @@ def _verdict(
     once = fmu.description.capabilities.can_be_instantiated_only_once_per_process
     isolated = plan.isolation == "process"
     if not candidate.exempt:
-        return examine(
+        remains = _remains(candidate)
+        verdict = examine(
             candidate, spec, starts, several=several, alone=once, must_survive=not isolated
         )
+        return _judge_remains(remains, verdict, candidate, spec, starts)
     if several and (once or isolated or _disturb_here(candidate, spec)):
         verdict = examine(
             candidate, spec, several=True, alone=not isolated or once, must_survive=False
         )
         return Verdict(neighbours=verdict.neighbours or Neighbours.PROCESSES)
     return Verdict()
+
+
+def _remains(candidate: Candidate) -> Remains:
+    try:
+        return remains_of(*marks_of(candidate))
+    except RuntimeError:  # there is no folder for caches
+        return Remains([], [])
+
+
+def _judge_remains(
+    remains: Remains, verdict: Verdict, candidate: Candidate, spec: PoolSpec, starts: Starts | None
+) -> Verdict:
+    """Let an FMU that has crashed an earlier process harm no other one.
+
+    The marks are removed after the verdict is cached, so that an environment that is opened
+    meanwhile finds one or the other. If nothing can be cached, they stay.
+    """
+    if remains.crashes:
+        verdict = note_harm(candidate, spec, starts, verdict, remains.crashes[-1])
+    if not remains.crashes or is_known_to_harm(candidate):
+        remains.remove()
+    return verdict
+
+
+def _mark(candidate: Candidate) -> Mark | None:
+    """Where a crash of this process is noted; nowhere if verdicts are not kept."""
+    if candidate.exempt:
+        return None
+    try:
+        return Mark.attempt(*marks_of(candidate))
+    except RuntimeError:
+        return None
 
 
 def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:

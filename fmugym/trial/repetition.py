@@ -75,12 +75,15 @@ class Repetition:
     ) -> None:
         self._candidate, self._spec, self._verdict = candidate, spec, verdict
         self._native, self._revise, self._log = native, revise, log
+        self._crash = ""
 
     def __call__(self, tape: Tape, begin_by: Callable[[ResetMethod], bool]) -> bool:
         """See ``fmugym.pool.tape.Judge``."""
         name, seen = self._candidate.path.name, _Run.of(tape)
         try:
             fresh = self._play(tape)
+            if self._crash:
+                return self._isolate_later()
             if self._is_close(seen, fresh):
                 self._log.info("%s: a fresh instance repeats %d steps", name, len(tape.inputs))
                 return True
@@ -95,11 +98,36 @@ class Repetition:
     def _play(self, tape: Tape) -> _Run:
         """Play a recorded episode on a fresh instance."""
         spec = replace(self._spec, reset_method=ResetMethod.RESET, leak_limit=None)
-        pool = ProcessPool(self._candidate.open(), spec, 1, _silent, native=self._native, workers=1)
+        pool = ProcessPool(
+            self._candidate.open(),
+            spec,
+            1,
+            _silent,
+            native=self._native,
+            workers=1,
+            note_crash=self._note_crash,
+        )
         try:
             return _played(pool, tape)
         finally:
             pool.close()
+
+    def _note_crash(self, how: str) -> None:
+        self._crash = how
+
+    def _isolate_later(self) -> bool:
+        """Let later environments run in processes: this one has survived by luck only."""
+        name = self._candidate.path.name
+        self._log.warning(
+            "%s: %s when it played an episode of the training again. Later environments run in "
+            "worker processes",
+            *(name, self._crash),
+        )
+        reason = f"in a rehearsal, {self._crash}"
+        reasons = (*self._verdict.reasons, reason)
+        self._verdict = replace(self._verdict, isolate=True, reasons=reasons)
+        self._revise(self._verdict)
+        return False
 
     def _is_close(self, seen: _Run, fresh: _Run) -> bool:
         if seen.equals(fresh):

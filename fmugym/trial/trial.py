@@ -34,7 +34,7 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMULoadError, LicenceError
+from fmugym.errors import FMULoadError, LicenceError, unknown_name
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
@@ -50,9 +50,12 @@ __all__ = [
     "Stage",
     "content_of",
     "examine",
+    "is_known_to_harm",
     "known_resuming",
     "known_verdict",
+    "marks_of",
     "meet",
+    "note_harm",
     "note_resuming",
     "revise",
     "run",
@@ -66,6 +69,10 @@ _ALONE: Final = {"loading and instantiation", "initialization", "the first step"
 """The stages of a single instance. If a worker ends there only when memory is checked, the FMU
 writes to memory that it must not touch."""
 
+
+_ON: Final = ("on", "1", "yes", "true")
+_OFF: Final = ("off", "0", "no", "false")
+"""The values of ``FMUGYM_PROBE``; an empty one is none."""
 
 _LOOK: Final = 0.1
 """Seconds between two looks at a worker."""
@@ -97,9 +104,20 @@ class Candidate:
 
     @property
     def exempt(self) -> bool:
-        """Whether to skip the trial: trials are turned off, or this package bundles the FMU."""
-        off = os.environ.get("FMUGYM_PROBE", "").lower() in {"0", "off", "no", "false"}
-        return off or self.timeout is None or is_bundled(self.path)
+        """Whether to skip the trial: trials are turned off, or this package bundles the FMU.
+
+        Raises:
+            ConfigError: If the environment variable ``FMUGYM_PROBE`` has an unknown value.
+        """
+        return _trials_are_off() or self.timeout is None or is_bundled(self.path)
+
+
+def _trials_are_off() -> bool:
+    given = os.environ.get("FMUGYM_PROBE", "").strip().lower()
+    if given not in (*_ON, *_OFF, ""):
+        known = (*_ON, *_OFF)
+        raise unknown_name("value of the environment variable FMUGYM_PROBE", given, known)
+    return given in _OFF
 
 
 class Stage(StrEnum):
@@ -210,6 +228,15 @@ def state_files(fmu: FMU) -> str:
         return ""
 
 
+def marks_of(candidate: Candidate) -> tuple[Path, str]:
+    """The folder and the key of an FMU's marks; see ``fmugym.pool.mark``.
+
+    Raises:
+        RuntimeError: If there is no folder for caches.
+    """
+    return cache_folder() / "marks", _content_key(candidate.path)
+
+
 def examine(
     candidate: Candidate,
     spec: Any,
@@ -240,7 +267,7 @@ def examine(
     key = _verdict_key(candidate, spec, starts)
     known = Verdict.from_text(recall(key))
     if known is not None and _answers(known, spec, several):
-        return known
+        return _with_harm(known, candidate)
     found = _examine(Request(candidate, spec, starts, several, alone), must_survive)
     if found.complete:
         remember(key, found.to_text())
@@ -251,6 +278,21 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
     """Whether a verdict tells all that is asked."""
     knows_states = verdict.states is not None or not spec.keep_states
     return knows_states and (verdict.neighbours is not None or not several)
+
+
+def is_known_to_harm(candidate: Candidate) -> bool:
+    """Whether the cache says that an FMU harms its process."""
+    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    return known is not None and known.isolate
+
+
+def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
+    """Add the harm to its process that the FMU has done with any other config."""
+    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    if known is None or not known.isolate or verdict.isolate:
+        return verdict
+    reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
+    return replace(verdict, isolate=True, reasons=tuple(reasons))
 
 
 def known_resuming(candidate: Candidate, spec: Any, starts: Any) -> Grade | None:
@@ -272,9 +314,36 @@ def _resuming_key(candidate: Candidate, spec: Any, starts: Any) -> str:
 
 
 def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> None:
-    """Replace the verdict that ``examine`` has cached for the same arguments."""
+    """Replace the verdict that ``examine`` has cached for the same arguments.
+
+    An FMU that is found to harm its process counts as harmful with every other config, too.
+    """
+    verdict = _with_harm(verdict, candidate)
     for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path)):
         remember(key, verdict.to_text())
+
+
+def note_harm(
+    candidate: Candidate, spec: Any, starts: Any, verdict: Verdict, reason: str
+) -> Verdict:
+    """Add to the cached verdict that an FMU harms its process.
+
+    Args:
+        candidate: As for ``examine``.
+        spec: As for ``examine``.
+        starts: As for ``examine``.
+        verdict: The verdict if nothing is cached.
+        reason: What the FMU has done, in one sentence.
+
+    Returns:
+        The new verdict.
+    """
+    known = Verdict.from_text(recall(_verdict_key(candidate, spec, starts))) or verdict
+    if known.isolate:
+        return known
+    harmful = replace(known, isolate=True, reasons=(*known.reasons, reason))
+    revise(candidate, spec, starts, harmful)
+    return harmful
 
 
 def _examine(request: Request, must_survive: bool) -> Verdict:
@@ -300,6 +369,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
     verdict = notes.verdict
     if request.spec is not None and request.spec.keep_states and verdict.complete:
         verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
+    verdict = _with_harm(verdict, request.candidate)
     logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())

@@ -47,7 +47,7 @@ __all__ = ["FMUVectorEnv"]
 
 logger = logging.getLogger(__name__)
 
-_DISABLED, _SAME_STEP = AutoresetMode.DISABLED, AutoresetMode.SAME_STEP  # each look-up takes time
+_SAME_STEP = AutoresetMode.SAME_STEP  # each look-up takes time
 
 
 class FMUVectorEnv(VectorEnv[Any, Any, Any]):
@@ -146,6 +146,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(env.action_space, count)
         self.observation_space = batch_space(env.observation_space, count)
         self._started = self._is_ready = False
+        self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
         self._background = Background()
         self._engine = self._make_engine(hooks, max_episode_steps)
         self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
@@ -240,7 +241,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        self._require_ready("step")
+        if not self._is_ready or self.closed or self._background.is_pending or self._waits:
+            self._require_ready("step")
         return self._step(actions)
 
     def step_async(self, actions: Any) -> None:
@@ -289,7 +291,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._is_ready or self.closed or self._background.is_pending:
             self._refuse_step(method)
         engine = self._engine
-        if not ended and engine.any_ended and self.autoreset_mode is _DISABLED:
+        if not ended and engine.any_ended and self._waits:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 

@@ -30,8 +30,8 @@ def drawn_info(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
     """The info of a reset.
 
     Args:
-        drawn: What was drawn or overridden, by name: one number, or one for each environment in the
-            mask. No caller changes it.
+        drawn: What was drawn or overridden, by name: one number, or a number or an array for each
+            environment in the mask. No caller changes it.
         mask: The environments that were reset.
     """
     mask = mask.copy()
@@ -39,7 +39,7 @@ def drawn_info(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
 
 
 def _drawn_rows(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
-    rows = {name: np.zeros(len(mask)) for name in drawn}
+    rows = {name: np.zeros((len(mask), *np.shape(row)[1:])) for name, row in drawn.items()}
     for name, values in drawn.items():
         rows[name][mask] = values
     return with_masks(rows, mask)

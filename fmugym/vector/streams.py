@@ -112,14 +112,14 @@ class EpisodeStreams:
         """Draw one episode for each of some environments.
 
         Returns:
-            The values in the order of ``plan.drawn_names``, shape (draws, M).
+            The values in the order of ``plan.draws``, shape (draws, M).
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
         self.require_seeds()
         draws = self.native_draws(plan)
-        values = np.empty((len(plan.drawn_names), len(indices)))
+        values = np.empty((len(plan.draws), len(indices)))
         if draws is not None:
             draws.take(self.states, indices, values)
             return values
@@ -147,7 +147,7 @@ class EpisodeStreams:
 
 def given_draws(plan: EpisodePlan) -> Draws:
     """The draws of a plan as values that are drawn before the C extension needs them."""
-    return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.drawn_names), plan.drawn_rows)
+    return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.draws), plan.drawn_rows)
 
 
 def _native_draws(plan: EpisodePlan) -> Draws | None:

@@ -658,13 +658,13 @@ static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObj
     const size_t count = playing->judgement.program.number_of_seen;
     PyTurn *t = &r->turn;
 
-    if (!PyTuple_Check(seen)) {
-        return count == 0 && take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
-                                        r->horizon * s->count * s->num_observed * sizeof(float));
+    if (count == 0 && !PyTuple_Check(seen)) {
+        return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
+                          r->horizon * s->count * s->num_observed * sizeof(float));
     }
     for (size_t i = 0; i < count; i++) {
         const size_t size = (size_t)playing->judgement.seen_bytes[i];
-        PyObject *array = PyTuple_GetItem(seen, (Py_ssize_t)i);
+        PyObject *array = PyTuple_Check(seen) ? PyTuple_GetItem(seen, (Py_ssize_t)i) : seen;
         if (array == NULL ||
             !take_bytes(array, &t->seen_buffers[i], PyBUF_WRITABLE, r->horizon * size)) {
             return false;

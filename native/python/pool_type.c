@@ -185,6 +185,9 @@ static void pool_dealloc(PyObject *object) {
     free(self->categories);
     free(self->strings);
     Py_XDECREF(self->playing);
+    Py_XDECREF(self->single);
+    Py_XDECREF(self->actions[0]);
+    Py_XDECREF(self->actions[1]);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -193,12 +196,14 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *categories, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *mark, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads;
     int version, private_libraries, logging, can_save;
     int restores, rebuilds, reloads, one_initialization;
     long long substeps, warm_up_steps, retries;
+    const char *sampling;
+    Py_ssize_t samplings;
 } Arguments;
 
 bool parse_group(PyObject *group, const char *format, char **names, ...) {
@@ -215,11 +220,11 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "model",   "token",  "resources",  "paths",
-                            "private", "logging", "states", "categories", NULL};
+                            "private", "logging", "states", "categories", "mark", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iyyyO!pppO!:library", names, &a->version, &s->model, &s->token,
+    return parse_group(group, "$iyyyO!pppO!O:library", names, &a->version, &s->model, &s->token,
                        &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories);
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -235,9 +240,10 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
-    static char *names[] = {"inputs", "outputs", "num_observed", "strings", NULL};
-    return parse_group(group, "$O!O!nO!:variables", names, access_type, &a->inputs, access_type,
-                       &a->outputs, &a->num_observed, &PyTuple_Type, &a->strings);
+    static char *names[] = {"inputs", "outputs", "num_observed", "strings", "sampling", NULL};
+    return parse_group(group, "$O!O!nO!y#:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &PyTuple_Type, &a->strings, &a->sampling,
+                       &a->samplings);
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
@@ -264,7 +270,8 @@ static bool check_numbers(const Arguments *a) {
     const bool sound = a->count >= 1 && a->count <= INT32_MAX && a->threads >= 1 &&
                        a->substeps >= 1 && a->warm_up_steps >= 0 && a->num_observed >= 0 &&
                        a->retries >= 0 && a->retries < 31 && (a->retries == 0 || a->can_save) &&
-                       (size_t)a->num_observed <= a->outputs->access.count;
+                       (size_t)a->num_observed <= a->outputs->access.count &&
+                       (a->samplings == 0 || (size_t)a->samplings == a->outputs->access.count);
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a number is out of range");
     }
@@ -383,6 +390,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->one_initialization = a->one_initialization;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
+    s->sampling = a->samplings == 0 ? NULL : (const unsigned char *)a->sampling;
     s->num_observed = (size_t)a->num_observed;
     s->count = (size_t)a->count;
     s->threads = (size_t)a->threads;
@@ -394,7 +402,8 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;
-    return take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
+    return take_mark(a->mark, &s->mark) &&
+           take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }
 
@@ -460,6 +469,11 @@ static PyMethodDef methods[] = {
      NULL},
     FAST("play", py_play),
     FAST("rollout", py_rollout),
+    {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
+     METH_VARARGS | METH_KEYWORDS, NULL},
+    FAST("step_single", py_step_single),
+    {"begin_single", py_begin_single, METH_O, NULL},
+    {"actions_of_single", py_actions_of_single, METH_NOARGS, NULL},
     FAST("start", py_start),
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),

@@ -254,26 +254,36 @@ void release_program(PyProgram *program) {
     Py_XDECREF(program->parts);
 }
 
+static bool take_one_seen(const PyProgram *program, size_t i, PyObject *array, Py_buffer *buffers,
+                          char **seen) {
+    if (PyObject_GetBuffer(array, &buffers[i], PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) < 0) {
+        return false;
+    }
+    if (buffers[i].len != program->seen_bytes[i]) {
+        PyErr_Format(PyExc_ValueError, "an array of observations has %zd bytes, expected %zd",
+                     buffers[i].len, program->seen_bytes[i]);
+        return false;
+    }
+    seen[i] = buffers[i].buf;
+    return true;
+}
+
 bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen) {
     const size_t count = program->program.number_of_seen;
+    bool good = true;
 
+    if (count == 1 && !PyTuple_Check(arrays)) {
+        return take_one_seen(program, 0, arrays, buffers, seen);
+    }
     if (!PyTuple_Check(arrays) || (size_t)PyTuple_Size(arrays) != count) {
         PyErr_Format(PyExc_TypeError, "there must be a tuple of %zu arrays of observations", count);
         return false;
     }
-    for (size_t i = 0; i < count; i++) {
+    for (size_t i = 0; good && i < count; i++) {
         PyObject *array = PyTuple_GetItem(arrays, (Py_ssize_t)i);
-        if (PyObject_GetBuffer(array, &buffers[i], PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) < 0) {
-            return false;
-        }
-        if (buffers[i].len != program->seen_bytes[i]) {
-            PyErr_Format(PyExc_ValueError, "an array of observations has %zd bytes, expected %zd",
-                         buffers[i].len, program->seen_bytes[i]);
-            return false;
-        }
-        seen[i] = buffers[i].buf;
+        good = take_one_seen(program, i, array, buffers, seen);
     }
-    return true;
+    return good;
 }
 
 /* Evaluating a program alone */

@@ -25,6 +25,10 @@ typedef struct {
 } PyDraws;
 
 typedef struct {
+    PyObject_HEAD Mark mark;
+} PyMark;
+
+typedef struct {
     PyObject_HEAD Snapshot *snapshot;
     PyObject *pool; /* keeps the memory of the pool alive, but not its instances */
 } PySnapshot;
@@ -40,17 +44,22 @@ typedef struct {
     const char **paths, **categories;
     StringValue *strings;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
+    PyObject *single;  /* another one */
+    PyObject *actions[2]; /* of a single environment, in the last step and in the one before */
 } PyPool;
 
-extern PyTypeObject *access_type, *draws_type, *snapshot_type;
+extern PyTypeObject *access_type, *draws_type, *mark_type, *snapshot_type;
 extern PyObject *closed_error; /* raised by calls of a closed pool */
 
-extern PyType_Spec access_spec, draws_spec, snapshot_spec, pool_spec;
+extern PyType_Spec access_spec, draws_spec, mark_spec, snapshot_spec, pool_spec;
 
 /* The table of an FMI version; NULL with an exception if there is none. */
 const Fmi *fmi_of(int version);
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
+
+/* Takes the Mark of an object, which may be None. Returns false with an exception for others. */
+bool take_mark(PyObject *object, const Mark **mark);
 
 PyObject *decode(const char *text);
 /* Parses the values of a dict by name, as PyArg_ParseTupleAndKeywords does. */
@@ -106,5 +115,10 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+
+PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs);
+PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_begin_single(PyObject *object, PyObject *action);
+PyObject *py_actions_of_single(PyObject *object, PyObject *unused);
 
 #endif

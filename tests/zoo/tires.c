@@ -5,11 +5,13 @@
    first step.
    "stubborn": a reset does nothing from the start.
    "noise": every step adds a random number if the environment variable TIRES_NOISE is set.
+   "crash": the process ends if the first step of all instances has an input of 1.
    "fails": instead of another value, the step returns Error.
    y' = gain u. Reals: 0 "u" (input), 1 "y" (output), 2 "gain" (parameter). */
 
 #include "zoo.h"
 
+#include <signal.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
@@ -23,7 +25,7 @@ struct Animal {
     char token[60];
 };
 
-static int instances;
+static int instances, has_stepped;
 
 static bool is(const Animal *me, const char *word) {
     return strstr(me->token, word) != NULL;
@@ -51,6 +53,10 @@ void zoo_free(Animal *me) {
 int zoo_step(Animal *me, double step_size, bool no_set_state) {
     double *v = me->values;
 
+    if (is(me, "crash") && !has_stepped && v[U] == 1.0) {
+        raise(SIGSEGV);
+    }
+    has_stepped = 1;
     if (is(me, "noise")) {
         struct timespec now;
         clock_gettime(CLOCK_MONOTONIC, &now);

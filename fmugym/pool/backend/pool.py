@@ -53,6 +53,9 @@ class BackendPool(CountedPool):
     """
 
     def __init__(self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any) -> None:
+        if spec.samplings:
+            fmu.close()
+            raise ConfigError("a backend has no substeps: leave 'samplings' out of the config")
         self.num_instances = num_instances
         self._spec = spec
         self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))

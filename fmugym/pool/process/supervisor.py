@@ -8,6 +8,7 @@ import math
 import socket
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,7 @@ from typing import Any, Final
 from fmugym.errors import printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.channel import Channel, Code
-from fmugym.pool.process.last_words import describe_exit
+from fmugym.pool.process.last_words import describe_exit, is_crash
 from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo
@@ -60,6 +61,7 @@ class Supervisor:
         setup: What the worker needs to know.
         memory: Shared with the worker.
         log: Gets the FMU's messages.
+        note_crash: Is told how the worker has crashed.
 
     Attributes:
         block: The indices of the worker's instances.
@@ -71,7 +73,13 @@ class Supervisor:
         released: The snapshots without any reference left, by generation and number.
     """
 
-    def __init__(self, setup: Setup, memory: Memory, log: logging.Logger) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        memory: Memory,
+        log: logging.Logger,
+        note_crash: Callable[[str], None] | None = None,
+    ) -> None:
         self.block = setup.block
         self.generation = 0
         self.reason = ""
@@ -80,6 +88,7 @@ class Supervisor:
         self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
         self._setup, self._memory, self._log = setup, memory, log
+        self._note_crash = note_crash
         self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
         self._output = Output()
         self._deaths = 0
@@ -317,6 +326,8 @@ class Supervisor:
         self._output.drain()
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
+        if self._note_crash is not None and status is not None and is_crash(status):
+            self._note_crash(f"a worker process {how} in {doing}")
         raise LostError(self.reason)
 
     def _end_hang(self, doing: str) -> None:

@@ -219,7 +219,7 @@ class BatchEngine(Engine):
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
         self._forget(indices, plan)
-        return plan.told | dict(zip(plan.drawn_names, drawn, strict=True))
+        return plan.told | plan.named(drawn)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""
@@ -249,17 +249,18 @@ class BatchEngine(Engine):
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env._plan
+        if plan.constant_variables:
+            starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
+            self._place(plan.constant_variables, starts, indices)
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
         else:
-            self._place(plan.drawn_names, drawn, indices)
+            rows = {n: results.environments_last(v) for n, v in plan.named(drawn).items()}
+            self._place(rows, rows.values(), indices)
         if not default or self._any_foreign:
             constants = plan.constant_parameters
             self._place(constants, constants.values(), indices)
             self._note_foreign(indices, not default)
-        if plan.constant_variables:
-            starts = [np.expand_dims(value, -1) for value in plan.constant_variables.values()]
-            self._place(plan.constant_variables, starts, indices)
         if self._given:
             self._place_given(indices, plan)
         if default:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,12 +36,16 @@ __all__ = ["CompiledEngine", "find_programs"]
 
 logger = logging.getLogger(__name__)
 
-_FLOAT32, _BOOL = np.dtype(np.float32), np.dtype(np.bool_)
+_BOOL = np.dtype(np.bool_)
 
 _WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
 """Magnitudes of other states that programs are compared with hooks on."""
 
-_make_tuple: Any = tuple.__new__  # takes a third of the time of a NamedTuple's constructor
+_REFUSALS = (TypeError, ValueError, BufferError)
+"""What the pool raises if it does not take the arguments of a step."""
+
+_make_result: Callable[[tuple[Any, ...]], StepResult] = partial(tuple.__new__, StepResult)
+"""Takes a third of the time of a NamedTuple's constructor."""
 
 
 def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
@@ -115,8 +120,8 @@ class CompiledEngine(BatchEngine):
         self._prepared = False
         if task is None or not _can_draw(task, plan):
             return
-        self._names, self._left = plan.drawn_names, task.left
-        self._drawn_shape = len(self._names), self._n
+        self._left = task.left
+        self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
         self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
@@ -125,7 +130,8 @@ class CompiledEngine(BatchEngine):
         self._keeps_actions = reads_actions or is_typed or bool(task.left)
         self._starts_in_pass = task.left.keys() <= {"_get_inputs"} and not self._draws_ahead
         self._make_rows(task)
-        self._layout = _Layout(task, self.env)
+        layout = _Layout(task, self.env)
+        self._new_arrays, self._divided = layout.new_arrays, layout.divided
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -228,9 +234,9 @@ class CompiledEngine(BatchEngine):
                 for name, start in env._start_inputs
             ),
             "drawn_variables": tuple(
-                (flat[name][0], number)
-                for number, name in enumerate(plan.drawn_names)
-                if name in flat
+                (flat[draw.name][draw.element or 0], number)
+                for number, draw in enumerate(plan.draws)
+                if draw.name in flat
             ),
             "variable_starts": tuple(
                 (row, np.array(value, row.dtype).tobytes())
@@ -267,12 +273,11 @@ class CompiledEngine(BatchEngine):
         if seeds is not None:
             self._streams.seed(seeds, np.flatnonzero(mask))
         self._streams.require_seeds()
-        seen, drawn = self._layout.new_arrays(), self._draw_ahead(mask)
+        seen, drawn = self._new_arrays(), self._draw_ahead(mask)
         self.has_moved = True
         troubled = self._start(mask, seen, drawn)
-        observations, own = self._layout.divided(seen)
-        infos = restricted(own, mask) if own else own
-        infos |= _start_infos(self._names, drawn, mask)
+        observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
+        infos = restricted(infos, mask) | _start_infos(self.env._plan, drawn, mask)
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -283,7 +288,7 @@ class CompiledEngine(BatchEngine):
         return observations, infos
 
     def _draw_ahead(self, mask: MaskArray) -> FloatArray:
-        """Make the array of drawn values; those of episodes that only Python can draw are in it."""
+        """Make the array of drawn values; those that only Python can draw are in it."""
         drawn = np.empty(self._drawn_shape)
         if self._draws_ahead:
             drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
@@ -298,7 +303,7 @@ class CompiledEngine(BatchEngine):
         """
         last, started = None, None
         if self.starts_at_ends and self._starts_in_pass:
-            last, started = self._layout.new_arrays(), np.empty(self._n, _BOOL)
+            last, started = self._new_arrays(), np.empty(self._n, _BOOL)
         self._spare = np.empty(self._drawn_shape), last, started
         return self._spare
 
@@ -319,51 +324,59 @@ class CompiledEngine(BatchEngine):
         """See ``Engine.step``."""
         if self._any_foreign or not self._prepared:
             return self._step_on_arrays(actions, resetting)
-        self._longest = self._limit  # this path does not count steps
-        self.has_moved = False
         if self._left or (resetting is not None and self._draws_ahead):
             actions = self._checked_ahead(actions, resetting)
         drawn, last, started = self._spare or self._make_spare()
-        if resetting is not None:
-            drawn = self._draw_ahead(resetting)
-        seen = self._layout.new_arrays()
-        judged = np.empty(self._n), np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
+        drawn = drawn if resetting is None else self._draw_ahead(resetting)
+        seen, rewards = self._new_arrays(), np.empty(self._n)
+        done, cut = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
         play = self._play if resetting is started is None else self._play_with_resets
-        troubled, begun = self._do(play, actions, seen, *judged, drawn, last, started)
-        observations, infos = self._layout.divided(seen)
-        if resetting is not None:
-            infos |= _start_infos(self._names, drawn, resetting)
-        elif begun:
-            infos = self._with_ends(infos, drawn, last, started)
-        result: StepResult = _make_tuple(StepResult, (observations, *judged, infos))
-        if troubled or self._left:
-            result = self._completed(result, resetting, started)
-        return result
+        self.has_moved = True  # unless the call refuses its arguments
+        try:
+            counts = play(actions, seen, rewards, done, cut, drawn, last, started)
+        except _REFUSALS as error:
+            return self.step(self._converted(actions, error), resetting)
+        troubled, ended, begun = counts
+        self.any_ended = ended > begun
+        observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
+        if begun or resetting is not None:
+            infos = self._with_starts(infos, resetting, drawn, last, started)
+        result = _make_result((observations, rewards, done, cut, infos))
+        return self._completed(result, resetting, started) if troubled or self._left else result
 
     def _checked_ahead(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
         """Check actions before Python draws or calls a hook: a refused step changes nothing."""
+        self.has_moved = False
         checked = self._flat(actions)
         if "_get_inputs" in self._left:
             self._call_get_inputs(checked, resetting)
         return checked
 
-    def _do(self, play: Callable[..., Any], actions: Any, *arrays: Any) -> tuple[int, int]:
-        """Let the pool do the step.
+    def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
+        """The actions in the form that the pool takes, if it has refused another one."""
+        require_refusal(error)
+        self.has_moved = False
+        converted = self._flat(actions)
+        if converted is actions:
+            raise error
+        return converted
 
-        Returns:
-            How many instances had trouble, and how many ended episodes were followed by others.
-        """
-        try:
-            troubled, ended, begun = play(actions, *arrays)
-        except (TypeError, ValueError, BufferError) as error:
-            require_refusal(error)
-            troubled, ended, begun = play(self._flat(actions), *arrays)
-        except IndexError:  # of a hook
-            self.has_moved = True
-            raise
-        self.has_moved = True
-        self.any_ended = ended > begun
-        return troubled, begun
+    def _with_starts(
+        self,
+        infos: dict[str, Any],
+        resetting: MaskArray | None,
+        drawn: FloatArray,
+        last: Any,
+        started: Any,
+    ) -> dict[str, Any]:
+        """Add the infos on the episodes that have started in this step."""
+        if resetting is not None:
+            infos["drawn"] = LateDict.of(_told, self.env._plan, drawn, resetting)
+            infos["_drawn"] = resetting
+            return infos
+        self._spare = None
+        late = LateDict.of(self._infos_at_ends, drawn, last, started)
+        return infos | late if infos else late
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
@@ -372,12 +385,14 @@ class CompiledEngine(BatchEngine):
         horizon = len(actions)
         shape = horizon, self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
-        seen = self._layout.new_arrays(horizon)
+        layout, seen = self._layout, self._layout.arrays_for(horizon)
         self.has_moved = True
         troubled = self._pool.roll_out(
             np.ascontiguousarray(actions), seen, *judged, np.zeros(self._drawn_shape)
         )
-        return None if troubled else (self._layout.divided(seen)[0], *judged)
+        if troubled:
+            return None
+        return seen if layout.divided is None else layout.divided(seen)[0], *judged
 
     def _completed(
         self, result: StepResult, resetting: MaskArray | None, started: MaskArray | None
@@ -388,21 +403,13 @@ class CompiledEngine(BatchEngine):
         self._mend(result, resetting if started is None else started)
         return result
 
-    def _with_ends(
-        self, infos: dict[str, Any], drawn: FloatArray, last: Any, started: Any
-    ) -> dict[str, Any]:
-        """Add the infos on the episodes that have followed others in this step."""
-        self._spare = None
-        late = LateDict.of(self._infos_at_ends, drawn, last, started)
-        return infos | late if infos else late
-
     def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:
         """The infos of a step in which episodes have followed others."""
-        observations, infos = self._layout.divided(last)
+        observations, infos = (last, {}) if self._divided is None else self._divided(last)
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
         final = final_infos(objects, restricted(infos, started), started)
-        return _start_infos(self._names, drawn, started) | final
+        return _start_infos(self.env._plan, drawn, started) | final
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -467,6 +474,7 @@ class CompiledEngine(BatchEngine):
         return np.require(array, requirements=["C", "A"])
 
     def _step_on_arrays(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        self._longest = self._limit  # steps of the pool are not counted there
         result = super().step(actions, resetting)
         if self._prepared:
             self._take_over()
@@ -521,38 +529,35 @@ class _Layout:
         env: The environment, with the arrays of N.
 
     Attributes:
-        new_arrays: Makes the arrays of a step, or of so many steps: those that the program stores
-            in, or else one for the observations of the pool.
-        divided: Returns the observations and a new dict of infos that such arrays hold.
+        new_arrays: Makes the arrays of a step: one, or a tuple of those that the program stores in.
+        divided: Returns the observations and a new dict of infos that such arrays hold. None if
+            there is one array, that of the observations.
     """
 
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
         self._n = len(env.step_count)
-        self._shape = self._n, env._output_count
-        self._shapes = [((self._n, *array.shape), array.dtype) for array in task.seen]
         self._paths = [array.path for array in task.seen]
         self._names = [path[-1] for path in self._paths]
-        stores = bool(task.seen) or not env._pool_observes
-        self.new_arrays: Callable[..., Any] = self._stored if stores else self._observed
-        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] = self._alone
-        if stores and self._paths == [("observation",)]:
-            self.divided = self._only
-        elif stores and all(len(path) == 2 and path[0] == "observation" for path in self._paths):
+        self._shapes = [((self._n, *array.shape), array.dtype) for array in task.seen]
+        self.new_arrays: Callable[[], Any] = self._stored
+        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
+        if not task.seen and env._pool_observes:
+            self.new_arrays = partial(np.empty, (self._n, env._output_count), np.float32)
+            self.divided = None
+        elif self._paths == [("observation",)]:
+            self.new_arrays, self.divided = partial(np.empty, *self._shapes[0]), None
+        elif all(len(path) == 2 and path[0] == "observation" for path in self._paths):
             self.divided = self._named
-        elif stores:
-            self.divided = self._tree
 
-    def _observed(self, *steps: int) -> npt.NDArray[Any]:
-        return np.empty((*steps, *self._shape), _FLOAT32)
+    def _stored(self) -> tuple[npt.NDArray[Any], ...]:
+        return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
 
-    def _stored(self, *steps: int) -> tuple[npt.NDArray[Any], ...]:
-        return tuple([np.empty((*steps, *shape), dtype) for shape, dtype in self._shapes])
-
-    def _alone(self, array: Any) -> tuple[Any, dict[str, Any]]:
-        return array, {}
-
-    def _only(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
-        return arrays[0], {}
+    def arrays_for(self, steps: int) -> Any:
+        """The arrays of so many steps; they have a first axis for the steps."""
+        arrays = self.new_arrays()
+        if isinstance(arrays, tuple):
+            return tuple([np.empty((steps, *array.shape), array.dtype) for array in arrays])
+        return np.empty((steps, *arrays.shape), arrays.dtype)
 
     def _named(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         return dict(zip(self._names, arrays, strict=True)), {}
@@ -570,9 +575,9 @@ class _Layout:
         return tree["observation"], infos
 
 
-def _start_infos(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return {"drawn": LateDict.of(_told, names, drawn, mask), "_drawn": mask}  # rarely read
+def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
 
 
-def _told(names: list[str], drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(dict(zip(names, drawn, strict=True)), mask)
+def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    return coded(plan.named(drawn), mask)

@@ -22,7 +22,7 @@ from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
 from fmugym.vector.views import batched, column, copied
 
-__all__ = ["CURE", "find_difference", "sample_states"]
+__all__ = ["CURE", "find_difference", "sample_of", "sample_states"]
 
 CURE = (
     "Write hooks element-wise: & and | for 'and' and 'or', numpy.where for 'if', no reduction over "
@@ -172,13 +172,13 @@ def _place_sample(
     batch.step_count[index] = 1 + index
     batch.done[index] = bool(rng.integers(2))
     for actions in (batch.action, batch.previous_action):
-        actions[..., index] = _sample(env.action_space, rng)
+        actions[..., index] = sample_of(env.action_space, rng)
     episode = env._plan.draw(rng)
     for name, value in {**episode.parameters, **episode.variables}.items():
         rows.setdefault(name, []).append(value)
 
 
-def _sample(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
+def sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
     """Sample without touching the space's own generator."""
     own, space._np_random = space._np_random, rng
     try:

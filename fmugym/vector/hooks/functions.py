@@ -65,6 +65,8 @@ def _into(out: Any, result: Symbols) -> Any:
 
 def _kind_of(value: Any) -> Any:
     """The type of an operand; the numbers of Python adapt to the other operands."""
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak
     return type(value) if type(value) in (int, float) else np.asarray(value).dtype
 
 
@@ -244,6 +246,8 @@ def _dummy(graph: Graph, value: Any) -> Any:
     """A number or array of the same type, of which numpy makes the same type of result."""
     if type(value) in (int, float, bool):
         return value
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak(1)
     return np.ones(1, as_symbols(graph, value).dtype)
 
 
@@ -431,7 +435,15 @@ _REARRANGING: Final = frozenset(
 _COMPOSED: Final = frozenset(
     {np.sum, np.prod, np.mean, np.std, np.var, np.any, np.all, np.max, np.min, np.amax, np.amin}
     | {np.round, np.around, np.cumsum, np.cumprod, np.ptp, np.diff, np.polyval, np.isclose}
-    | {np.sinc, np.average, np.trapezoid, np.gradient, np.append, np.angle, np.count_nonzero}
+    | {
+        np.sinc,
+        np.average,
+        getattr(np, "trapezoid", None),
+        np.gradient,
+        np.append,
+        np.angle,
+        np.count_nonzero,
+    }
     | {np.fix, np.real_if_close}
 )
 """Functions that numpy composes of others."""
@@ -447,7 +459,7 @@ def _patched(function: Any, own: Callable[..., Any]) -> Callable[..., Any]:
         graph = getattr(_tracing, "graph", None)
         if graph is None:
             return function(*args, **keywords)
-        return own(graph, function, *args, **keywords)
+        return graph.patched(own, function, args, keywords)
 
     return functools.update_wrapper(call, function)
 

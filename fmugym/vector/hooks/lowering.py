@@ -151,6 +151,8 @@ class _Compiler:
                 return node.kind, self._place(self._tables, what)
             case "where":
                 return f"where {node.dtype.itemsize}", 0
+            case "scalar_power":
+                return f"scalar_power {letter_of(node.dtype)}", 0
             case "cast":
                 source, target = self._letters(node)[0], letter_of(node.dtype)
                 return "cast", TYPES.index(source) * len(TYPES) + TYPES.index(target)

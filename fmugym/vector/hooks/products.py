@@ -209,12 +209,16 @@ def _cross(
     return np.moveaxis(np.stack(elements), 0, axisc)
 
 
-UFUNCS: Final[Mapping[Any, Callable[..., Symbols]]] = {
-    np.matmul: _matmul,
-    np.vecdot: _vector_dot,
-    getattr(np, "matvec", None): _matvec,  # since numpy 2.2
-    getattr(np, "vecmat", None): _vecmat,
-}
+def _those_of(module: Any, functions: Mapping[str, Callable[..., Symbols]]) -> dict[Any, Any]:
+    """Functions by those of numpy that they stand for; older releases do not have all of them."""
+    known = {getattr(module, name, None): own for name, own in functions.items()}
+    known.pop(None, None)
+    return known
+
+
+UFUNCS: Final[Mapping[Any, Callable[..., Symbols]]] = _those_of(
+    np, {"matmul": _matmul, "vecdot": _vector_dot, "matvec": _matvec, "vecmat": _vecmat}
+)
 """The products that numpy has as element-wise functions of whole vectors and matrices."""
 
 FUNCTIONS: Final[Mapping[Any, Callable[..., Symbols]]] = {
@@ -224,8 +228,6 @@ FUNCTIONS: Final[Mapping[Any, Callable[..., Symbols]]] = {
     np.tensordot: _tensordot,
     np.einsum: _einsum,
     np.cross: _cross,
-    np.linalg.matmul: _matmul,
-    np.linalg.vecdot: _vector_dot,
-    np.linalg.tensordot: _tensordot,
+    **_those_of(np.linalg, {"matmul": _matmul, "vecdot": _vector_dot, "tensordot": _tensordot}),
 }
 """The products among numpy's functions of arrays."""

@@ -29,6 +29,7 @@ OPERATIONS: Final = (
     *("add q", "subtract q", "multiply q", "negative q"),
     *("less q", "less_equal q", "greater q", "greater_equal q", "equal q", "not_equal q"),
     *("and", "or", "xor", "not", "where 8", "where 4", "where 2", "where 1"),
+    *("scalar_power d", "scalar_power f"),
 )
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 

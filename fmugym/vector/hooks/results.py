@@ -22,6 +22,7 @@ from fmugym.vector.codec import coded
 
 __all__ = [
     "environments_first",
+    "environments_last",
     "flags",
     "info_arrays",
     "observations",
@@ -144,6 +145,11 @@ def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
 def environments_first(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """View an array with its last axis first."""
     return array.T if array.ndim <= 2 else np.moveaxis(array, -1, 0)  # which takes 3 us
+
+
+def environments_last(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """View an array with its first axis last."""
+    return array.T if array.ndim <= 2 else np.moveaxis(array, 0, -1)
 
 
 def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:

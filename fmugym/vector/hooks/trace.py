@@ -36,7 +36,7 @@ from fmugym.vector.hooks.symbols import (
 )
 from fmugym.vector.hooks.tables import is_table, tables_in
 
-__all__ = ["SeenArray", "TracedTask", "trace_hooks"]
+__all__ = ["SeenArray", "TracedTask", "placed", "rounded", "tables_of", "trace_hooks"]
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class _Tracer:
         self._graph = Graph()
         self._contents = Contents(env)
         self._left: dict[str, str] = {}
-        self._tables = dict(_tables(env))
+        self._tables = dict(tables_of(env))
         self._variables: dict[str, np.dtype[Any]] = {
             name: np.dtype(np.float64) for name in env.variables
         }
@@ -170,7 +170,7 @@ class _Tracer:
                 raise UntraceableError(f"it changes self.{changed}")
             return of(value)
         except Exception as error:  # hooks do with numbers what symbols cannot do
-            raise UntraceableError(_placed(self._env, name, error)) from error
+            raise UntraceableError(placed(self._env, name, error)) from error
 
     def _nodes(self, value: Any, shape: tuple[int, ...] | None, dtype: Any) -> npt.NDArray[Any]:
         """The nodes of a result, the environments last; one value stands for all environments."""
@@ -229,7 +229,7 @@ class _Tracer:
             rounded: Any = np.where(value >= 0.5, 1.0, 0.0)
             rounded = np.where(np.isfinite(value), rounded, value)
         elif variable.kind in {"integer", "enumeration"}:
-            rounded = _rounded(variable, value)
+            rounded = rounded(variable, value)
         else:
             limit = float(np.finfo(np.float32).max)
             rounded = np.where(np.absolute(value) <= limit, value, np.nan)
@@ -372,7 +372,7 @@ class _Tracer:
         seen.append(SeenArray(path, nodes.shape, dtype))
 
 
-def _rounded(variable: Any, value: Any) -> Any:
+def rounded(variable: Any, value: Any) -> Any:
     """The nearest integer, or the nearest item of an Enumeration; NaN outside of the range."""
     low, high = variable.integer_limits
     largest = 2.0**53
@@ -396,7 +396,7 @@ def _nearest(items: list[int], value: Any) -> Any:
     return np.where(inside, nearest, value)
 
 
-def _placed(env: FMUEnv, name: str, error: Exception) -> str:
+def placed(env: FMUEnv, name: str, error: Exception) -> str:
     """Say where a hook does what cannot be traced."""
     what = str(error) if isinstance(error, UntraceableError) else f"it fails on symbols: {error}"
     code = getattr(getattr(type(env), name), "__code__", None)
@@ -462,7 +462,7 @@ def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
     return loaded(graph, kind, names, space.dtype)
 
 
-def _tables(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+def tables_of(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """The arrays among the attributes, of the class too, that hooks may index with values."""
     of_classes = {name: v for cls in reversed(type(env).__mro__) for name, v in vars(cls).items()}
     for name, value in (of_classes | vars(env)).items():

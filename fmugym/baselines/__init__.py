@@ -1,0 +1,17 @@
+"""Controllers that need no training: what a trained agent has to beat.
+
+Each is made without an environment and bound to one or to many::
+
+    controller = PID("theta", setpoint=0.0, kp=-0.4, td=0.15)
+    controller.bind(env)
+    observation, info = env.reset(seed=0)
+    action = controller.act(observation, info)
+
+All read the observation by the names of its elements and return actions of the action space.
+"""
+
+from fmugym.baselines.base import Controller
+from fmugym.baselines.feedback import LQR, PID, Hysteresis
+from fmugym.baselines.feedforward import Constant, Random, Schedule
+
+__all__ = ["LQR", "PID", "Constant", "Controller", "Hysteresis", "Random", "Schedule"]

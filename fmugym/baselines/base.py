@@ -1,0 +1,161 @@
+"""What all controllers share: how they are bound to environments, and the shapes of actions."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.checks import check_number
+from fmugym.errors import ConfigError, shown, unknown_name
+
+__all__ = ["Controller", "FloatArray"]
+
+FloatArray = npt.NDArray[np.float64]
+
+Signal = str | float
+"""An element of the observation by name, or a constant."""
+
+
+class Controller(ABC):
+    """A controller of one environment, or of the N environments of a vector environment.
+
+    Attributes:
+        space: The action space of one environment.
+        names: The names of the observation's elements.
+        time_step: The length of a step in s.
+        count: The number of environments.
+    """
+
+    space: spaces.Space[Any]
+    names: tuple[str, ...]
+    time_step: float
+    count: int
+
+    def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
+        """Prepare for an environment and forget all episodes.
+
+        Args:
+            env: A single or a vector environment of this package, or a wrapper of one.
+            names: The names of the observation's elements. They are known if the observation is
+                the FMU's outputs, which is the default, and for declared tasks.
+
+        Returns:
+            The controller itself.
+
+        Raises:
+            ConfigError: If the names are not known, or something that the controller needs is not
+                there.
+        """
+        self._is_vector = hasattr(env, "single_action_space")
+        self.count = env.num_envs if self._is_vector else 1
+        self.space = env.single_action_space if self._is_vector else env.action_space
+        self.time_step = _attribute(env, "config").time_step
+        self.names = _names_of(env) if names is None else tuple(names)
+        self._prepare()
+        self.reset()
+        return self
+
+    def act(self, observation: Any, info: Any = None) -> Any:
+        """Choose actions.
+
+        Args:
+            observation: Of shape (k,), or (N, k) for a vector environment.
+            info: The infos that came with it; no controller of this package reads them.
+
+        Returns:
+            An action of the action space, or N of them.
+
+        Raises:
+            ConfigError: If the controller is not bound, or the observation has another shape.
+        """
+        if not hasattr(self, "names"):
+            raise ConfigError(f"call {type(self).__name__}.bind(env) before act")
+        rows = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+        if rows.shape != (self.count, len(self.names)):
+            raise ConfigError(
+                f"expected an observation of {self._shape()}, got one of shape "
+                f"{np.shape(observation)}"
+            )
+        actions = self._as_actions(self._decide(rows))
+        return actions if self._is_vector else actions[0]
+
+    def reset(self, mask: npt.NDArray[np.bool_] | None = None) -> None:
+        """Begin new episodes; call it where ``terminated`` or ``truncated`` was true.
+
+        Args:
+            mask: Which environments begin one, shape (N,); by default all.
+        """
+        self._forget(np.ones(self.count, dtype=bool) if mask is None else np.asarray(mask))
+
+    # What a controller adds.
+
+    def _prepare(self) -> None:  # noqa: B027 (not every controller needs it)
+        """Find what the controller needs in the space and the names."""
+
+    @abstractmethod
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        """Choose the actions for observations of shape (N, k): shape (N,) or (N, m)."""
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:  # noqa: B027 (as above)
+        """Forget the episodes of some environments."""
+
+    # Shared by controllers.
+
+    def _column(self, rows: FloatArray, signal: Signal) -> FloatArray:
+        """The values of a signal, shape (N,)."""
+        if isinstance(signal, str):
+            return rows[:, self.names.index(signal)]
+        return np.full(len(rows), signal)
+
+    def _check_signal(self, what: str, signal: Signal) -> None:
+        if not isinstance(signal, str):
+            check_number(what, signal)
+        elif signal not in self.names:
+            raise ConfigError(unknown_name(f"observation in {what}", signal, self.names))
+
+    def _limits(self) -> tuple[float, float]:
+        """The lowest and the highest action of a space with one element."""
+        space = self.space
+        if isinstance(space, spaces.Box) and space.shape in ((), (1,)):
+            return float(space.low.item()), float(space.high.item())
+        if isinstance(space, spaces.Discrete):
+            return float(space.start), float(space.start + space.n - 1)
+        raise ConfigError(
+            f"{type(self).__name__} gives one number, but the action space is {shown(space)}"
+        )
+
+    def _as_actions(self, values: FloatArray) -> Any:
+        """Round or clip values to the action space and give them its shape and type."""
+        space = self.space
+        if isinstance(space, spaces.Discrete):
+            least, largest = self._limits()
+            return np.clip(np.rint(values), least, largest).astype(space.dtype)
+        values = values.reshape(len(values), *space.shape or ())
+        if isinstance(space, spaces.Box):
+            values = np.clip(values, space.low, space.high)
+        return values.astype(space.dtype)
+
+    def _shape(self) -> str:
+        width = len(self.names)
+        return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
+
+
+def _attribute(env: Any, name: str) -> Any:
+    """An attribute of an environment, or of the first of many."""
+    base = env.unwrapped
+    return base.get_attr(name)[0] if hasattr(base, "get_attr") else getattr(base, name)
+
+
+def _names_of(env: Any) -> tuple[str, ...]:
+    names: tuple[str, ...] | None = _attribute(env, "observation_names")
+    if names is None:
+        raise ConfigError(
+            "the elements of these observations have no names, because a hook makes them; give "
+            "bind their names in order"
+        )
+    return names

@@ -1,0 +1,177 @@
+"""Controllers that look at the observation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.baselines.base import Controller, FloatArray, Signal
+from fmugym.checks import check_number
+from fmugym.errors import ConfigError
+from fmugym.lazy import scipy_module
+from fmugym.tools.linearization import LinearModel
+
+__all__ = ["LQR", "PID", "Hysteresis"]
+
+
+class Hysteresis(Controller):
+    """Switches between two actions, as a thermostat does.
+
+    Args:
+        of: The name of what is measured.
+        setpoint: What it shall be: a name or a constant.
+        band: The controller switches where the measured value leaves the set point by this much.
+        below: The action below the band; it holds until the value is above the band.
+        above: The action above the band.
+    """
+
+    def __init__(
+        self, of: str, setpoint: Signal, band: float, below: float = 1.0, above: float = 0.0
+    ) -> None:
+        self.of, self.setpoint = of, setpoint
+        self.band = check_number("band", band, minimum=0.0)
+        self.below, self.above = check_number("below", below), check_number("above", above)
+
+    def _prepare(self) -> None:
+        self._limits()
+        self._check_signal("of", self.of)
+        self._check_signal("setpoint", self.setpoint)
+        self._action = np.full(self.count, self.above)
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        self._action = np.where(mask, self.above, self._action)
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        error = self._column(rows, self.of) - self._column(rows, self.setpoint)
+        kept = np.where(error > self.band, self.above, self._action)
+        self._action = np.where(error < -self.band, self.below, kept)
+        return self._action
+
+
+class PID(Controller):
+    """A PID controller on one value, with limits and anti-windup.
+
+    With the error e = setpoint - measured value y, the action is
+
+        offset + kp (e + 1/ti * integral of e - td * dy/dt)
+
+    It is limited to the action space. While it is at a limit, the integral does not grow further,
+    so that it does not wind up. The derivative is that of the measured value, so that a step of the
+    set point does not kick. (K. J. Åström and T. Hägglund, Advanced PID Control, 2006, chapter 3.)
+
+    Args:
+        of: The name of what is measured.
+        setpoint: What it shall be: a name or a constant.
+        kp: The gain, in units of the action per unit of the measured value. A negative gain is for
+            actions that lower the value.
+        ti: The integral time in s; without one there is no integral part.
+        td: The derivative time in s.
+        offset: The action where the error is zero.
+    """
+
+    def __init__(
+        self,
+        of: str,
+        setpoint: Signal,
+        kp: float,
+        ti: float | None = None,
+        td: float = 0.0,
+        offset: float = 0.0,
+    ) -> None:
+        self.of, self.setpoint = of, setpoint
+        self.kp = check_number("kp", kp)
+        self.ti = None if ti is None else check_number("ti", ti, minimum=0.0, positive=True)
+        self.td = check_number("td", td, minimum=0.0)
+        self.offset = check_number("offset", offset)
+
+    def _prepare(self) -> None:
+        self._low, self._high = self._limits()
+        self._check_signal("of", self.of)
+        self._check_signal("setpoint", self.setpoint)
+        self._integral = np.zeros(self.count)
+        self._last = np.full(self.count, np.nan)
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        self._integral = np.where(mask, 0.0, self._integral)
+        self._last = np.where(mask, np.nan, self._last)
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        value = self._column(rows, self.of)
+        error = self._column(rows, self.setpoint) - value
+        change = np.where(np.isnan(self._last), 0.0, value - self._last)
+        self._last = value
+        rest = self.offset + self.kp * (error - self.td * change / self.time_step)
+        if self.ti is None:
+            return rest
+        growth = self.kp * error * self.time_step / self.ti
+        wanted = rest + self._integral + growth
+        beyond = wanted - np.clip(wanted, self._low, self._high)
+        self._integral = np.where(beyond * growth > 0, self._integral, self._integral + growth)
+        return rest + self._integral
+
+
+class LQR(Controller):
+    """A linear-quadratic regulator for a linear model: u = u0 - K (x - x0).
+
+    K minimizes the sum over the steps of (x - x0)' Q (x - x0) + (u - u0)' R (u - u0), for the model
+    with inputs that are constant within a step. It comes from the discrete algebraic Riccati
+    equation. Needs SciPy (the extra ``identification``).
+
+    Args:
+        model: The linear model, from ``fmugym.linearize`` at an equilibrium.
+        q: The weights of the states: one each, or the matrix Q of shape (n, n).
+        r: The weights of the inputs: one each, or the matrix R of shape (m, m).
+        of: The names of the states in the observation; by default those of the model.
+
+    Attributes:
+        gain: The matrix K of shape (m, n), once the controller is bound.
+    """
+
+    def __init__(self, model: LinearModel, q: Any, r: Any, of: Sequence[str] | None = None) -> None:
+        self.model = model
+        self.of = tuple(model.states if of is None else of)
+        if len(self.of) != len(model.states):
+            raise ConfigError(
+                f"the model has {len(model.states)} states, but of names {len(self.of)}"
+            )
+        self._q = _weights("q", q, len(model.states))
+        self._r = _weights("r", r, len(model.inputs))
+
+    def _prepare(self) -> None:
+        for name in self.of:
+            self._check_signal("of", name)
+        a, b = _discrete(self.model, self.time_step)
+        linalg = scipy_module("linalg")
+        try:
+            cost = linalg.solve_discrete_are(a, b, self._q, self._r)
+            self.gain = np.linalg.solve(self._r + b.T @ cost @ b, b.T @ cost @ a)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise ConfigError(f"no regulator stabilizes this model: {error}") from None
+        if np.abs(np.linalg.eigvals(a - b @ self.gain)).max() >= 1:
+            raise ConfigError("no regulator stabilizes this model; do its inputs move its states?")
+        self._places = [self.names.index(name) for name in self.of]
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        deviation = rows[:, self._places] - self.model.x0
+        decided: FloatArray = self.model.u0 - deviation @ self.gain.T
+        return decided
+
+
+def _weights(what: str, value: Any, size: int) -> FloatArray:
+    matrix = np.asarray(value, dtype=np.float64)
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
+    if matrix.shape != (size, size):
+        raise ConfigError(f"{what} must have {size} weights or shape ({size}, {size})")
+    return matrix
+
+
+def _discrete(model: LinearModel, time_step: float) -> tuple[FloatArray, FloatArray]:
+    """The model over one step with constant inputs, by one matrix exponential (Van Loan 1978)."""
+    n, m = model.B.shape
+    joined = np.zeros((n + m, n + m))
+    joined[:n, :n], joined[:n, n:] = model.A, model.B
+    exponential = scipy_module("linalg").expm(joined * time_step)
+    return exponential[:n, :n], exponential[:n, n:]

@@ -1,0 +1,101 @@
+"""Controllers that do not look at the observation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.baselines.base import Controller, FloatArray
+from fmugym.checks import check_mapping, check_number, check_seed
+from fmugym.errors import ConfigError, shown
+
+__all__ = ["Constant", "Random", "Schedule"]
+
+_DAY: Final = 86400.0
+
+
+class Constant(Controller):
+    """Gives the same action in every step.
+
+    Args:
+        action: One action; its shape is that of the action space.
+    """
+
+    def __init__(self, action: Any) -> None:
+        self.action = action
+
+    def _prepare(self) -> None:
+        try:
+            taken = self._as_actions(self._decide(np.empty((1, 0))))[0]
+        except (TypeError, ValueError):  # of another shape, or no numbers
+            taken = None
+        if not np.array_equal(taken, self.action):
+            raise ConfigError(f"the action {shown(self.action)} is not in {shown(self.space)}")
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        return np.stack([np.asarray(self.action, dtype=np.float64)] * len(rows))
+
+
+class Random(Controller):
+    """Samples the action space.
+
+    Args:
+        seed: Of the samples; the same seed gives the same actions after each ``bind``.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self.seed = check_seed(seed)
+
+    def _prepare(self) -> None:
+        self.space.seed(self.seed)
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        samples = [self.space.sample() for _ in rows]
+        return np.asarray(samples, dtype=np.float64)
+
+
+class Schedule(Controller):
+    """Gives actions by the time of day, counted from the beginning of the episode.
+
+    Args:
+        actions: The action from each time on, such as ``{"06:00": 1.0, "22:00": 0.0}``. Before the
+            first time, the last one of the day before holds.
+        start: The time of day at which an episode begins.
+    """
+
+    def __init__(self, actions: Mapping[str, float], start: str = "00:00") -> None:
+        times = {
+            _seconds(time): check_number(f"the action at {time}", action)
+            for time, action in check_mapping("actions", actions).items()
+        }
+        if not times:
+            raise ConfigError("a schedule needs at least one time")
+        self._times = np.array(sorted(times))
+        self._actions = np.array([times[time] for time in self._times])
+        self._start = _seconds(start)
+
+    def _prepare(self) -> None:
+        self._limits()
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        steps = getattr(self, "_steps", None)
+        kept = np.zeros(self.count) if steps is None or len(steps) != self.count else steps
+        self._steps = np.where(mask, 0.0, kept)
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        time = (self._start + self._steps * self.time_step) % _DAY
+        self._steps = self._steps + 1
+        return self._actions[np.searchsorted(self._times, time, side="right") - 1]
+
+
+def _seconds(time: Any) -> float:
+    """The seconds since midnight of a time such as "06:30"."""
+    match = re.fullmatch(r"(\d\d?):(\d\d)(?::(\d\d))?", str(time))
+    hours, minutes, seconds = (int(part or 0) for part in match.groups()) if match else (99, 0, 0)
+    if hours > 23 or minutes > 59 or seconds > 59:
+        raise ConfigError(f'expected a time of day such as "06:30", got {shown(time)}')
+    return 3600.0 * hours + 60.0 * minutes + seconds

@@ -1,0 +1,198 @@
+"""The comparison of programs with the hooks that they were made of, on random states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import prod
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.single.trace import SingleTask, kind_of
+from fmugym.task.readings import Readings, reading
+from fmugym.task.step import conclude
+from fmugym.task.values import EpisodeVariables
+from fmugym.vector.contents import borrowed
+from fmugym.vector.hooks.check import sample_of
+from fmugym.vector.hooks.program import Row, UntraceableError, evaluate
+
+__all__ = ["require_equal"]
+
+_COUNT: Final = 48
+
+_SCALES: Final = (0.1, 0.1, 1.0, 1.0, 10.0, 300.0)
+"""How far the states are from the present one; the last ones may reach limits."""
+
+
+def require_equal(env: FMUEnv, task: SingleTask) -> None:
+    """Run programs and hooks on random states, and compare all results to the last bit.
+
+    States in which a hook raises an exception are left out. NaNs are equal.
+
+    Args:
+        env: The environment, in an episode; its FMU is not used.
+        task: The programs.
+
+    Raises:
+        UntraceableError: If a result differs, or the hooks raise in every state.
+    """
+    with np.errstate(all="ignore"), borrowed(env):
+        comparison = _Comparison(env, task)
+        compared = sum(map(comparison.compare, range(_COUNT)))
+    if not compared:
+        raise UntraceableError("the hooks raise an exception in all states that were tried")
+
+
+class _Comparison:
+    def __init__(self, env: FMUEnv, task: SingleTask) -> None:
+        self._env, self._task = env, task
+        rng = np.random.default_rng(0)
+        scales = np.resize(_SCALES, _COUNT)
+        width, now = len(env.out), np.array(env._values)[:, None]
+        noise = rng.normal(size=(2 * width, _COUNT)) * scales
+        self._kept, self._outputs = (now + (1 + abs(now)) * part for part in np.split(noise, 2))
+        self._last_inputs = rng.normal(size=(len(env.inputs), _COUNT)) * scales
+        self._wanted = np.full_like(self._last_inputs, np.nan)
+        self._inputs = self._last_inputs.copy()
+        self._counts = rng.integers(0, 1000, _COUNT)
+        actions = [sample_of(env.action_space, rng) for _ in range(2 * _COUNT)]
+        self._actions = np.array(actions[:_COUNT]), np.array(actions[_COUNT:])
+        self._before = {name: self._drawn(name, rng) for name in task.variables}
+        self._after = {name: values.copy() for name, values in self._before.items()}
+        self._run()
+
+    def _drawn(self, name: str, rng: np.random.Generator) -> npt.NDArray[Any]:
+        """A row for each element of an episode variable."""
+        kind = self._task.variables[name]
+        values = 3 * rng.normal(size=(prod(kind.shape or ()), _COUNT))
+        return values > 0 if kind.dtype == np.bool_ else values.astype(kind.dtype)
+
+    def _run(self) -> None:
+        """Run the programs on all states at once."""
+        task, (actions, before) = self._task, self._actions
+        evaluate(task.inputs, self._find_before, (actions, before))
+        self._inputs = self._wanted.copy()
+        seen = [np.zeros((_COUNT, *array.shape), array.dtype) for array in task.seen]
+        self._seen = tuple(seen)
+        self._counts = self._counts + 1
+        try:
+            self._judged = evaluate(task.judgement, self._find, (actions, before), self._seen)
+        except IndexError:
+            raise UntraceableError("an index is outside of its table in a random state") from None
+
+    def _find_before(self, row: Row) -> Any:
+        """The values of a row before the step, when the inputs are made."""
+        if row[0] == "output":
+            index: Any = row[1]
+            return self._kept[index]
+        return self._find(row)
+
+    def _find(self, row: Row) -> Any:
+        kind, *rest = row
+        index: Any = rest[-1] if rest else 0
+        name: Any = rest[0] if rest else None
+        match kind:
+            case "output":
+                return self._outputs[index]
+            case "kept":
+                return self._kept[index]
+            case "input":
+                return self._inputs[index]
+            case "wanted":
+                return self._wanted[index]
+            case "parameter":
+                return np.full(_COUNT, self._env.parameters[name])
+            case "step_count":
+                return self._counts
+        rows = self._after if kind == "variable" else self._before
+        return rows[name][index]
+
+    def compare(self, index: int) -> bool:
+        """Compare one state; return whether the hooks have given a result there."""
+        env = self._env
+        with reading(env, self._readings(index)):
+            try:
+                inputs = env._input_writer.write(
+                    env._get_inputs(), env.action, np.zeros(len(env.inputs))
+                )
+            except Exception:  # hooks may raise anything
+                return False
+            _require("_get_inputs", self._wanted[:, index], np.array(inputs))
+            self._place_after(index, inputs)
+            try:
+                observed = None if self._task.seen else ()
+                result = conclude(env, env._form, False, False, observed)
+            except Exception:  # as above
+                return False
+            self._compare_results(index, result)
+        return True
+
+    def _readings(self, index: int) -> Readings:
+        env = self._env
+        values = tuple(self._kept[:, index].tolist())
+        variables = EpisodeVariables(env.variables)
+        for name, rows in self._before.items():
+            variables[name] = self._value(name, rows[:, index])
+        state = values[: env._output_count]
+        action, before = (self._action(actions[index]) for actions in self._actions)
+        present = Readings.of(env)
+        return Readings(
+            values=values,
+            out=env.out,
+            state=state,
+            previous_state=state,
+            inputs=tuple(self._last_inputs[:, index].tolist()),
+            action=action,
+            previous_action=before,
+            step_count=int(self._counts[index]) - 1,
+            done=False,
+            after_end=False,
+            parameters=present.parameters,
+            variables=variables,
+        )
+
+    def _action(self, action: Any) -> Any:
+        if self._task.action_type is int:
+            return int(action)
+        return action.copy()
+
+    def _value(self, name: str, value: Any) -> Any:
+        kind = self._task.variables[name]
+        if kind.shape is not None:
+            return value.reshape(kind.shape)
+        return kind.python(value[0]) if kind.python else value[0]
+
+    def _place_after(self, index: int, inputs: tuple[float, ...]) -> None:
+        """Let the hooks read what they read after the FMU's step."""
+        env = self._env
+        env.inputs, env.previous_state = inputs, env.state
+        env._values = tuple(self._outputs[:, index].tolist())
+        env.state = env._values[: env._output_count]
+        env.step_count += 1
+
+    def _compare_results(self, index: int, result: tuple[Any, ...]) -> None:
+        observation, reward, done, truncated = result
+        expected = {"_is_done": done, "_is_truncated": truncated, "_reward_policy": reward}
+        for (hook, value), row in zip(expected.items(), self._judged, strict=True):
+            _require(hook, row[index], np.asarray(value, row.dtype))
+        for array, description in zip(self._seen, self._task.seen, strict=True):
+            *_, key = description.path
+            part = observation[key] if isinstance(observation, Mapping) else observation
+            _require("_get_observation", array[index], part)
+        for name in self._task.updated:
+            value = self._env.variables[name]
+            if kind_of(value) != self._task.variables[name]:
+                raise UntraceableError(f"_update gives {name!r} different types")
+            _require("_update", self._after[name][:, index], np.asarray(value).reshape(-1))
+
+
+def _require(hook: str, value: Any, expected: Any) -> None:
+    if value.dtype == expected.dtype and value.shape == expected.shape:
+        numbers = value == value
+        same = np.array_equal(numbers, expected == expected)
+        bits = value[numbers].tobytes() == expected[numbers].tobytes()
+        if same and bits:
+            return
+    raise UntraceableError(f"the program gives other values than {hook}")

@@ -1,0 +1,138 @@
+"""What a step gives of the values after each of its substeps, in every pool."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import FMU, ConfigError, FMUVectorEnv, bundled_fmu
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.spec import SAMPLINGS
+from fmugym.trial.opening import make_pool
+
+SUBSTEPS, STEP = 5, 0.1
+OUTPUTS = ("x", "x_dot", "theta", "theta_dot", "f")
+POOLS = {
+    "python": {"backend": "python"},
+    "native": {"backend": "native"},
+    "process": {"isolation": "process", "workers": 1},
+}
+
+
+@pytest.fixture(params=POOLS)
+def make(request):
+    if request.param == "native" and not has_native_pool():
+        pytest.skip("the C extension was not built")
+    made = []
+
+    def make(**spec):
+        fmu = FMU(bundled_fmu("CartPole"))
+        outputs = tuple(map(fmu.variable, OUTPUTS))
+        spec = PoolSpec((fmu.variable("f"),), outputs, **spec)
+        made.append(make_pool(fmu, spec, 3, logging.getLogger("test"), **POOLS[request.param]))
+        return made[-1]
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+def rollout(pool, inputs):
+    start = FMU(bundled_fmu("CartPole")).variable("phi_0")
+    first = pool.reset((start,), np.array([[0.1, -0.2, 0.3]]))[0].copy()
+    results = []
+    for row in inputs:
+        outputs, statuses = pool.step(row)
+        assert not statuses.any()
+        results.append(outputs.copy())
+    return first, np.array(results)
+
+
+def expected(fine):
+    """By numpy, of the values after each substep, shape (steps, substeps, outputs, N)."""
+    parts = [
+        fine[:, -1, 0],
+        np.add.accumulate(fine[:, :, 1], axis=1)[:, -1] / SUBSTEPS,
+        np.add.accumulate(fine[:, :, 2], axis=1)[:, -1] * (STEP / SUBSTEPS),
+        fine[:, :, 3].min(axis=1),
+        fine[:, :, 4].max(axis=1),
+    ]
+    return np.stack(parts, axis=1)
+
+
+def test_a_step_gives_what_its_substeps_give(make):
+    inputs = np.random.default_rng(0).uniform(-5, 5, (8, 1, 3))
+    pool = make(time_step=STEP, substeps=SUBSTEPS, samplings=SAMPLINGS)
+    fine = make(time_step=STEP / SUBSTEPS)
+    for _ in range(3):  # the third time, an episode may begin with a saved state
+        first, results = rollout(pool, inputs)
+        first_of_fine, values = rollout(fine, np.repeat(inputs, SUBSTEPS, axis=0))
+        np.testing.assert_array_equal(first[[0, 1, 3, 4]], first_of_fine[[0, 1, 3, 4]])
+        np.testing.assert_array_equal(first[2], 0.0)
+        values = values.reshape(8, SUBSTEPS, len(OUTPUTS), 3)
+        np.testing.assert_array_equal(results, expected(values))
+
+
+def test_an_integral_over_one_substep(make):
+    pool = make(time_step=0.1, samplings=("last", "integral", "last", "last", "last"))
+    plain = make(time_step=0.1)
+    inputs = np.full((2, 1, 3), 2.0)
+    results, values = rollout(pool, inputs)[1], rollout(plain, inputs)[1]
+    np.testing.assert_array_equal(results[:, 1], values[:, 1] * 0.1)
+    np.testing.assert_array_equal(results[:, 0], values[:, 0])
+
+
+class Cart(fmugym.FMUEnv):
+    def __init__(self, backend=None, **changes):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot"],
+            "monitor_names": "theta",
+            "time_step": STEP,
+            "substeps": SUBSTEPS,
+            "samplings": {"x_dot": "mean", "theta": "max"},
+        }
+        super().__init__(bundled_fmu("CartPole"), config | changes, backend=backend)
+
+    def _is_done(self):
+        return self.out["theta"] > 3.0
+
+    def _reward_policy(self):
+        return -abs(self.out["x_dot"])
+
+
+def test_one_environment_equals_those_of_a_vector():
+    env, envs = Cart(), FMUVectorEnv(Cart, 2, hooks="compiled")
+    np.testing.assert_array_equal(env.reset(seed=1)[0], envs.reset(seed=1)[0][0])
+    for action in np.linspace(-1, 1, 6, dtype=np.float32):
+        single = env.step([action])
+        results = envs.step(np.full((2, 1), action))
+        for one, many in zip(single[:4], results[:4], strict=True):
+            np.testing.assert_array_equal(one, many[0])
+    env.close()
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("samplings", "fact"), [({"x": "avg"}, "'avg'"), ({"y": "mean"}, "'y'"), (["x"], "dict")]
+)
+def test_mistakes_are_named(samplings, fact):
+    with pytest.raises(ConfigError, match=fact):
+        Cart(samplings=samplings)
+
+
+class Rig:
+    def reset(self, values):
+        return dict.fromkeys(OUTPUTS, 0.0)
+
+    def step(self, inputs):
+        return dict.fromkeys(OUTPUTS, 0.0)
+
+    def stop(self):
+        """Nothing moves."""
+
+
+def test_a_rig_has_no_substeps():
+    with pytest.raises(ConfigError, match="samplings"):
+        Cart(backend=Rig())

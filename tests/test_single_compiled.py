@@ -1,0 +1,534 @@
+"""A single environment with compiled hooks equals the same one with its hooks in Python."""
+
+import copy
+import logging
+import math
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from fmu_tools import PlainEnv, probe_config
+from gymnasium.utils.env_checker import check_env
+from hypothesis import HealthCheck, Phase, given, settings
+from test_vector_program import EXPRESSIONS, hook_of
+from test_vector_tasks import Delayed, Goal, Tables, Tracking
+from vector_tools import Drawing
+
+import fmugym
+from fmugym import ConfigError, SimulationError, Uniform
+from fmugym.pool import has_native_pool
+from fmugym.single.compare import require_equal
+from fmugym.single.trace import trace_single
+from fmugym.task.readings import READINGS
+from fmugym.testing import check_fmu_env
+from fmugym.vector.hooks.program import UntraceableError
+
+pytestmark = pytest.mark.skipif(
+    not has_native_pool(), reason="hooks are compiled for the native pool"
+)
+
+READ = (*READINGS, "time")
+
+
+def same(first, second):
+    """Whether two values have the same types and bits; NaNs are equal."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
+    if isinstance(first, tuple):
+        return len(first) == len(second) and all(map(same, first, second))
+    if type(first) is not type(second):
+        return False
+    if isinstance(first, np.ndarray):
+        equal = first.dtype == second.dtype and first.shape == second.shape
+        return equal and np.ascontiguousarray(first).tobytes() == second.tobytes()
+    return repr(first) == repr(second)
+
+
+def require_readings(one, other):
+    for name in READ:
+        first, second = getattr(one, name), getattr(other, name)
+        if name in ("out", "parameters", "variables"):
+            first, second = dict(first), dict(second)
+        assert same(first, second), (name, first, second)
+
+
+def with_hooks(cls, hooks, *args, **keywords):
+    """An environment of a class whose constructor does not pass arguments on."""
+    env = cls(*args, **keywords)
+    env._way = hooks
+    return env
+
+
+def require_same(make, steps=250, reads=5, options=({},)):
+    """Play episodes side by side; return how many steps were compiled, and how many ended."""
+    one, other = make("compiled"), make("python")
+    compiled = ended = 0
+    assert same(one.reset(seed=5), other.reset(seed=5))
+    one.action_space.seed(1)
+    for index in range(steps):
+        action = one.action_space.sample()
+        with np.errstate(all="ignore"):
+            first, second = one.step(action), other.step(action)
+        assert same(first, second), (index, first, second)
+        compiled += one._play is not None
+        if index % reads == 0:
+            require_readings(one, other)
+        if first[2] or first[3]:
+            require_readings(one, other)
+            ended += 1
+            chosen = options[ended % len(options)]
+            assert same(one.reset(options=chosen), other.reset(options=chosen))
+            require_readings(one, other)
+    one.close()
+    other.close()
+    return compiled, ended
+
+
+@pytest.mark.parametrize("name", ["CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum"])
+def test_bundled_environments(name):
+    def make(hooks):
+        env_id = f"fmugym/{name}-v0"
+        return gym.make(
+            env_id, max_episode_steps=-1, hooks=hooks, disable_env_checker=True
+        ).unwrapped
+
+    compiled, _ = require_same(make)
+    assert compiled > 180
+
+
+class Acting(Drawing):
+    """Actions of float32 meet floats of Python, which adapt to them."""
+
+    def _get_action_space(self):
+        return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def _get_inputs(self):
+        return 0.01 * self.action[0] + 0.003 * self.state[0]
+
+    def _is_done(self):
+        return (self.state[0] > 0.5) | (self.step_count > 30)
+
+    def _reward_policy(self):
+        return self.action[1] * self.state[0] - self.state[1] ** 2 + self.action[0] ** 3
+
+
+class Counting(Drawing):
+    """Episode variables of several types, and truths that are added."""
+
+    def __init__(self):
+        super().__init__(
+            episode_variables={"count": 0, "high": False, "target": Uniform(-1.0, 1.0), "sum": 0.0},
+            max_episode_steps=12,
+        )
+
+    def _update(self):
+        is_high = self.state[0] > self.variables["target"]
+        self.variables["count"] += 1
+        self.variables["high"] = is_high
+        self.variables["sum"] = self.variables["sum"] / 2 + self.state[1] // 0.1
+
+    def _is_done(self):
+        return self.variables["high"] & (self.variables["count"] > 5)
+
+    def _reward_policy(self):
+        return (self.state[0] > 0) + (self.state[1] > 0) - self.variables["count"] % 3
+
+
+class Telling(Counting):
+    """Has infos, and reads everything in them."""
+
+    def _get_info(self):
+        return {"count": self.variables["count"], "action": self.action, "time": self.time}
+
+
+TASKS = [Tracking, Delayed, Goal, Tables, Acting, Counting, Telling]
+
+
+@pytest.mark.parametrize("cls", TASKS)
+def test_tasks_of_users(cls):
+    compiled, ended = require_same(lambda hooks: with_hooks(cls, hooks), steps=120)
+    assert ended > 1
+    assert compiled > 60
+
+
+def test_overridden_parameters():
+    options = ({}, {"model_parameters": {"theta_0": 0.1}}, {"x_init": 0.2}, {"y_init": 0.3})
+
+    def make(hooks):
+        return gym.make("fmugym/Pendulum-v0", max_episode_steps=-1, hooks=hooks).unwrapped
+
+    one, other = make("compiled"), make("python")
+    for index, chosen in enumerate(2 * options):
+        assert same(one.reset(seed=index, options=chosen), other.reset(seed=index, options=chosen))
+        for value in np.linspace(-3.0, 3.0, 7, dtype=np.float32):
+            assert same(one.step(np.array([value])), other.step(np.array([value])))
+            require_readings(one, other)
+    one.close()
+    other.close()
+
+
+def compiled_cart(**options):
+    env = fmugym.envs.CartPoleEnv(hooks="compiled", **options)
+    env.reset(seed=0)
+    env.step(0)
+    assert env._play is not None
+    return env
+
+
+class TestAttributes:
+    def test_values_set_in_an_episode_are_noticed(self):
+        one, other = compiled_cart(), fmugym.envs.CartPoleEnv(hooks="python")
+        other.reset(seed=0)
+        other.step(0)
+        for env in (one, other):
+            env.force_mag = 3.0
+        for _ in range(5):
+            assert same(one.step(1), other.step(1))
+        for env in (one, other):
+            env.x_threshold = 1e-9
+        assert same(one.step(1), other.step(1))
+        assert one.done
+
+    def test_hooks_set_in_an_episode_are_noticed(self):
+        env = compiled_cart()
+        env._reward_policy = lambda: 7.0
+        assert env.step(0)[1] == 7.0
+        assert env.step(0)[1] == 7.0
+
+    def test_changes_inside_of_arrays_and_lists_are_noticed(self):
+        class Weighted(Drawing):
+            def __init__(self):
+                self.weights, self.gains = np.array([1.0, 2.0]), [3.0]
+                super().__init__(max_episode_steps=50)
+
+            def _is_done(self):
+                return self.state[0] > 5.0
+
+            def _reward_policy(self):
+                return np.sum(self.weights * np.array(self.state)) * self.gains[0]
+
+        def make(hooks):
+            env = with_hooks(Weighted, hooks)
+            env.reset(seed=1)
+            env.step(env.action_space.sample() * 0)
+            return env
+
+        one, other = make("compiled"), make("python")
+        assert one._play is not None
+        for change in ("weights", "gains", "weights"):
+            for env in (one, other):
+                getattr(env, change)[0] += 1.5
+            for _ in range(3):
+                assert same(one.step(one._no_action), other.step(one._no_action))
+
+    def test_readings_may_be_set(self):
+        one, other = (with_hooks(Counting, hooks) for hooks in ("compiled", "python"))
+        action = np.zeros(1, np.float32)
+        for env in (one, other):
+            env.reset(seed=2)
+            env.step(action)
+            env.variables["target"] = 0.25
+            env.step_count = 3
+        for _ in range(3):
+            assert same(one.step(action), other.step(action))
+            require_readings(one, other)
+
+    def test_what_was_read_is_kept_by_nobody(self):
+        env = compiled_cart()
+        state, before = env.state, env.previous_state
+        env.step(1)
+        assert env.previous_state == state != before
+
+    def test_without_a_reset_there_are_no_readings(self):
+        class Early(fmugym.envs.CartPoleEnv):
+            def __init__(self):
+                assert not hasattr(self, "state")
+                super().__init__()
+
+        Early().close()
+
+
+class TestActions:
+    @pytest.mark.parametrize("bad", [2, -1, None, "1", 0.5, np.array([1])])
+    def test_bad_actions_change_nothing(self, bad):
+        env = compiled_cart()
+        before = env.state, env.step_count, env.action
+        with pytest.raises(ConfigError, match="is not in Discrete"):
+            env.step(bad)
+        assert (env.state, env.step_count, env.action) == before
+        assert env.step(1)[2] is False
+
+    def test_actions_of_other_types_are_taken_as_in_python(self):
+        one, other = compiled_cart(), fmugym.envs.CartPoleEnv(hooks="python")
+        other.reset(seed=0)
+        other.step(0)
+        for action in (1, np.int64(0), np.int32(1), True, np.array(1), 0, np.uint8(1), 1):
+            assert same(one.step(action), other.step(action))
+            require_readings(one, other)
+
+    def test_arrays_of_other_types(self):
+        one, other = (fmugym.envs.PendulumEnv(hooks=way) for way in ("compiled", "python"))
+        actions = [
+            *(np.array([0.3], np.float32), np.array([0.3]), [0.3], np.array([1], np.int8)),
+            *(np.array([0.3, 0.2], np.float32)[::2], np.float32([np.inf]), np.float32([0.1])),
+        ]
+        for env in (one, other):
+            env.reset(seed=4)
+        for action in actions:
+            assert same(one.step(action), other.step(action))
+            require_readings(one, other)
+        with pytest.raises(ConfigError, match="NaN"):
+            one.step(np.array([np.nan], np.float32))
+        assert same(one.step(actions[0]), other.step(actions[0]))
+
+
+class Failing(PlainEnv):
+    """Divides by zero at a certain sum, and may make what is not finite."""
+
+    def _reward_policy(self):
+        return self.state[0] / (self.step_count - 3)
+
+
+class TestFaults:
+    def make(self, probe, hooks, cls=PlainEnv, **changes):
+        env = cls(probe(), probe_config(**changes), log_level=logging.ERROR, hooks=hooks)
+        env.reset(seed=0)
+        return env
+
+    def both(self, probe, actions, cls=PlainEnv, **changes):
+        envs = [self.make(probe, hooks, cls, **changes) for hooks in ("compiled", "python")]
+        results = []
+        for env in envs:
+            outcome = []
+            for action in actions:
+                try:
+                    outcome.append(env.step(np.array([action])))
+                except Exception as error:
+                    outcome.append((type(error).__name__, str(error)))
+                    break
+            results.append(outcome)
+        require_readings(*envs)
+        for env in envs:
+            env.close()
+        return results
+
+    @pytest.mark.parametrize("policy", ["truncate", "terminate", "raise"])
+    @pytest.mark.parametrize("big", [1e308, 1e300])
+    def test_numbers_that_are_not_finite(self, probe, policy, big):
+        one, other = self.both(probe, [1.0, 2.0, big, big, big], on_fault=policy)
+        assert all(map(same, one, other))
+        assert len(one) == len(other)
+
+    def test_exceptions_of_hooks(self, probe):
+        one, other = self.both(probe, [1.0, 1.0, 1.0, 1.0], Failing)
+        assert all(map(same, one, other))
+        assert one[-1][0] == "ZeroDivisionError"
+
+    def test_inputs_that_are_not_finite(self, probe):
+        one, other = self.both(probe, [1.0, np.inf])
+        assert all(map(same, one, other))
+        assert one[-1][0] == "ConfigError"
+
+    def test_time_limits(self, probe):
+        one, other = self.both(probe, [1.0] * 4, max_episode_steps=4)
+        assert all(map(same, one, other))
+        assert one[-1][3] is True
+        assert one[-2][3] is False
+
+
+class TestWays:
+    def test_some_steps_come_before_compiling(self):
+        env = fmugym.envs.CartPoleEnv()
+        env.reset(seed=0)
+        compiled = []
+        for _ in range(1100):
+            result = env.step(env.action_space.sample())
+            compiled.append(env._play is not None)
+            if result[2]:
+                env.reset()
+        assert not any(compiled[:990])
+        assert sum(compiled[1000:]) > 80
+
+    def test_what_cannot_be_compiled_is_told_once(self, caplog):
+        class Branching(Drawing):
+            def _is_done(self):
+                return bool(self.state[0] > 0.5)
+
+        env = Branching()
+        env.reset(seed=0)
+        with caplog.at_level(logging.INFO):
+            for _ in range(1100):
+                if any(env.step(env.action_space.sample())[2:4]):
+                    env.reset()
+        texts = [
+            record.getMessage()
+            for record in caplog.records
+            if "compiled" in record.msg % record.args
+        ]
+        assert len(texts) == 1
+        assert "Branching" in texts[0]
+        assert "_is_done" in texts[0]
+
+    def test_compiled_is_an_error_where_it_is_not_possible(self):
+        class Overriding(fmugym.envs.CartPoleEnv):
+            def step(self, action):
+                return super().step(action)
+
+        env = Overriding(hooks="compiled")
+        with pytest.raises(ConfigError, match="step is overridden"):
+            env.reset(seed=0)
+        env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
+        with pytest.raises(ConfigError, match="pool"):
+            env.reset(seed=0)
+        env.close()
+
+    def test_names(self):
+        with pytest.raises(ConfigError, match="compiled"):
+            fmugym.envs.CartPoleEnv(hooks="compild")
+
+    @pytest.mark.parametrize(
+        "text", ["math.sin(self.state[0])", "max(self.state)", "self.filter(1)"]
+    )
+    def test_hooks_of_other_kinds_stay_in_python(self, text):
+        class Other(Drawing):
+            def __init__(self):
+                self.filter = lambda value: value
+                super().__init__()
+
+            def _is_done(self):
+                return self.state[0] > 0.5
+
+            _reward_policy = eval(f"lambda self: {text}", {"math": math})
+
+        compiled, _ = require_same(lambda hooks: with_hooks(Other, "auto"), steps=30)
+        assert compiled == 0
+        env = with_hooks(Other, "compiled")
+        env.reset(seed=0)
+        with pytest.raises(ConfigError, match="cannot be compiled"):
+            env.step(env._no_action)
+        env.close()
+
+
+class TestLife:
+    def test_copies_and_pickles_are_new_environments(self):
+        env = compiled_cart()
+        for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+            other.reset(seed=0)
+            assert other.step(0)[2] is False
+            other.close()
+        env.close()
+
+    def test_close(self):
+        env = compiled_cart()
+        state = env.state
+        env.close()
+        assert env.state == state
+        with pytest.raises(SimulationError, match="closed"):
+            env.step(0)
+
+    def test_steps_after_the_end(self):
+        env = compiled_cart()
+        while not env.step(1)[2]:
+            pass
+        with pytest.warns(UserWarning, match="after the end"):
+            assert env.step(1)[1] == 0.0
+        env.reset(seed=0)
+        assert env.step(1)[1] == 1.0
+
+    def test_draws_in_hooks_are_refused(self):
+        class Random(Drawing):
+            def _is_done(self):
+                return self.np_random.random() > 2
+
+        env = with_hooks(Random, "auto")
+        env.reset(seed=0)
+        with pytest.raises(SimulationError, match="random"):
+            env.step(env._no_action)
+        env.close()
+
+    def test_rendering(self):
+        one, other = (
+            fmugym.envs.PendulumEnv("rgb_array", hooks=hooks) for hooks in ("compiled", "python")
+        )
+        for env in (one, other):
+            env.reset(seed=1)
+            for _ in range(3):
+                env.step(np.array([1.0], np.float32))
+        assert one._play is not None
+        assert np.array_equal(one.render(), other.render())
+
+    def test_checkers(self):
+        env = fmugym.envs.PendulumEnv(hooks="compiled")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the action space is Gymnasium's own
+            check_env(env, skip_render_check=True)
+        check_fmu_env(compiled_cart())
+
+
+# Expressions
+
+PHASES = (Phase.explicit, Phase.reuse, Phase.generate)  # a smaller example takes minutes to find
+
+
+def expression_task(reward, observed, variable):
+    rewarded, seen, updated = map(hook_of, (reward, observed, variable))
+
+    class Generated(Drawing):
+        def __init__(self):
+            variables = {"memory": Uniform(-1.0, 1.0)}
+            super().__init__(episode_variables=variables, monitor_names=["theta_ddot"])
+
+        def _get_action_space(self):
+            return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+        def _get_inputs(self):
+            return 0.01 * self.action[0]
+
+        def _update(self):
+            self.variables["memory"] = updated(self)
+
+        def _is_done(self):
+            return self.state[0] > 0.8
+
+        def _get_observation_space(self):
+            return gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+        def _get_observation(self):
+            return np.array([seen(self), self.variables["memory"]], np.float32)
+
+        def _reward_policy(self):
+            return rewarded(self)
+
+    return Generated
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    phases=PHASES,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(EXPRESSIONS, EXPRESSIONS, EXPRESSIONS)
+def test_generated_expressions(reward, observed, variable):
+    """Whatever can be traced gives what Python gives."""
+    env = expression_task(reward, observed, variable)()
+    env.logger.setLevel(logging.ERROR)
+    action = np.zeros(2, np.float32)
+    try:
+        with np.errstate(all="ignore"):
+            env.reset(seed=0)
+            env.step(action)
+            env.step(action)
+    except Exception:
+        return  # Python refuses these types
+    try:
+        task = trace_single(env, action)
+    except UntraceableError:
+        return
+    finally:
+        env.close()
+    require_equal(env, task)
