@@ -385,14 +385,21 @@ class CompiledEngine(BatchEngine):
         horizon = len(actions)
         shape = horizon, self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
-        layout, seen = self._layout, self._layout.arrays_for(horizon)
+        seen = self._arrays_of_steps(horizon)
         self.has_moved = True
         troubled = self._pool.roll_out(
             np.ascontiguousarray(actions), seen, *judged, np.zeros(self._drawn_shape)
         )
         if troubled:
             return None
-        return seen if layout.divided is None else layout.divided(seen)[0], *judged
+        return seen if self._divided is None else self._divided(seen)[0], *judged
+
+    def _arrays_of_steps(self, horizon: int) -> Any:
+        """Make the arrays of many steps, with a first axis for the steps."""
+        arrays = self._new_arrays()
+        if isinstance(arrays, tuple):
+            return tuple([np.empty((horizon, *array.shape), array.dtype) for array in arrays])
+        return np.empty((horizon, *arrays.shape), arrays.dtype)
 
     def _completed(
         self, result: StepResult, resetting: MaskArray | None, started: MaskArray | None
@@ -551,13 +558,6 @@ class _Layout:
 
     def _stored(self) -> tuple[npt.NDArray[Any], ...]:
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
-
-    def arrays_for(self, steps: int) -> Any:
-        """The arrays of so many steps; they have a first axis for the steps."""
-        arrays = self.new_arrays()
-        if isinstance(arrays, tuple):
-            return tuple([np.empty((steps, *array.shape), array.dtype) for array in arrays])
-        return np.empty((steps, *arrays.shape), arrays.dtype)
 
     def _named(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         return dict(zip(self._names, arrays, strict=True)), {}
