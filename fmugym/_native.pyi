@@ -159,6 +159,7 @@ class Experiment(TypedDict):
     reloads: bool
     one_initialization: bool
     pace: tuple[float, int, int]
+    start_outputs: bytes | None
 
 class Variables(TypedDict):
     """What is set and read in each step, and the Strings that are set before initialization."""

@@ -63,6 +63,8 @@ typedef struct {
     int8_t *status;
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
     const Mark *mark; /* where a crash is noted, or NULL */
+    const char *start_outputs; /* doubles in the place of outputs that the FMU does not tell before
+                                * the first step, or NULL */
 } Settings;
 
 /* The health counters of each instance. fmugym/pool/health.py lists their names in this order. */

@@ -90,6 +90,13 @@ class FreshInstance:
         """The values of variables as floats."""
         return [self._get(self._variables[name]) for name in names]
 
+    def get_at_start(self, names):
+        """The same before the first step; start values if the FMU cannot be read yet."""
+        try:
+            return self.get(names)
+        except FMICallException:
+            return [float(self._variables[name].start or 0.0) for name in names]
+
     def _get(self, variable):
         get = getattr(self._fmu, f"get{self._kind(variable)}")
         return float(get([variable.valueReference])[0])
@@ -145,7 +152,7 @@ def play(path, outputs, rows, step_size, start_values=None, **options):
         The outputs of the start and of each step; fewer if the FMU asked to stop.
     """
     with FreshInstance(path, start_values, **options) as instance:
-        results = [instance.get(outputs)]
+        results = [instance.get_at_start(outputs)]
         for number, row in enumerate(rows):
             instance.set(row)
             goes_on = instance.step(number, step_size)

@@ -146,6 +146,12 @@ QUIRKS = (
           "when the environment is closed)"),
     Quirk("needs its directory", "reads a file beside its library while that is loaded"),
     Quirk("no early reading", "returns Error if it is read before its initialization"),
+    Quirk(
+        "no reading before a step",
+        "returns Error if it is read before its first step (until then, outputs have the start "
+        "values of the model description)",
+        log="cannot be read before its first step",
+    ),
     Quirk("reads a table", "has `\\` in the names of its archive"),
 )  # fmt: skip
 

@@ -15,9 +15,10 @@ from gymnasium.envs.registration import EnvSpec
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
-from fmugym.declared.declarations import BUILT_IN
+from fmugym.declared.declarations import AGENT_KEYS, BUILT_IN, SETPOINTS
 from fmugym.declared.expressions import CONSTANTS
 from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.series import DATA_KEYS
 from fmugym.declared.task import KEYS
 from fmugym.declared.variables import VARIABLE_KEYS
 from fmugym.errors import TaskError
@@ -501,6 +502,8 @@ def merged(base, own):
     [
         ("Keys", KEYS),
         ("Variables", [*VARIABLE_KEYS]),
+        ("Agent", AGENT_KEYS),
+        ("Data and set points", [*DATA_KEYS, *SETPOINTS]),
         ("Expressions", [*FUNCTIONS, "previous", *BUILT_IN, *CONSTANTS]),
     ],
 )
@@ -508,7 +511,8 @@ def test_the_tables_of_the_documentation_are_complete(heading, names):
     text = (DOCS / "task-file.md").read_text(encoding="utf-8")
     part = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (`.+?`) \|", part, re.M)
-    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(names)
+    told = re.findall(r"`(?:\{ )?(\w+)(?: = \{?.*?)?`", " ".join(rows))
+    assert sorted(name for name in told if not name.isdigit()) == sorted(names)
 
 
 def test_the_id_needs_a_task():

@@ -6,8 +6,10 @@ table is in quirk_table.py and in docs/reliability.md.
 
 import contextlib
 import functools
+import logging
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import fresh
@@ -19,6 +21,7 @@ from quirk_table import OUTPUTS, QUIRKS
 
 import fmugym
 from fmugym.errors import ContractError
+from fmugym.pool.local import local_pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
@@ -180,6 +183,34 @@ def test_verdict(make_fmu, version, quirk, caplog):
     assert bool(warnings) == bool(quirk.log)
 
 
+@pytest.mark.parametrize("backend", ["native", "python"])
+def test_outputs_before_the_first_step_are_start_values(make_fmu, backend):
+    """In each episode, restored ones included; the model description may give other ones than 0."""
+    fmu = fmugym.FMU(make_fmu("no reading before a step"))
+    outputs = [replace(fmu.variable(name), start=start) for name, start in START_OUTPUTS.items()]
+    spec = PoolSpec((fmu.variable("u"),), tuple(outputs), STEP, blind_start=True)
+    spec = replace(spec, reset_method=ResetMethod.RESTORE)
+    pool = local_pool(fmu, spec, 2, logging.getLogger(), native=backend == "native")
+    for _ in range(4):
+        outputs, statuses = pool.reset((), np.zeros((0, 2)))
+        assert outputs.tolist() == [[0.75, 0.75], [0.0, 0.0]]
+        outputs, statuses = pool.step(np.ones((1, 2)))
+        assert outputs[1].tolist() == [1.0, 1.0]
+        assert not statuses.any()
+    pool.close()
+
+
+START_OUTPUTS = {"y": "0.75", "calls": None}
+
+
+@pytest.mark.parametrize("backend", ["native", "python"])
+def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu, backend):
+    env = QuirkEnv(make_fmu("no reading before a step"), way=backend, probe_timeout=None)
+    with pytest.raises(fmugym.SimulationError, match="reading the outputs returned Error"):
+        env.reset()
+    env.close()
+
+
 class HiddenEnv(QuirkEnv):
     """Observes the output only, rounded."""
 
@@ -291,7 +322,7 @@ class TestVerdict:
         "text",
         [
             *("", "true", "[]", "{}", "null", '{"format": 1}', "[" * 100_000, "\0", "NaN"),
-            Verdict().to_text().replace('"format": 2', '"format": 1'),
+            Verdict().to_text().replace('"format": 3', '"format": 2'),
             Verdict().to_text().replace("false", '"no"'),
         ],
     )

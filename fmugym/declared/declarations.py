@@ -12,6 +12,8 @@ from fmugym.archive.description import ModelDescription
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.quantities import duration
+from fmugym.declared.series import Series, read_data, read_schedule
 from fmugym.declared.variables import (
     Record,
     Records,
@@ -20,10 +22,13 @@ from fmugym.declared.variables import (
     start_value,
 )
 
-__all__ = ["BUILT_IN", "Declarations", "Memory", "Term"]
+__all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term"]
 
-BUILT_IN: Final = ("time", "step", "dt", "dt_h", "done")
+BUILT_IN: Final = ("time", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
+
+AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescale", "normalize"),)
+"""The keys of the agent."""
 
 _RESERVED: Final = frozenset({*BUILT_IN, *CONSTANTS, *FUNCTIONS, "previous"})
 
@@ -83,6 +88,7 @@ class Declarations:
         parameters: Parameters and start values by alias: the record, and a value or distribution in
             the unit of the FMU.
         memory, derived: What the task remembers and names, by name.
+        series: Data and schedules by name.
         actions: The variables that the agent writes.
         inputs: Inputs that expressions write, by alias.
         observed: The names that the agent sees, and where they stand.
@@ -95,6 +101,7 @@ class Declarations:
     parameters: dict[str, tuple[Record, Any]] = field(init=False)
     memory: dict[str, Memory] = field(init=False)
     derived: dict[str, Derived] = field(init=False)
+    series: dict[str, Series] = field(init=False)
     actions: list[Record] = field(init=False)
     inputs: dict[str, tuple[Record, Expression]] = field(init=False)
     observed: list[tuple[Entry, str]] = field(init=False)
@@ -110,10 +117,14 @@ class Declarations:
             ConfigError: If one has a mistake, or does not fit the FMU. The text says where.
         """
         declared = cls(root, Records(root, description))
+        _check_names(root)
         declared.memory = {e.name: _memory(e) for e in _section(root, "memory")}
         declared.derived = {e.name: _derived(e) for e in _section(root, "expressions")}
-        _check_names(root)
+        declared.series = {e.name: read_data(e) for e in _section(root, "data")}
+        for entry in _section(root, "setpoints"):
+            declared._add_setpoint(entry)
         declared.parameters = dict(declared._read_parameters())
+        root.required("agent").table(AGENT_KEYS)
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
         declared.observed = list(declared._read_observed())
@@ -126,7 +137,7 @@ class Declarations:
     @property
     def own_names(self) -> list[str]:
         """The names that are not those of variables."""
-        return [*self.memory, *self.derived]
+        return [*self.memory, *self.derived, *self.series]
 
     @property
     def has_reward_terms(self) -> bool:
@@ -138,6 +149,20 @@ class Declarations:
         """The aliases of the FMU's inputs, in their order."""
         of_actions = [record.alias for record in self.actions if record.variable is not None]
         return of_actions + list(self.inputs)
+
+    @property
+    def remembered(self) -> list[str]:
+        """The names of which the agent sees the history."""
+        history = self.root.child("agent").child("history")
+        if history.value is None:
+            return []
+        history.table(("of", "length"))
+        names = history.required("of")
+        entries = [names] if isinstance(names.value, str) else names.elements()
+        for entry in entries:
+            if entry.text() not in self.own_names:
+                self.records.find(entry, entry.text(), "variable", self.own_names)
+        return [entry.text() for entry in entries]
 
     @property
     def expressions(self) -> list[Expression]:
@@ -161,6 +186,8 @@ class Declarations:
 
     def limits_of(self, name: str) -> Limits:
         """The limits of something that the agent observes."""
+        if name in self.series:
+            return self.series[name].low, self.series[name].high
         if name in self.memory:
             return self.memory[name].limits
         if name in self.derived:
@@ -174,9 +201,43 @@ class Declarations:
         Raises:
             ConfigError: If it is missing.
         """
-        agent = self.root.required("agent")
-        agent.table(("actions", "observations"))
-        return agent.required(key)
+        return self.root.required("agent").required(key)
+
+    def option(self, key: str) -> bool:
+        """Whether an option of the agent is set."""
+        entry = self.root.child("agent").child(key)
+        return entry.value is not None and entry.flag()
+
+    def _add_setpoint(self, entry: Entry) -> None:
+        """Add a set point in the form of what the task remembers, a schedule or an expression."""
+        is_table = isinstance(entry.value, Mapping) and "distribution" not in entry.value
+        kinds = [kind for kind in SETPOINTS if is_table and kind in entry.value]
+        if not is_table:
+            self.memory[entry.name] = _memory(entry)
+            return
+        entry.table((*SETPOINTS, "min", "max"))
+        if len(kinds) != 1:
+            raise entry.error(f"give one of {', '.join(SETPOINTS)}")
+        if kinds[0] == "value":
+            start = number_or_distribution(entry.child("value"))
+            self.memory[entry.name] = Memory(entry, start, None, _limits_of(entry))
+        elif kinds[0] == "schedule":
+            self.series[entry.name] = read_schedule(entry.child("schedule"))
+        else:
+            self._add_curve(entry, kinds[0])
+
+    def _add_curve(self, entry: Entry, kind: str) -> None:
+        """Add a curve over the time since the reset; its numbers may be drawn in each episode."""
+        name, (formula, defaults) = entry.name, _CURVES[kind]
+        table = entry.child(kind).table(defaults)
+        for key, default in defaults.items():
+            if key not in table and default is None:
+                raise entry.child(kind).error(f"the key {key!r} is missing")
+            value = _of_curve(table[key]) if key in table else default
+            self.memory[f"{name}_{key}"] = Memory(entry, value, None, (-np.inf, np.inf))
+        names = {key: f"{name}_{key}" for key in defaults}
+        expression = Expression.parse(formula.format(**names))
+        self.derived[name] = Derived(entry, expression, _limits_of(entry))
 
     def _listed(self, key: str) -> list[Entry]:
         """The names in a list of the agent; a bare name stands for one."""
@@ -211,6 +272,12 @@ class Declarations:
         return actions
 
     def _read_inputs(self) -> Iterator[tuple[str, tuple[Record, Expression]]]:
+        for name, series in self.series.items():
+            target = series.entry.child("input")
+            if target.value is not None:
+                unit = series.entry.child("unit")
+                record = self.records.input_of(target, None if unit.value is None else unit.text())
+                yield record.alias, (record, Expression.parse(name))
         for entry in _section(self.root, "inputs"):
             record = self.records.find(entry, entry.name, "input")
             if record in self.actions and record.variable is not None:
@@ -226,6 +293,31 @@ class Declarations:
                 if record not in self.actions:
                     self.records.check_output(entry, name)
             yield entry, name
+
+
+SETPOINTS: Final = ("value", "schedule", "ramp", "sine")
+"""The kinds of set points."""
+
+_CURVES: Final[Mapping[str, tuple[str, dict[str, float | None]]]] = {
+    "ramp": (
+        "{from} + ({to} - {from}) * clip((elapsed - {begin}) / {duration}, 0, 1)",
+        {"from": None, "to": None, "begin": 0.0, "duration": None},
+    ),
+    "sine": (
+        "{mean} + {amplitude} * sin(2 * pi * elapsed / {period} + {phase})",
+        {"mean": 0.0, "amplitude": None, "period": None, "phase": 0.0},
+    ),
+}
+"""Formulas of set points that follow a curve, and the defaults of their numbers."""
+
+_TIMES_OF_CURVES: Final = ("begin", "duration", "period")
+
+
+def _of_curve(entry: Entry) -> Any:
+    """A number of a curve, which may be a duration, or a distribution."""
+    if entry.name in _TIMES_OF_CURVES and not isinstance(entry.value, Mapping):
+        return entry.check(duration)
+    return number_or_distribution(entry)
 
 
 def _section(root: Entry, name: str) -> list[Entry]:
@@ -259,7 +351,7 @@ def _derived(entry: Entry) -> Derived:
 def _check_names(root: Entry) -> None:
     """A name must mean one thing. Aliases may hide names of the FMU."""
     seen: set[str] = set()
-    for section in ("variables", "memory", "expressions"):
+    for section in ("variables", "memory", "expressions", "data", "setpoints"):
         for entry in _section(root, section):
             if entry.name in seen:
                 raise entry.error(f"the name {entry.name!r} is given twice")

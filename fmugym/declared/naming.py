@@ -23,9 +23,17 @@ class Moment(Enum):
     BEFORE = "before the FMU steps"
     AFTER = "after the FMU has stepped"
     JUDGED = "when it is known whether the task has ended"
+    SEEN = "when the agent observes, between two steps"
+    FORECAST = "at a later time, which only functions of time know"
 
 
 _SECONDS_PER_HOUR: Final = 3600.0
+
+_JUST: Final = 1e-6
+"""Values that hold until the next one are looked up this part of a step after its beginning.
+
+So the rounding of times does not matter.
+"""
 
 
 class Naming:
@@ -44,18 +52,21 @@ class Naming:
     def __init__(self, declared: Declarations, time_step: float) -> None:
         self._declared, self._time_step = declared, time_step
         self._open: list[str] = []
+        self._ahead = 0.0
         self.constants: dict[str, Any] = {}
         self.outputs, self.monitors = self._read_names()
 
     def _read_names(self) -> tuple[list[str], list[str]]:
         """Observed variables come first, and next those whose previous values are needed."""
         declared, expressions = self._declared, self._declared.expressions
-        observed = [name for _, name in declared.observed]
+        observed = [name for _, name in declared.observed] + declared.remembered
         previous = sorted(set().union(*(e.previous_names for e in expressions)))
         used = sorted(set().union(*(e.names for e in expressions)))
         wanted = dict.fromkeys(filter(declared.is_output, observed + previous))
         others = [name for name in used if declared.is_output(name) and name not in wanted]
         self._check_distinct([*wanted, *others])
+        if not wanted and not others:
+            raise declared.agent("observations").error("the task reads no variable of the FMU")
         return (list(wanted), others) if wanted else (others, [])
 
     def _check_distinct(self, names: list[str]) -> None:
@@ -96,18 +107,59 @@ class Naming:
         if name in BUILT_IN:
             return self._built_in(name, moment)
         if name in declared.memory:
-            return Code(f"env.variables[{name!r}]")
+            return self._code_of_memory(name, moment)
+        if name in declared.series:
+            return Code(self._code_of_series(name, moment))
         if name in declared.derived:
             return self._code_of_derived(name, moment)
         record = declared.records.get(name)
         return None if record is None else Code(self._code_of_record(name, record, moment))
 
+    def forecast(self, entry: Entry, name: str, ahead: float) -> str:
+        """Code for the value of a name at another time.
+
+        Args:
+            entry: Where the forecast stands.
+            name: Something that depends on time only.
+            ahead: Seconds from now; negative for the past.
+
+        Raises:
+            ConfigError: If it depends on more than time.
+        """
+        self._ahead = ahead
+        try:
+            code = self.code_of(name, Moment.FORECAST)
+        finally:
+            self._ahead = 0.0
+        if code is None or code.value is not None:
+            raise entry.error(f"{name!r} is nothing that changes with time")
+        return code.number.text
+
+    def _code_of_memory(self, name: str, moment: Moment) -> Code:
+        memory = self._declared.memory[name]
+        if moment is Moment.FORECAST and memory.update is not None:
+            raise memory.entry.error(f"{name!r} depends on the course of the episode: no forecast")
+        return Code(f"env.variables[{name!r}]")
+
+    def _code_of_series(self, name: str, moment: Moment) -> str:
+        """The value now. One that holds for a while is, after a step, that of the step."""
+        series, shift = self._declared.series[name], self._ahead
+        if series.is_stepped:
+            is_over = moment in (Moment.AFTER, Moment.JUDGED)
+            shift += (_JUST - 1.0 if is_over else _JUST) * self._time_step
+        place = f"remainder((env.time + {shift - series.start!r}), {series.period!r})"
+        self.constants[f"times_{name}"] = series.times
+        self.constants[f"values_{name}"] = series.values
+        return f"interp({place}, times_{name}, values_{name})"
+
     def _built_in(self, name: str, moment: Moment) -> Code | None:
         match name:
             case "time":
-                return Code("env.time")
+                return Code(f"(env.time + {self._ahead!r})" if self._ahead else "env.time")
+            case "elapsed":
+                return Code(f"(env.step_count * {self._time_step!r} + {self._ahead!r})")
             case "step":
-                return Code("(env.step_count * 1.0)")
+                return Code(f"(env.step_count + {self._ahead / self._time_step!r})")
             case "done":
                 return Code("env.done", True) if moment is Moment.JUDGED else None
             case "dt":
@@ -129,12 +181,14 @@ class Naming:
 
     def _code_of_record(self, name: str, record: Record, moment: Moment) -> str:
         declared = self._declared
-        if name in declared.parameters:
-            return converted(record.conversion, f"env.parameters[{record.fmu_name!r}]")
+        if moment is Moment.FORECAST:
+            raise record.entry.error(f"there is no forecast of {name!r}: no function of time")
         if record in declared.actions and (moment is Moment.BEFORE or record.variable is None):
             return self.action_code(record, "action")
         if name in declared.written:
             return converted(record.conversion, f"env.inputs[{declared.written.index(name)}]")
+        if name in declared.parameters:
+            return converted(record.conversion, f"env.parameters[{record.fmu_name!r}]")
         place = [*self.outputs, *self.monitors].index(name)
         return converted(record.conversion, f"env._values[{place}]")
 
@@ -154,9 +208,38 @@ class Naming:
             record: The variable that the agent writes.
             attribute: ``"action"`` or ``"previous_action"``.
         """
-        place, is_one = self._declared.actions.index(record), len(self._declared.actions) == 1
+        declared = self._declared
+        place, is_one = declared.actions.index(record), len(declared.actions) == 1
         if not record.levels:
-            return f"float64(env.{attribute}[{place}])"
+            element = f"float64(env.{attribute}[{place}])"
+            return self._rescaled(record, element) if declared.option("rescale") else element
         self.constants[f"levels_{place}"] = np.array(record.levels)
         element = f"env.{attribute}" if is_one else f"env.{attribute}[{place}]"
         return f"take(levels_{place}, {element})"
+
+    def _rescaled(self, record: Record, element: str) -> str:
+        """Code that turns an action from -1 to 1 into one from the lowest to the highest value."""
+        middle, half = (record.low + record.high) / 2, (record.high - record.low) / 2
+        return f"({middle!r} + {half!r} * {element})"
+
+    def kept(self, name: str) -> tuple[str, str] | None:
+        """Code for what a history adds to a name's values in each step.
+
+        Returns:
+            Code for the value to add, and for the older values in the first step; None if there is
+            no history of this name.
+        """
+        declared, record = self._declared, self._declared.records.get(name)
+        if record is None or name not in [*self.outputs, *(one.alias for one in declared.actions)]:
+            return None
+        if record not in declared.actions:
+            before = self._previous_code_of(name)
+            return None if before is None else (before.text, before.text)
+        now = self._code_of_record(name, record, Moment.AFTER)
+        if record.variable is None:
+            return now, self.action_code(record, "previous_action")
+        if name in declared.parameters:
+            start = f"env.parameters[{record.fmu_name!r}]"
+        else:
+            start = f"(env.step_count * 0.0 + {record.variable.start_number!r})"
+        return now, converted(record.conversion, start)

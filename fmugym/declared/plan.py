@@ -15,6 +15,7 @@ from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
 from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.observing import histories, normalized, observed_values, remember
 from fmugym.declared.quantities import duration
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
@@ -65,6 +66,8 @@ class Plan:
         self._naming = Naming(declared, self._time_step)
         for name in declared.derived:
             self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
+        self._kept = histories(declared, self._naming, self._time_step)
+        self._seen = observed_values(declared, self._naming, self._kept, self._time_step)
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(name for _, name in declared.observed)
@@ -82,10 +85,14 @@ class Plan:
             "model_output_names": [records[name].fmu_name for name in self._naming.outputs],
             "monitor_names": [records[name].fmu_name for name in self._naming.monitors],
             "model_parameters": {r.fmu_name: value for r, value in declared.parameters.values()},
-            "episode_variables": {name: one.start for name, one in declared.memory.items()},
+            "episode_variables": self._variables(),
             "bounds": self._bounds(),
             "samplings": self._samplings(),
         }
+
+    def _variables(self) -> dict[str, Any]:
+        remembered = {name: memory.start for name, memory in self._declared.memory.items()}
+        return remembered | {one.variable: np.zeros(one.length) for one in self._kept}
 
     def _own_config(self) -> dict[str, Any]:
         section = self._root.child("config")
@@ -142,10 +149,12 @@ class Plan:
         """The action space; None if it is that of the inputs as they are."""
         records = self._declared.actions
         are_inputs = all(r.variable is not None and is_plain(r) for r in records)
-        if are_inputs and not self._declared.inputs:
+        rescales = self._declared.option("rescale")
+        if are_inputs and not self._declared.inputs and not rescales:
             return None
         if not records[0].levels:
-            return _box([(record.low, record.high) for record in records])
+            limits = [(record.low, record.high) for record in records]
+            return _box([(-1.0, 1.0)] * len(records) if rescales else limits)
         counts = [len(record.levels) for record in records]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
 
@@ -169,29 +178,26 @@ class Plan:
 
     def _observation_space(self) -> spaces.Space[Any] | None:
         """The observation space; None if it is that of the outputs as they are."""
-        names = [name for _, name in self._declared.observed]
-        records = self._declared.records
+        names, records = [seen.name for seen in self._seen], self._declared.records
+        if self._declared.option("normalize"):
+            return _box([(-1.0, 1.0)] * len(names))
         if names == self._naming.outputs and all(is_plain(records[name]) for name in names):
             return None
-        return _box([self._declared.limits_of(name) for name in names])
+        return _box([(seen.low, seen.high) for seen in self._seen])
 
     def _observation(self) -> Hook:
-        codes = [self._observed(entry, name) for entry, name in self._declared.observed]
+        normalizes = self._declared.option("normalize")
+        codes = [normalized(seen) if normalizes else seen.code for seen in self._seen]
         values = self._function(_tuple(codes))
         return lambda env: np.array(values(env), dtype=np.float32)
-
-    def _observed(self, entry: Entry, name: str) -> str:
-        code = self._naming.code_of(name, Moment.AFTER)
-        if code is None or code.value is not None:
-            raise entry.error(f"{name!r} is a constant, which an agent need not observe")
-        return code.number.text
 
     # What follows a step.
 
     def _hooks_of_steps(self) -> dict[str, Hook]:
         declared, hooks = self._declared, {}
-        if any(memory.update is not None for memory in declared.memory.values()):
-            hooks["_update"] = self._update()
+        updates = [*self._updates_of_memory(), *self._updates_of_histories()]
+        if updates:
+            hooks["_update"] = _in_turn(updates)
         if "terminated" in declared.flags:
             hooks["_is_done"] = self._condition("terminated", Moment.AFTER)
         if "truncated" in declared.flags:
@@ -202,20 +208,28 @@ class Plan:
             hooks["_get_info"] = self._function(self._info())
         return hooks
 
-    def _update(self) -> Hook:
+    def _updates_of_histories(self) -> list[Hook]:
+        if not self._kept:
+            return []
+        values, fills = ([history.now for history in self._kept], [h.fill for h in self._kept])
+        return [remember(self._kept, self._function(_tuple(values)), self._function(_tuple(fills)))]
+
+    def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""
         codes = {
             name: self._naming.code(memory.entry, memory.update, Moment.AFTER).number.text
             for name, memory in self._declared.memory.items()
             if memory.update is not None
         }
+        if not codes:
+            return []
         names, values = list(codes), self._function(_tuple(codes.values()))
 
         def update(env: Any) -> None:
             for name, value in zip(names, values(env), strict=True):
                 env.variables[name] = value
 
-        return update
+        return [update]
 
     def _condition(self, name: str, moment: Moment) -> Hook:
         entry = self._root.child(name)
@@ -245,6 +259,14 @@ class Plan:
 
     def _function(self, text: str) -> Hook:
         return function_of(text, self._naming.constants, self._task.name)
+
+
+def _in_turn(updates: list[Hook]) -> Hook:
+    def update(env: Any) -> None:
+        for one in updates:
+            one(env)
+
+    return update
 
 
 def _time_step(root: Entry, description: ModelDescription) -> float:

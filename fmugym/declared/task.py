@@ -27,7 +27,8 @@ VERSION: Final = 1
 KEYS: Final = (
     *("version", "extends", "description", "fmu", "class", "arguments"),
     *("time_step", "substeps", "episode_length", "warm_up", "start_time"),
-    *("variables", "parameters", "inputs", "memory", "expressions", "agent"),
+    *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
+    "agent",
     *("reward", "costs", "terminated", "truncated", "config"),
 )
 """The keys of a task."""
@@ -246,5 +247,16 @@ def _relative_path(path: str, folder: Path) -> str:
 
 
 def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
-    fmu = document.get("fmu")
-    return document | {"fmu": function(fmu)} if isinstance(fmu, str) else document
+    fmu, data = document.get("fmu"), document.get("data")
+    if isinstance(fmu, str):
+        document = document | {"fmu": function(fmu)}
+    if isinstance(data, dict):
+        document = document | {
+            "data": {name: _mapped_path(d, function) for name, d in data.items()}
+        }
+    return document
+
+
+def _mapped_path(column: Any, function: Any) -> Any:
+    file = column.get("file") if isinstance(column, dict) else None
+    return column | {"file": function(file)} if isinstance(file, str) else column

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription, Variable
@@ -137,6 +137,24 @@ class Records:
         if record is None:
             raise entry.error(unknown_name(role, name, [*others, *self.names()]))
         return record
+
+    def input_of(self, entry: Entry, unit: str | None) -> Record:
+        """The record of an input that data are written to, in the unit of the data.
+
+        Args:
+            entry: The name of the input: an alias, or the FMU's.
+            unit: The unit of the data; None for that of the variable.
+
+        Raises:
+            ConfigError: If there is no such input, or the unit does not fit it.
+        """
+        record = self.find(entry, entry.text(), "input")
+        self.check_input(entry, record)
+        if unit is None or record.variable is None:
+            return record
+        with entry.placing():
+            own, units = record.variable.unit, self._description.units
+            return replace(record, conversion=conversion_between(own, unit, units))
 
     def check_input(self, entry: Entry, record: Record) -> None:
         """Check that a variable can be written before each step; one without the FMU's name can.

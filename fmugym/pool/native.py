@@ -191,6 +191,9 @@ class NativePool(SavingPool):
                     "reloads": method == ResetMethod.LIBRARY,
                     "one_initialization": spec.one_initialization,
                     "pace": (spec.initialization_interval, *spec.turn),
+                    "start_outputs": (
+                        np.array(spec.start_outputs).tobytes() if spec.blind_start else None
+                    ),
                 },
                 variables={
                     "inputs": self._access(spec.inputs),

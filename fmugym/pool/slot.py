@@ -175,7 +175,7 @@ class Slot:
             return False
         try:
             self._instance.restore_state(self._saved)
-            got = self._get_between_steps()
+            got = self._get_between_steps(is_start=True)
         except SimulationError:  # a reset and an initialization may still work
             got = Status.ERROR
         if not _is_fine(got) or self._output_row.tobytes() != self._first_outputs:
@@ -363,15 +363,19 @@ class Slot:
                 break
         return status
 
-    def _get_between_steps(self) -> int:
+    def _get_between_steps(self, *, is_start: bool) -> int:
         """Get the outputs into the row, where integrals over a step are 0."""
-        got = self._outputs.get()
+        got: int = Status.OK
+        if is_start and self._spec.blind_start:
+            self._output_row[:] = self._spec.start_outputs
+        else:
+            got = self._outputs.get()
         self._output_row[self._integrals] = 0.0
         return got
 
     def _read_outputs(self, status: int) -> int:
         """Read the outputs between steps."""
-        return self._take_outputs(status, self._get_between_steps())
+        return self._take_outputs(status, self._get_between_steps(is_start=self._count == 0))
 
     def _take_outputs(self, status: int, got: int) -> int:
         """Take the outputs in the row; if any is not finite, keep the last good ones.

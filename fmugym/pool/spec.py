@@ -87,6 +87,8 @@ class PoolSpec:
             shows that they work there.
         state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
         licence_wait: How long to wait for a refused licence, in seconds of real time.
+        blind_start: Whether outputs have the start values of the model description until the first
+            step, because the FMU cannot be read before.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
             FMU's states can be saved; see ``fmugym.pool.saving``.
     """
@@ -111,12 +113,18 @@ class PoolSpec:
     licence_wait: float = 0.0
     keep_states: bool = False
     state_files: str = ""
+    blind_start: bool = False
     samplings: tuple[str, ...] = ()
     records: bool = False
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""
         return self.start_time + count * self.time_step / self.substeps
+
+    @property
+    def start_outputs(self) -> tuple[float, ...]:
+        """The start values of the outputs in the model description; 0 where it has none."""
+        return tuple(variable.start_number for variable in self.outputs)
 
     @property
     def communication_step_size(self) -> float:

@@ -25,7 +25,7 @@ from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
 from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
 from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.tables import tables_in
-from fmugym.vector.hooks.trace import SeenArray, placed, rounded, tables_of
+from fmugym.vector.hooks.trace import SeenArray, placed, tables_of, to_integer
 
 __all__ = ["Kind", "SingleTask", "kind_of", "trace_single"]
 
@@ -237,7 +237,7 @@ class _Tracer:
             typed: Any = np.where(value >= 0.5, 1.0, 0.0)
             typed = np.where(np.isfinite(value), typed, value)
         elif variable.kind in {"integer", "enumeration"}:
-            typed = rounded(variable, value)
+            typed = to_integer(variable, value)
         else:
             raise UntraceableError(f"the input {variable.name!r} is a {variable.type}")
         return _only(lifted(self._graph, typed))

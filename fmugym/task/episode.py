@@ -134,6 +134,8 @@ class EpisodePlan:
         Returns:
             For each name, an array of shape (M,), or (M, ...) for a variable that is an array.
         """
+        if not self._arrays:
+            return dict(zip(self.drawn_names, values, strict=True))
         named: dict[str, Any] = {}
         place = 0
         for name in self.drawn_names:
@@ -169,6 +171,11 @@ class EpisodePlan:
         """The episode variables that are not drawn, and arrays with 0 for drawn elements."""
         drawn = {name for name, array in self._random_variables if array is None}
         return {name: value for name, value in self._variables.items() if name not in drawn}
+
+    @cached_property
+    def variable_starts(self) -> dict[str, FloatArray]:
+        """The constant episode variables, with an axis for environments at the end."""
+        return {name: np.array(value)[..., None] for name, value in self.constant_variables.items()}
 
     def starts(self) -> Starts:
         """Draw two episodes for the trial of resets, from a separate random stream."""

@@ -90,6 +90,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "reset_method": str(verdict.reset_method) if verdict.resets else None,
         "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
         "isolate": verdict.isolate,
+        "cannot_be_read_before_a_step": verdict.blind_start,
         "initial_state": None if verdict.states is None else str(verdict.states),
         "instances_at_once": verdict.instances,
         "deaths": list(verdict.reasons),
@@ -225,6 +226,8 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
         parts.append("fresh instances differ")
     if trial["several_instances"]:
         parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
+    if trial["cannot_be_read_before_a_step"]:
+        parts.append("it cannot be read before its first step")
     if trial["isolate"]:
         parts.append("it harms its process and is isolated")
     if trial["initial_state"]:

@@ -332,7 +332,8 @@ class _Life:
 
 def _steps(instance: Instance, spec: PoolSpec, inputs: FloatArray) -> bytes:
     writer, reader = Access(instance, spec.inputs), Access(instance, spec.outputs)
-    instance.check("reading the outputs", reader.get())
+    if not spec.blind_start:
+        instance.check("reading the outputs", reader.get())
     values = reader.values.tobytes()
     for step, row in enumerate(inputs):
         writer.values[:] = row

@@ -40,6 +40,10 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = ["make_pool"]
 
+_BLIND: Final = (
+    "%s cannot be read before its first step: until then, its outputs have the start values of the "
+    "model description"
+)
 _NAMES = ("auto", "fmu", "native", "python")
 
 
@@ -109,12 +113,15 @@ def make_pool(
         def note_crash(how: str) -> None:
             _note_crash(fmu, spec, starts, verdict, how, log)
 
+        actual = replace(spec, blind_start=verdict.blind_start)
+        if verdict.blind_start:
+            log.warning(_BLIND, fmu.path.name)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
-            trust = _Trust.of(fmu, spec, starts, completed)
+            trust = _Trust.of(fmu, actual, starts, completed)
             pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
         pool.trust_states_if(trust.do_states_work)
         if rehearse and reset_method is None:
-            _rehearse(pool, fmu, spec, starts, verdict, completed, log)
+            _rehearse(pool, fmu, actual, starts, verdict, completed, log)
         return pool
 
     return Patience(spec.licence_wait, log).call(attempt)
@@ -226,7 +233,7 @@ class _Trust:
 
 def _tried(spec: PoolSpec) -> PoolSpec:
     """The part of a spec that a trial uses."""
-    return replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
+    return replace(spec, num_observed=0, leak_limit=None, fault_retries=0, blind_start=False)
 
 
 def _is_native(backend: str) -> bool:

@@ -382,7 +382,8 @@ def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -
         return Grade.ABSENT
     if sample is None:
         return Grade.FAILS
-    outcome = run(replace(request, sample=pickle.loads(sample)))
+    spec = replace(request.spec, blind_start=verdict.blind_start)
+    outcome = run(replace(request, spec=spec, sample=pickle.loads(sample)))
     _Notes().require_licence(request.candidate.path.name, outcome)
     return Grade(outcome.answer.get("states", Grade.FAILS))
 
@@ -413,6 +414,7 @@ class _Notes:
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             neighbours=None if neighbours is None else Neighbours(neighbours),
             instances=int(answer.get("instances", 1)),
+            blind_start=bool(answer.get("blind_start")),
             isolate=any(death.stage in _ALONE for death in self._deaths),
             reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )

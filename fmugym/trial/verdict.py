@@ -12,7 +12,7 @@ from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 
 
 class Grade(StrEnum):
@@ -55,6 +55,7 @@ class Verdict:
         neighbours: What several instances need; None if only one was tried.
         isolate: Whether a lone instance has harmed its process.
         states: The grade of an initial state in a second process; None if it was not tried.
+        blind_start: Whether the FMU cannot be read before its first step.
         instances: How many instances the trial used at once, each of which may take a licence.
         reasons: The observations, one sentence each, for the log and ``fmugym info``.
     """
@@ -65,6 +66,7 @@ class Verdict:
     neighbours: Neighbours | None = None
     isolate: bool = False
     states: Grade | None = None
+    blind_start: bool = False
     instances: int = 1
     reasons: tuple[str, ...] = ()
 
@@ -88,6 +90,7 @@ class Verdict:
                 "neighbours": None if self.neighbours is None else str(self.neighbours),
                 "isolate": self.isolate,
                 "states": None if self.states is None else str(self.states),
+                "blind_start": self.blind_start,
                 "instances": self.instances,
                 "reasons": list(self.reasons),
             }
@@ -103,7 +106,8 @@ class Verdict:
 
     @classmethod
     def _from_data(cls, data: dict[str, Any]) -> Verdict | None:
-        flags = data["complete"], data["deterministic"], data["isolate"]
+        names = ("complete", "deterministic", "isolate", "blind_start")
+        flags = [data[name] for name in names]
         reasons = data["reasons"]
         if data["format"] != _FORMAT or not all(isinstance(flag, bool) for flag in flags):
             return None
@@ -119,6 +123,7 @@ class Verdict:
             neighbours=None if given is None else Neighbours(given),
             isolate=flags[2],
             states=None if data["states"] is None else Grade(data["states"]),
+            blind_start=flags[3],
             instances=data["instances"],
             reasons=tuple(reasons),
         )

@@ -67,6 +67,10 @@ class Notes:
         (self._folder / "call").write_text(call)
         _end_after(patience(call, self._timeout))
 
+    def found(self, name: str) -> bool:
+        """Whether the answer so far has a value that is true."""
+        return bool(self._answer.get(name))
+
     def keep(self, sample: Sample | Halfway | None) -> None:
         """Leave a sample for another process, if there is one."""
         if sample is not None:
@@ -111,7 +115,9 @@ def _try(request: Request, notes: Notes) -> None:
     if complete and request.spec is not None:
         method = _try_resets(request, notes)
         if request.several:
-            spec = replace(request.spec, reset_method=method)
+            spec = replace(
+                request.spec, reset_method=method, blind_start=notes.found("blind_start")
+            )
             _try_several(replace(request, spec=spec), notes)
 
 
@@ -181,7 +187,7 @@ def _try_resets(request: Request, notes: Notes) -> ResetMethod:
     notes.stage(Stage.REFERENCE)
     if Stage.REFERENCE in request.skip:
         return ResetMethod.RESET
-    rehearsal = Rehearsal(request.candidate, request.spec, request.starts or Starts())
+    rehearsal = _rehearsal(request, notes)
     if not rehearsal.possible:
         return ResetMethod.RESET
     notes.answer(deterministic=rehearsal.deterministic)
@@ -197,6 +203,19 @@ def _try_resets(request: Request, notes: Notes) -> ResetMethod:
     if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
         _make_sample(rehearsal, request, notes)
     return Verdict(resets=grades).reset_method
+
+
+def _rehearsal(request: Request, notes: Notes) -> Rehearsal:
+    """Find the reference; if the FMU cannot be read before its first step, without doing so."""
+    starts = request.starts or Starts()
+    rehearsal = Rehearsal(request.candidate, request.spec, starts)
+    if rehearsal.possible or "reading the outputs" not in rehearsal.reason:
+        return rehearsal
+    blind = Rehearsal(request.candidate, replace(request.spec, blind_start=True), starts)
+    if not blind.possible:
+        return rehearsal
+    notes.answer(blind_start=True)
+    return blind
 
 
 def _make_sample(rehearsal: Rehearsal, request: Request, notes: Notes) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.base import MaskArray
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.episode import EpisodePlan
 from fmugym.task.values import LateDict
 from fmugym.vector.codec import with_masks, within
 
@@ -26,22 +27,23 @@ __all__ = [
 ]
 
 
-def drawn_info(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+def drawn_info(plan: EpisodePlan, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
     """The info of a reset.
 
     Args:
-        drawn: What was drawn or overridden, by name: one number, or a number or an array for each
-            environment in the mask. No caller changes it.
+        plan: What the environments in the mask have drawn from.
+        values: What they have drawn, shape (draws, M). No caller changes it.
         mask: The environments that were reset.
     """
     mask = mask.copy()
-    return {"drawn": LateDict.of(_drawn_rows, drawn, mask), "_drawn": mask}  # rarely read
+    return {"drawn": LateDict.of(_drawn_rows, plan, values, mask), "_drawn": mask}  # rarely read
 
 
-def _drawn_rows(drawn: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
+def _drawn_rows(plan: EpisodePlan, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    drawn = plan.told | plan.named(values)
     rows = {name: np.zeros((len(mask), *np.shape(row)[1:])) for name, row in drawn.items()}
-    for name, values in drawn.items():
-        rows[name][mask] = values
+    for name, row in drawn.items():
+        rows[name][mask] = row
     return with_masks(rows, mask)
 
 

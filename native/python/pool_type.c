@@ -198,7 +198,7 @@ static void pool_dealloc(PyObject *object) {
 typedef struct {
     PyObject *paths, *categories, *mark, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
-    Py_ssize_t num_observed, count, threads;
+    Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, private_libraries, logging, can_save;
     int restores, rebuilds, reloads, one_initialization;
     long long substeps, warm_up_steps, retries;
@@ -231,12 +231,13 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
                             "rebuilds",   "reloads",       "one_initialization",
-                            "pace",       NULL};
+                            "pace",       "start_outputs", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLpppp(dLL):experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLpppp(dLL)z#:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns);
+                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns,
+                       &s->start_outputs, &a->start_outputs_size);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -274,6 +275,18 @@ static bool check_numbers(const Arguments *a) {
                        (a->samplings == 0 || (size_t)a->samplings == a->outputs->access.count);
     if (!sound) {
         PyErr_SetString(PyExc_ValueError, "a number is out of range");
+    }
+    return sound;
+}
+
+static bool check_start_outputs(const PyPool *self, const Arguments *a) {
+    const size_t wanted = a->outputs->access.count * sizeof(double);
+    const bool sound =
+        self->pool.settings.start_outputs == NULL || (size_t)a->start_outputs_size == wanted;
+
+    if (!sound) {
+        PyErr_Format(PyExc_ValueError, "%zu bytes of start outputs are wanted, not %zd", wanted,
+                     a->start_outputs_size);
     }
     return sound;
 }
@@ -450,7 +463,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     }
     self->arguments = copy_of_groups(kwargs);
     if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
-        check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
+        check_start_outputs(self, &a) && check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
         take_categories(self, a.categories) && take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
         open_pool(self)) {
         return (PyObject *)self;

@@ -29,7 +29,13 @@ from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
-from fmugym.vector.infos import final_infos, observations_of, restricted, rows_as_objects
+from fmugym.vector.infos import (
+    final_infos,
+    not_finite,
+    observations_of,
+    restricted,
+    rows_as_objects,
+)
 from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine", "find_programs"]
@@ -503,7 +509,7 @@ class CompiledEngine(BatchEngine):
         self._outputs_before, self._variables_before = self._kept, self._before
         env._in_hooks = True
         try:
-            self._handle_faults(result, statuses, True)
+            self._handle_faults(result, statuses, True, not_finite(result.observations))
         finally:
             env._in_hooks = False
         self.note_ends(result.terminated, result.truncated)

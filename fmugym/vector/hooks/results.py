@@ -172,15 +172,15 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
 
 
 def restore_variable(
-    name: str, row: npt.NDArray[Any], mask: MaskArray, values: npt.NDArray[Any]
+    name: str, row: npt.NDArray[Any], mask: MaskArray, before: npt.NDArray[Any]
 ) -> None:
     """Undo what ``_update`` has assigned to an episode variable of the environments in a mask."""
     try:
-        row[..., mask] = values
+        np.copyto(row, before, where=mask, casting="unsafe")  # half the time of an assignment
     except ValueError:
         raise ConfigError(
             f"a hook has given the episode variable {name!r} the shape {row.shape}, where it had "
-            f"{(*values.shape[:-1], len(mask))}"
+            f"{before.shape}"
         ) from None
 
 

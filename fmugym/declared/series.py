@@ -1,0 +1,246 @@
+"""Values that depend on time only: columns of data, and schedules of a day."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.checks import check_option, check_path
+from fmugym.declared.entries import Entry
+from fmugym.declared.quantities import duration
+from fmugym.declared.variables import number
+from fmugym.errors import shown, unknown_name
+
+__all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
+
+DATA_KEYS: Final = (
+    *("file", "column", "time", "values", "step", "period", "interpolation"),
+    *("unit", "input", "min", "max"),
+)
+"""The keys of a column of data."""
+
+_DAY: Final = 86400.0
+_INTERPOLATIONS: Final = ("linear", "previous")
+_CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
+_NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A function of time that repeats itself.
+
+    Attributes:
+        entry: Where it is declared.
+        start: The time in seconds of the first row.
+        period: Seconds after which it repeats.
+        times: Seconds since ``start``, rising.
+        values: The values at these times, and between them on straight lines.
+        is_stepped: Whether the values jump, and hold until the next one.
+        low, high: Limits for the observation space.
+    """
+
+    entry: Entry
+    start: float
+    period: float
+    times: FloatArray
+    values: FloatArray
+    is_stepped: bool
+    low: float
+    high: float
+
+    @classmethod
+    def of(
+        cls, entry: Entry, times: FloatArray, values: FloatArray, period: float, is_stepped: bool
+    ) -> Series:
+        """Make a series of rows.
+
+        Args:
+            entry: Where it is declared; ``min`` and ``max`` are read from it.
+            times: The times of the rows in seconds.
+            values: Their values.
+            period: Seconds after which the rows repeat.
+            is_stepped: Whether a value holds until the next row.
+
+        Raises:
+            ConfigError: If the rows do not make a function of time.
+        """
+        _require_rising(entry, times, values, period)
+        start, times = float(times[0]), times - times[0]
+        ends, wrapped = np.append(times[1:], period), np.append(values[1:], values[0])
+        if is_stepped:  # hold each value until just before the next time
+            ends = np.nextafter(ends, -np.inf)
+            times = np.stack([times, np.maximum(times, ends)], axis=1).ravel()
+            values = np.repeat(values, 2)
+        else:
+            times, values = np.append(times, ends[-1]), np.append(values, wrapped[-1])
+        low, high = entry.child("min"), entry.child("max")
+        least = float(values.min()) if low.value is None else number(low)
+        most = float(values.max()) if high.value is None else number(high)
+        return cls(entry, start, period, times, values, is_stepped, least, most)
+
+
+def _require_rising(entry: Entry, times: FloatArray, values: FloatArray, period: float) -> None:
+    if not len(times) or not np.isfinite(times).all() or not np.isfinite(values).all():
+        raise entry.error("expected rows of finite times and values")
+    steps = np.diff(times)
+    if (steps <= 0).any():
+        place = int(np.flatnonzero(steps <= 0)[0]) + 1
+        raise entry.error(
+            f"the times must rise, but {times[place]:g} s is not above the one before"
+        )
+    if period <= times[-1] - times[0]:
+        raise entry.error(
+            f"the period of {period:g} s must be longer than the rows, which last "
+            f"{times[-1] - times[0]:g} s"
+        )
+
+
+def read_data(entry: Entry) -> Series:
+    """Read a column of a CSV file, or a list of values.
+
+    Raises:
+        ConfigError: If the file or the column is missing, or a cell is no number. The text says
+            where.
+    """
+    table = entry.table(DATA_KEYS)
+    if ("file" in table) == ("values" in table):
+        raise entry.error("give either 'file' and 'column', or 'values' and 'step'")
+    times, values = _rows_of_list(entry) if "values" in table else _rows_of_file(entry)
+    spacing = times[-1] - times[-2] if len(times) > 1 else _DAY
+    given = table.get("period")
+    period = times[-1] - times[0] + spacing if given is None else given.check(duration)
+    kind = table.get("interpolation")
+    how = "linear" if kind is None else kind.check(check_option, _INTERPOLATIONS)
+    return Series.of(entry, times, values, float(period), how == "previous")
+
+
+def _rows_of_list(entry: Entry) -> tuple[FloatArray, FloatArray]:
+    values = np.array([number(one) for one in entry.child("values").elements()])
+    return _even_times(entry.required("step"), len(values)), values
+
+
+def _even_times(step: Entry, count: int) -> FloatArray:
+    seconds = step.check(duration)
+    if seconds <= 0:
+        raise step.error("the step must be positive")
+    return np.arange(count, dtype=np.float64) * seconds
+
+
+def _rows_of_file(entry: Entry) -> tuple[FloatArray, FloatArray]:
+    rows, column = _read_csv(entry.child("file")), entry.required("column")
+    if column.text() not in rows:
+        raise column.error(unknown_name("column", column.value, rows))
+    values = np.array([_cell(column, i, text) for i, text in enumerate(rows[column.value])])
+    if entry.child("step").value is not None:
+        return _even_times(entry.child("step"), len(values)), values
+    return _times(entry, rows), values
+
+
+def _read_csv(file: Entry) -> dict[str, list[str]]:
+    """The cells of each column. A semicolon separates cells where the first line has one."""
+    path = check_path("file", file.text())
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise file.error(f"{shown(str(path))} is not encoded in UTF-8") from None
+    delimiter = ";" if lines and ";" in lines[0] else ","
+    header, *rows = [row for row in csv.reader(lines, delimiter=delimiter) if row] or [[]]
+    for number_of_row, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise file.error(
+                f"row {number_of_row} of {path.name} has {len(row)} cells, expected {len(header)}"
+            )
+    if not rows:
+        raise file.error(f"{path.name} has no rows below its header")
+    return {
+        name.strip(): list(cells)
+        for name, cells in zip(header, zip(*rows, strict=True), strict=True)
+    }
+
+
+def _times(entry: Entry, rows: Mapping[str, list[str]]) -> FloatArray:
+    """The times of the rows: seconds, or dates, which count from the beginning of their year."""
+    name = entry.child("time")
+    if name.value is not None and name.text() not in rows:
+        raise name.error(unknown_name("column", name.value, rows))
+    known = {column.lower(): column for column in rows}
+    usual = next((known[word] for word in _NAMES_OF_TIME if word in known), None)
+    column: str | None = usual if name.value is None else name.value
+    if column is None:
+        raise entry.error(
+            "name the column with the times as 'time', or give the 'step' between rows; there are: "
+            + ", ".join(map(repr, rows))
+        )
+    return _seconds(name, rows[column])
+
+
+def _seconds(entry: Entry, cells: Sequence[str]) -> FloatArray:
+    if _is_number(cells[0]):
+        return np.array([_cell(entry, i, text) for i, text in enumerate(cells)])
+    dates = [_date(entry, i, text.strip()) for i, text in enumerate(cells)]
+    start = dates[0].replace(month=1, day=1, hour=0, minute=0, second=0, microsecond=0)
+    try:
+        return np.array([(date - start).total_seconds() for date in dates])
+    except TypeError:
+        raise entry.error("either all dates have a time zone, or none has") from None
+
+
+def _date(entry: Entry, index: int, text: str) -> datetime.datetime:
+    try:
+        return datetime.datetime.fromisoformat(text)
+    except ValueError:
+        raise entry.error(
+            f"row {index + 2} of the column with times is {shown(text)}, expected seconds, or a "
+            "date such as 2023-12-31 15:00"
+        ) from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _cell(entry: Entry, index: int, text: str) -> float:
+    value = float(text) if _is_number(text) else math.nan
+    if not math.isfinite(value):
+        raise entry.error(f"row {index + 2} of the column is {shown(text)}, expected a number")
+    return value
+
+
+def read_schedule(entry: Entry) -> Series:
+    """Read the values of a day by the times from which they hold, such as ``"06:00"``.
+
+    Raises:
+        ConfigError: If a time or a value does not fit.
+    """
+    rows = sorted((_time_of_day(one), number(one)) for one in entry.items().values())
+    if not rows:
+        raise entry.error('expected times and values, such as { "06:00" = 21, "22:00" = 17 }')
+    if rows[0][0] > 0:  # what holds at midnight began on the day before
+        rows.insert(0, (0.0, rows[-1][1]))
+    times, values = np.array(rows).T
+    parent = Entry(None, entry.keys[:-1], entry.sources)
+    return Series.of(parent, times, values, _DAY, is_stepped=True)
+
+
+def _time_of_day(entry: Entry) -> float:
+    match = _CLOCK.fullmatch(entry.name)
+    hours, minutes, seconds = (int(part or 0) for part in match.groups()) if match else (24, 0, 0)
+    if hours > 23 or minutes > 59 or seconds > 59:
+        raise entry.error(f"expected a time of day such as '06:00', got {shown(entry.name)}")
+    return hours * 3600.0 + minutes * 60.0 + seconds

@@ -1,0 +1,317 @@
+"""Data, set points, forecasts, histories and scaled spaces of declared tasks."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import FMUVectorEnv
+from fmugym.errors import TaskError
+
+DT = 0.25
+
+BASE = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": DT,
+    "variables": {
+        "tau": {"min": -0.02, "max": 0.06},
+        "q": {"min": -4, "max": 4},
+        "q_dot": {"min": -60, "max": 60},
+    },
+    "parameters": {"q_0": {"distribution": "uniform", "low": -1, "high": 1}},
+    "agent": {"actions": ["tau"], "observations": ["q"]},
+    "reward": 0,
+}
+
+AT_REST = {"q_0": 0, "g": 0, "max_step": 3600}
+"""Parameters of a pendulum that nothing moves, for steps of hours."""
+
+PRICES = [0.2, 0.5, 0.1]
+EVERYTHING = BASE | {
+    "data": {
+        "price": {"values": PRICES, "step": "1s", "interpolation": "previous"},
+        "load": {"values": [0, 2, 1], "step": "0.4s", "min": -1, "max": 4},
+    },
+    "setpoints": {
+        "goal": {"value": {"distribution": "normal", "mean": 0, "std": 1}, "min": -9, "max": 9},
+        "wave": {
+            "sine": {
+                "amplitude": {"distribution": "uniform", "low": 1, "high": 2},
+                "period": "1.5s",
+            },
+            "min": -2,
+            "max": 2,
+        },
+        "rise": {
+            "ramp": {"from": -1, "to": 1, "begin": "1s", "duration": "2s"},
+            "min": -1,
+            "max": 1,
+        },
+        "night": {"schedule": {"06:00": 1, "22:00": 0}},
+    },
+    "memory": {"total": {"start": 0, "update": "total + price * dt", "min": 0, "max": 100}},
+    "agent": {
+        "actions": ["tau"],
+        "observations": ["q", "tau", "price", "load", "goal", "wave", "rise", "night", "total"],
+        "forecast": [
+            {"of": ["price", "wave"], "horizon": "1s", "step": "0.5s"},
+            {"of": "load", "horizon": "0.5s"},
+        ],
+        "history": {"of": ["q", "tau", "load"], "length": "0.75s"},
+        "rescale": True,
+        "normalize": True,
+    },
+    "reward": {"cost": "-price * tau**2", "track": "-abs(q - wave)", "late": "night - price"},
+    "truncated": "time >= 3",
+}
+
+
+def named(observation):
+    """The parts of an observation of ``EVERYTHING`` before it is normalized."""
+    ranges = {
+        "q": (-4, 4), "tau": (-0.02, 0.06), "price": (0.1, 0.5), "load": (-1, 4),
+        "goal": (-9, 9), "wave": (-2, 2), "rise": (-1, 1), "night": (0, 1), "total": (0, 100),
+    }  # fmt: skip
+    order = [
+        *((name, 1) for name in ranges),
+        *(("price", 2), ("wave", 2), ("load", 2)),
+        *(("q", 3), ("tau", 3), ("load", 3)),
+    ]
+    parts, place = [], 0
+    for name, count in order:
+        low, high = ranges[name]
+        part = observation[place : place + count].astype(float)
+        parts.append((name, low + (part + 1) / 2 * (high - low)))
+        place += count
+    assert place == len(observation)
+    return parts
+
+
+def price_at(time):
+    return PRICES[int(time % 3.0 + 1e-9)]
+
+
+def load_at(time):
+    return np.interp(time % 1.2, [0, 0.4, 0.8, 1.2], [0, 2, 1, 0])
+
+
+def test_an_episode_has_the_declared_values():
+    env = fmugym.load(EVERYTHING)
+    assert env.action_space.low == [-1]
+    observation, info = env.reset(seed=4)
+    amplitude, goal = info["drawn"]["wave_amplitude"], info["drawn"]["goal"]
+    angles, torques, total = [env.state[0]], [0.0], 0.0
+    rng = np.random.default_rng(0)
+    for step in range(12):
+        time = step * DT
+        parts = named(observation)
+        seen = {name: part[0] for name, part in parts[:9]}
+        assert seen["q"] == pytest.approx(angles[-1], rel=1e-6)
+        assert seen["tau"] == pytest.approx(torques[-1], abs=1e-6)
+        assert seen["price"] == pytest.approx(price_at(time), abs=1e-6)
+        assert seen["load"] == pytest.approx(load_at(time), abs=1e-6)
+        assert seen["goal"] == pytest.approx(goal, abs=1e-5)
+        wave = [amplitude * np.sin(2 * np.pi * t / 1.5) for t in (time, time + 0.5, time + 1)]
+        assert seen["wave"] == pytest.approx(wave[0], abs=1e-6)
+        assert seen["rise"] == pytest.approx(np.clip((time - 1) / 2, 0, 1) * 2 - 1, abs=1e-6)
+        assert seen["night"] == pytest.approx(0.0, abs=1e-6)
+        assert seen["total"] == pytest.approx(total, abs=1e-5)
+        forecasts = [part for _, part in parts[9:12]]
+        np.testing.assert_allclose(forecasts[0], [price_at(time + 0.5), price_at(time + 1)], 1e-5)
+        np.testing.assert_allclose(forecasts[1], wave[1:], atol=1e-6)
+        loads = [load_at(time + DT), load_at(time + 2 * DT)]
+        np.testing.assert_allclose(forecasts[2], loads, atol=1e-6)
+        past = [part for _, part in parts[12:]]
+        np.testing.assert_allclose(past[0], last(angles[:-1], angles[0]), rtol=1e-6)
+        np.testing.assert_allclose(past[1], last(torques, 0.0), atol=1e-6)
+        np.testing.assert_allclose(past[2], [load_at(time - k * DT) for k in (1, 2, 3)], atol=1e-6)
+        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        observation, reward, _, truncated, info = env.step(action)
+        torque = -0.02 + (float(action[0]) + 1) / 2 * 0.08
+        assert env.inputs[0] == pytest.approx(torque, rel=1e-12)
+        angles.append(env.state[0])
+        torques.append(torque)
+        total += price_at(time) * DT
+        terms = {
+            "cost": -price_at(time) * torque**2,
+            "track": -abs(angles[-1] - amplitude * np.sin(2 * np.pi * (time + DT) / 1.5)),
+            "late": -price_at(time),
+        }
+        assert info["reward_terms"] == pytest.approx(terms)
+        assert reward == pytest.approx(sum(terms.values()))
+        assert truncated == (step == 11)
+    env.close()
+
+
+def last(values, first):
+    """The last three values, the latest first."""
+    return [first, first, first, *values][:-4:-1]
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
+    envs = FMUVectorEnv(partial(fmugym.load, EVERYTHING), 3, hooks=hooks)
+    singles = [fmugym.load(EVERYTHING) for _ in range(3)]
+    observations, _ = envs.reset(seed=5)
+    expected = [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
+    np.testing.assert_array_equal(observations, expected)
+    envs.action_space.seed(3)
+    for step in range(30):
+        actions = envs.action_space.sample()
+        observations, rewards, _, truncated, infos = envs.step(actions)
+        if step % 13 == 12:  # the step that follows the end of an episode
+            expected = [env.reset()[0] for env in singles]
+            np.testing.assert_array_equal(observations, expected)
+            continue
+        for i, env in enumerate(singles):
+            seen, reward, _, cut, info = env.step(actions[i])
+            assert (reward, cut) == (rewards[i], truncated[i])
+            np.testing.assert_array_equal(seen, observations[i])
+            for name, value in info["reward_terms"].items():
+                assert value == infos["reward_terms"][name][i]
+    for env in (envs, *singles):
+        env.close()
+
+
+def test_all_hooks_are_compiled():
+    envs = FMUVectorEnv(partial(fmugym.load, EVERYTHING), 2, hooks="compiled")
+    assert envs._engine._task.left == {}
+    envs.close()
+
+
+CSV = "time;T_C;note\n0;10;a\n3600;20;b\n7200;15;c\n"
+
+
+class TestFiles:
+    def load(self, folder, text=CSV, **column):
+        (folder / "weather.csv").write_text(text, encoding="utf-8")
+        data = {"T": {"file": str(folder / "weather.csv"), "column": "T_C"} | column}
+        agent = {"actions": ["tau"], "observations": ["T", "q"]}
+        task = {"data": data, "agent": agent, "time_step": 900, "parameters": AT_REST}
+        return fmugym.load(BASE | task)
+
+    def values(self, env, steps):
+        """The observations of an episode; the steps are long, but nobody looks at the FMU."""
+        seen = [env.reset(seed=0)[0][0]]
+        seen += [env.step([0.0])[0][0] for _ in range(steps)]
+        env.close()
+        return seen
+
+    def test_lines_between_the_rows(self, tmp_path):
+        seen = self.values(self.load(tmp_path), 12)
+        expected = np.interp(np.arange(13) * 900 % 10800, [0, 3600, 7200, 10800], [10, 20, 15, 10])
+        np.testing.assert_allclose(seen, expected, rtol=1e-6)
+
+    def test_a_value_holds_until_the_next_row(self, tmp_path):
+        seen = self.values(self.load(tmp_path, interpolation="previous"), 13)
+        assert seen == [10] * 4 + [20] * 4 + [15] * 4 + [10, 10]
+
+    def test_dates_count_from_the_beginning_of_their_year(self, tmp_path):
+        text = CSV.replace("0;10", "2023-01-01 00:00;10", 1)
+        text = text.replace("3600;", "2023-01-01T01:00:00;").replace("7200;", "2023-01-01 02:00;")
+        seen = self.values(self.load(tmp_path, text, interpolation="previous"), 4)
+        assert seen == [10] * 4 + [20]
+
+    def test_rows_at_even_times_with_commas(self, tmp_path):
+        text = CSV.replace(";", ",").replace("time", "index")
+        env = self.load(tmp_path, text, step="30min", interpolation="previous", period="2h")
+        assert self.values(env, 8) == [10, 10, 20, 20, 15, 15, 15, 15, 10]
+
+    @pytest.mark.parametrize(
+        ("text", "column", "fact"),
+        [
+            (CSV, {"column": "T_K"}, "column 'T_K'; did you mean 'T_C'"),
+            (CSV, {"file": "/nowhere/x.csv"}, "/nowhere/x.csv"),
+            (CSV, {"time": "tim"}, "'time'"),
+            (CSV, {"interpolation": "cubic"}, "'cubic'"),
+            (CSV, {"period": "1h"}, "3600"),
+            (CSV, {"values": [1]}, "either"),
+            (CSV.replace("20", "n/a"), {}, "row 3.*'n/a'"),
+            (CSV.replace("7200", "60"), {}, "60 s"),
+            (CSV.replace("3600;20;b", "3600;20"), {}, "row 3 .* 2 cells, expected 3"),
+            (CSV.replace("time", "hour"), {}, "'hour'"),
+            (CSV.replace("7200", "noon"), {}, "noon"),
+            ("time;T_C\n", {}, "no rows"),
+            ("", {}, "no rows"),
+        ],
+    )
+    def test_mistakes_are_explained(self, tmp_path, text, column, fact):
+        with pytest.raises(TaskError, match=rf"data\.T.*{fact}"):
+            self.load(tmp_path, text, **column)
+
+    def test_a_task_with_data_survives_writing(self, tmp_path):
+        env = self.load(tmp_path)
+        (tmp_path / "folder").mkdir()
+        env.task.write(tmp_path / "folder" / "task.toml")
+        assert 'file = "../weather.csv"' in (tmp_path / "folder" / "task.toml").read_text()
+        assert fmugym.Task.read(tmp_path / "folder" / "task.toml") == env.task
+        env.close()
+
+
+def test_data_are_written_to_an_input_in_its_unit():
+    data = {"load": {"values": [1, 5], "step": DT, "unit": "N.mm", "input": "tau"}}
+    agent = {"actions": ["gain"], "observations": ["q", "load"]}
+    variables = {"gain": {"min": 0, "max": 1}}
+    env = fmugym.load(BASE | {"data": data, "agent": agent, "variables": variables})
+    assert env.reset(seed=0)[0][1] == 1.0
+    assert env.step([0.0])[0][1] == 5.0
+    assert env.inputs == (pytest.approx(0.001),)
+    env.step([0.0])
+    assert env.inputs == (pytest.approx(0.005),)
+    env.close()
+
+
+def test_a_schedule_holds_over_midnight():
+    setpoints = {"T": {"schedule": {"06:00": 21, "22:00": 17}}}
+    agent = {"actions": ["tau"], "observations": ["T", "q"]}
+    task = BASE | {"setpoints": setpoints, "agent": agent, "parameters": AT_REST}
+    task |= {"time_step": "1h", "reward": "T"}
+    env = fmugym.load(task)
+    seen, rewards = [env.reset(seed=0)[0][0]], []
+    for _ in range(26):
+        observation, reward, *_ = env.step([0.0])
+        seen.append(observation[0])
+        rewards.append(reward)
+    assert seen == [17] * 6 + [21] * 16 + [17] * 5
+    assert rewards == seen[:-1]
+    assert env.observation_space.low[0] == 17
+    env.close()
+
+
+MISTAKES = {
+    "forecast of a variable": ({"forecast": {"of": "q", "horizon": 1}}, "'q'"),
+    "forecast of a memory": ({"forecast": {"of": "total", "horizon": 1}}, "'total'"),
+    "horizon": ({"forecast": {"of": "price", "horizon": 0.3}}, r"0\.3 s.*0\.25"),
+    "history of an expression": ({"history": {"of": "total", "length": 1}}, "'total'"),
+    "history of nothing": ({"history": {"of": "tota", "length": 1}}, "'total'"),
+    "key": ({"histry": {"of": "q", "length": 1}}, "'history'"),
+    "no limits": ({"observations": ["unlimited"]}, "'unlimited'.*min"),
+    "flag": ({"rescale": "yes"}, "True or False"),
+}
+
+
+@pytest.mark.parametrize(("change", "fact"), MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_of_the_agent(change, fact):
+    task = EVERYTHING | {
+        "agent": EVERYTHING["agent"] | change,
+        "expressions": {"unlimited": "q * 2"},
+    }
+    with pytest.raises(TaskError, match=fact):
+        fmugym.load(task)
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "fact"),
+    [
+        ({"schedule": {"25:00": 1}}, "'25:00'"),
+        ({"schedule": {}}, "expected times"),
+        ({"ramp": {"from": 1, "to": 2}}, "'duration'"),
+        ({"sine": {"amplitud": 1}}, "'amplitude'"),
+        ({"value": 1, "ramp": {}}, "one of"),
+        ({"constant": 1}, "'constant'"),
+    ],
+)
+def test_mistakes_of_set_points(setpoint, fact):
+    with pytest.raises(TaskError, match=rf"^setpoints\.goal.*{fact}"):
+        fmugym.load(BASE | {"setpoints": {"goal": setpoint}})
