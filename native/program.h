@@ -28,6 +28,7 @@ enum {
     X(STORE_ROW, "store_row")                                                                      \
     X(STORE_SEEN, "store_seen")                                                                    \
     X(CALL, "call")                                                                                \
+    X(CALL_SQUARE, "call_square")                                                                  \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \
