@@ -178,7 +178,8 @@ class FMUEnv(Constructed):
             self._prepare_player(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
-        episode = plan.draw(self.np_random)
+        generator = self._np_random
+        episode = plan.draw(self.np_random if generator is None else generator)
         self._ended = True  # there is no episode if the FMU fails
         try:
             pool.reset(plan.model_variables, episode.start_values)
@@ -216,7 +217,8 @@ class FMUEnv(Constructed):
         self.variables.update(episode.variables)
         self.step_count = 0
         self.action = self.previous_action = self._no_action
-        self.inputs = tuple(self.parameters.get(n, start) for n, start in self._start_inputs)
+        given = self.parameters.get
+        self.inputs = tuple([given(name, start) for name, start in self._start_inputs])
         self.done = self.after_end = False
         self._values = tuple(self._output_row.tolist())
         self.state = self.previous_state = self._values[: self._output_count]
@@ -292,8 +294,7 @@ class FMUEnv(Constructed):
             self._ended = True
             self._halt()
             raise
-        if self._play is not None:
-            self._player.give_back(self)
+        self._player.doubt(self)
         return None
 
     def _completed(self, result: Result) -> Result:
