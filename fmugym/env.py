@@ -24,7 +24,6 @@ from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
-from fmugym.task.readings import LateReading
 from fmugym.task.results import FLOAT32_LIMIT, as_info
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
@@ -118,17 +117,6 @@ class FMUEnv(Constructed):
     _play: Callable[..., Any] | None = None
     _width = 0
     _tells = False
-
-    # Where these are not attributes of the environment, the pool keeps them.
-    _values = LateReading()
-    state = LateReading()
-    previous_state = LateReading()
-    inputs = LateReading()
-    action = LateReading()
-    previous_action = LateReading()
-    step_count = LateReading()
-    done = LateReading()
-    variables = LateReading()
 
     def __init__(
         self,

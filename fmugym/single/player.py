@@ -16,7 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.single.compare import require_equal
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
-from fmugym.task.readings import LATE, LateReading
+from fmugym.task.readings import LATE, LateReading, make_late
 from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.hooks.program import Row, UntraceableError
@@ -89,6 +89,7 @@ class Player:
             task = trace_single(env, action)
             require_equal(env, task)
             self._prepare(env, task)
+            make_late(FMUEnv)
             self._task, self._required = task, False
             self._known = len(vars(env))
         except Exception as reason:  # hooks may raise anything
@@ -295,5 +296,5 @@ def _is_plain(env: FMUEnv, action: Any) -> bool:
 def _require_late(env: FMUEnv) -> None:
     """Refuse classes that have attributes of their own in the place of readings."""
     for name in (*LATE, "variables"):
-        if not isinstance(getattr_static(type(env), name), LateReading):
+        if not isinstance(getattr_static(type(env), name, None), LateReading | None):
             raise UntraceableError(f"the class has an attribute {name!r} of its own")
