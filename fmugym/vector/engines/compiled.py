@@ -417,6 +417,8 @@ class CompiledEngine(BatchEngine):
         """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
+            if started is not None:
+                self.env.done[started] = False
         seen = result.rewards, result.observations
         if troubled or any(not_finite(values) is not None for values in seen):
             self._mend(result, resetting if started is None else started)
