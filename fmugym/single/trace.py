@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.single.purity import unchanged_globals
 from fmugym.single.watch import Watched, noting_reads, watched_in
 from fmugym.task.readings import Readings, reading
 from fmugym.task.results import FLOAT32_LIMIT
@@ -25,7 +26,7 @@ from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
 from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
 from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.tables import tables_in
-from fmugym.vector.hooks.trace import SeenArray, placed, rounded, tables_of
+from fmugym.vector.hooks.trace import SeenArray, placed, tables_of, to_integer
 
 __all__ = ["Kind", "SingleTask", "kind_of", "trace_single"]
 
@@ -118,6 +119,7 @@ def trace_single(env: FMUEnv, action: Any) -> SingleTask:
     attributes = dict(vars(env))
     with (
         exclusive(),
+        unchanged_globals(env),
         borrowed(env),
         tables_in(env),
         reading(env, Readings.of(env)),
@@ -237,7 +239,7 @@ class _Tracer:
             typed: Any = np.where(value >= 0.5, 1.0, 0.0)
             typed = np.where(np.isfinite(value), typed, value)
         elif variable.kind in {"integer", "enumeration"}:
-            typed = rounded(variable, value)
+            typed = to_integer(variable, value)
         else:
             raise UntraceableError(f"the input {variable.name!r} is a {variable.type}")
         return _only(lifted(self._graph, typed))

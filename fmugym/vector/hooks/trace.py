@@ -36,7 +36,7 @@ from fmugym.vector.hooks.symbols import (
 )
 from fmugym.vector.hooks.tables import is_table, tables_in
 
-__all__ = ["SeenArray", "TracedTask", "placed", "rounded", "tables_of", "trace_hooks"]
+__all__ = ["SeenArray", "TracedTask", "placed", "tables_of", "to_integer", "trace_hooks"]
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ class _Tracer:
             rounded: Any = np.where(value >= 0.5, 1.0, 0.0)
             rounded = np.where(np.isfinite(value), rounded, value)
         elif variable.kind in {"integer", "enumeration"}:
-            rounded = rounded(variable, value)
+            rounded = to_integer(variable, value)
         else:
             limit = float(np.finfo(np.float32).max)
             rounded = np.where(np.absolute(value) <= limit, value, np.nan)
@@ -372,7 +372,7 @@ class _Tracer:
         seen.append(SeenArray(path, nodes.shape, dtype))
 
 
-def rounded(variable: Any, value: Any) -> Any:
+def to_integer(variable: Any, value: Any) -> Any:
     """The nearest integer, or the nearest item of an Enumeration; NaN outside of the range."""
     low, high = variable.integer_limits
     largest = 2.0**53
