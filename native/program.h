@@ -100,6 +100,7 @@ extern const char *const operation_names[NUMBER_OF_OPERATIONS];
     X(uint8_t, 'B')                                                                                \
     X(Flag, '?')
 
+enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
 enum { VALUE_TYPES = 11, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_INT64 = 2, VALUE_FLAG = 10 };
 
 /* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a
