@@ -100,7 +100,7 @@ class EpisodePlan:
             self._distributions.extend(own)
         self._sampler = Sampler(self._distributions)
         self._start_values = self.constants.reshape(-1, 1).copy()
-        self._starts: Any = memoryview(self._start_values.reshape(-1))  # faster to write to
+        self._starts: Any = self._start_values.reshape(-1).data  # faster to write to
 
     @cached_property
     def parameter_names(self) -> list[str]:
