@@ -370,6 +370,18 @@ class Pool:
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
 
+    def rollout(
+        self,
+        actions: Array,
+        observations: Array | tuple[Array, ...],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        drawn: Array,
+        /,
+    ) -> int:
+        """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
+
     def bundle(self, indices: Array, ends: Array, steps: Array, /) -> bytes | int:
         """Serialize the states of M instances.
 

@@ -464,6 +464,7 @@ class FMUEnv(Constructed):
         pool = self._open_pool("save_state")
         if not self._was_reset:
             raise SimulationError("save_state was called before the first reset")
+        self._keep_readings()
         bundle = pool.save_instances(np.zeros(1, np.int64))
         return Snapshot(self._scope, columns_of(self), bundle)
 
@@ -483,13 +484,20 @@ class FMUEnv(Constructed):
         pool = self._open_pool("restore_state")
         columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
         if not self._was_reset:
-            self._prepare_hooks()
+            self._prepare_hooks()  # as in ``reset``
+            self._prepare_player(pool)
+        self._keep_readings()
         self._ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)
         if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         return self._observation_and_info()[0]
+
+    def _keep_readings(self) -> None:
+        """Keep what hooks read in the environment itself until the next step."""
+        if self._play is not None:
+            self._player.give_back(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
         """Make a new environment in the middle of the same episode, if there is one."""

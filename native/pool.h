@@ -161,7 +161,7 @@ typedef struct {
     uint32_t calls;
 } Cost;
 
-enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
+enum { STEP, RESET, MIXED, PLAY, RESTORE, ROLLOUT, OPERATIONS };
 
 typedef struct Pool {
     struct Pool *next; /* next in the list of all pools */
@@ -285,6 +285,9 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends);
 /* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
  * and sets outside if a hook looked up an index outside of a table. */
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
+
+/* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside);
 
 /* A serialized FMU state after initialization. */
 typedef struct {

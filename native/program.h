@@ -28,6 +28,7 @@ enum {
     X(STORE_ROW, "store_row")                                                                      \
     X(STORE_SEEN, "store_seen")                                                                    \
     X(CALL, "call")                                                                                \
+    X(CALL_SQUARE, "call_square")                                                                  \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \
@@ -99,6 +100,7 @@ extern const char *const operation_names[NUMBER_OF_OPERATIONS];
     X(uint8_t, 'B')                                                                                \
     X(Flag, '?')
 
+enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
 enum { VALUE_TYPES = 11, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_INT64 = 2, VALUE_FLAG = 10 };
 
 /* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a

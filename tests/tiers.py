@@ -99,6 +99,7 @@ SLOW_TESTS = (
     "test_resources.py::test_linux_libraries",
     "test_slow_models.py::TestProgress::test_is_not",
     "test_slow_models.py::TestTime::test_of_a_trial",
+    "test_rollouts.py::TestValues::test_of_many_candidates",
     "test_snapshots.py::TestForeign",
     "test_snapshots.py::TestSingle::test_goes_on_in_another_process",
     "test_specs.py::test_a_class_of_a_script",

@@ -242,6 +242,14 @@ class Pool(ABC):
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
+    def roll_out(self, *arrays: Any) -> int:
+        """Do many steps of the prepared play in one call; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``can_play``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+
     def prepare_single(self, **groups: Any) -> SingleCalls:
         """Make the functions that do whole steps of a single environment; see ``NativePool``.
 

@@ -558,6 +558,19 @@ class NativePool(SavingPool):
         )
         return self._pool.play
 
+    def roll_out(self, *arrays: Any) -> int:
+        """Do many steps of the prepared play in one call; episodes that end are not followed.
+
+        Args:
+            arrays: Actions, observations, rewards, terminated and truncated as for the function
+                that ``prepare_play`` returns, each with a first axis for the steps; and memory for
+                drawn values, which are not drawn.
+
+        Returns:
+            How many instances or numbers were in trouble; if there are any, not all steps are done.
+        """
+        return self._open_pool().rollout(*arrays)
+
     def prepare_single(self, **groups: Any) -> SingleCalls:
         """Prepare a pool of one instance to do whole steps of a single environment.
 

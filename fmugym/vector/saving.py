@@ -120,6 +120,5 @@ def require_fit(columns: Columns) -> None:
 
 def values_of(column: Any, sources: IndexArray) -> npt.NDArray[Any]:
     """The values of a column at these places, as an array."""
-    if isinstance(column, np.ndarray):
-        return column[sources]
-    return np.array([column[source] for source in sources.tolist()])
+    rows: npt.NDArray[Any] = np.asarray(column)[sources]
+    return rows

@@ -610,6 +610,124 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return result;
 }
 
+/* Rollouts: each array has a row for each step. */
+
+typedef struct {
+    PyTurn turn;
+    size_t horizon;
+} PyRollout;
+
+static bool has_bad_action(const PyRollout *r) {
+    const Play *play = r->turn.turn.play;
+    const size_t size = play->count * play->actions.elements * play->actions.size;
+    Turn turn = r->turn.turn;
+    bool bad = false;
+
+    for (size_t step = 0; step < r->horizon && !bad; step++, turn.actions += size) {
+        bad = play_has_bad_action(&turn);
+    }
+    return bad;
+}
+
+static void do_rollout(PyPool *self, bool alone, void *context) {
+    PyRollout *r = context;
+    PyTurn *t = &r->turn;
+
+    t->call.alone = alone;
+    t->ends.outside = false;
+    t->bad_action = has_bad_action(r);
+    if (!t->bad_action) {
+        t->troubled = pool_rollout(&self->pool, &t->call, r->horizon, &t->ends.outside);
+    }
+}
+
+/* Takes memory that must have so many bytes, whatever its items are. */
+static bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
+    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
+        return false;
+    }
+    if ((size_t)buffer->len != size) {
+        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
+    }
+    return (size_t)buffer->len == size;
+}
+
+static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObject *seen,
+                                     PyRollout *r) {
+    const Settings *s = &self->pool.settings;
+    const size_t count = playing->judgement.program.number_of_seen;
+    PyTurn *t = &r->turn;
+
+    if (count == 0 && !PyTuple_Check(seen)) {
+        return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
+                          r->horizon * s->count * s->num_observed * sizeof(float));
+    }
+    for (size_t i = 0; i < count; i++) {
+        const size_t size = (size_t)playing->judgement.seen_bytes[i];
+        PyObject *array = PyTuple_Check(seen) ? PyTuple_GetItem(seen, (Py_ssize_t)i) : seen;
+        if (array == NULL ||
+            !take_bytes(array, &t->seen_buffers[i], PyBUF_WRITABLE, r->horizon * size)) {
+            return false;
+        }
+        t->seen[i] = t->seen_buffers[i].buf;
+        t->seen_sizes[i] = size / s->count;
+    }
+    return true;
+}
+
+static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *args,
+                         PyRollout *r) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
+    const Actions *a = &playing->play.actions;
+    Py_buffer *b = r->turn.buffers;
+
+    if (!take_matrix(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, ANY_LENGTH, n)) {
+        return false;
+    }
+    const Py_ssize_t horizon = b[REWARDS].shape[0];
+    r->horizon = (size_t)horizon;
+    return take_bytes(args[ACTIONS], &b[ACTIONS], PyBUF_SIMPLE,
+                      r->horizon * (size_t)n * a->elements * a->size) &&
+           take_rolled_observations(self, playing, args[SEEN], r) &&
+           take_matrix(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN,
+                       horizon, n) &&
+           take_matrix(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, horizon,
+                       n) &&
+           take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
+                       (Py_ssize_t)playing->play.draws->count, n);
+}
+
+static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
+    PyRollout r = {.horizon = 0};
+    bool done = false;
+
+    clear_turn(playing, &r.turn);
+    if (take_rollout(self, playing, args, &r)) {
+        settle_turn(self, playing, &r.turn);
+        done = perform(self, NEVER_SHORT, do_rollout, &r) && !is_outside(&r.turn) &&
+               report_messages(self);
+    }
+    if (done && r.turn.bad_action) {
+        PyErr_SetString(PyExc_ValueError, "an action is out of range");
+        done = false;
+    }
+    release_turn(playing, &r.turn);
+    return done ? PyLong_FromSize_t(r.turn.troubled) : NULL;
+}
+
+PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+
+    if (!has_arguments(nargs, LAST) || !is_prepared(self)) {
+        return NULL;
+    }
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = roll_out(self, playing, args);
+    Py_DECREF(playing);
+    return result;
+}
+
 /* Starting episodes outside of a step */
 
 static void do_start(PyPool *self, bool alone, void *context) {

@@ -481,6 +481,7 @@ static PyMethodDef methods[] = {
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
     FAST("play", py_play),
+    FAST("rollout", py_rollout),
     {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
      METH_VARARGS | METH_KEYWORDS, NULL},
     FAST("step_single", py_step_single),
