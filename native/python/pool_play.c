@@ -191,7 +191,7 @@ static bool take_row(PyPool *self, Playing *playing, PyObject *object, Row *row)
                       (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    *row = (Row){buffer->buf, (size_t)buffer->itemsize};
+    *row = (Row){buffer->buf, (size_t)buffer->itemsize, false};
     return true;
 }
 
