@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -312,6 +312,24 @@ class CompiledEngine(BatchEngine):
             last, started = self._new_arrays(), np.empty(self._n, _BOOL)
         self._spare = np.empty(self._drawn_shape), last, started
         return self._spare
+
+    @contextmanager
+    def single(self, index: int) -> Iterator[FMUEnv]:
+        """See ``Engine.single``."""
+        if self._prepared and not self.env._in_hooks:
+            self._find_done()
+        with super().single(index) as env:
+            yield env
+
+    def _find_done(self) -> None:
+        """Ask the hook on arrays for ``done``: few callers read it, so steps do not store it."""
+        env, env._in_hooks = self.env, True
+        try:
+            with np.errstate(all="ignore"):
+                done = results.flags("_is_done", env._is_done(), self._n)
+        finally:
+            env._in_hooks = False
+        env.done = (done | self._stopped(self._pool.statuses)) & (env.step_count > 0)
 
     def call(
         self,
