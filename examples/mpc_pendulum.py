@@ -3,11 +3,11 @@
     python examples/mpc_pendulum.py
 
 Nothing is learnt. In each step of 50 ms, the controller tries 2,048 sequences of 30 torques on
-copies of the FMU and averages them, the better ones with more weight: model predictive path integral
-control (G. Williams, A. Aldrich, E. Theodorou, "Model Predictive Path Integral Control", Journal of
-Guidance, Control, and Dynamics 40(2), 2017). The plant is a rod of 1 kg and 1 m, whose largest
-torque of 2 N m is too weak to lift it directly. The FMU solves it by the classical Runge-Kutta
-method of order 4 with internal steps of 25 ms, for the controller as for the plant.
+copies of the FMU and averages them, the better ones with more weight: model predictive path
+integral control (G. Williams, A. Aldrich, E. Theodorou, "Model Predictive Path Integral Control",
+Journal of Guidance, Control, and Dynamics 40(2), 2017). The plant is a rod of 1 kg and 1 m, whose
+largest torque of 2 N m is too weak to lift it directly. The FMU solves it by the classical
+Runge-Kutta method of order 4 with internal steps of 25 ms, for the controller as for the plant.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SwingUp(fmugym.FMI2CSEnv):
 
 
 class PathIntegral:
-    """The controller: how many sequences of torques it tries in each decision, and how long ones."""
+    """The controller: how many sequences of torques it tries in a decision, and how long ones."""
 
     spread = 1.5  # the standard deviation of the torques that it tries, in N m
     temperature = 1.0  # how much worse than the best a sequence may be and still count

@@ -18,6 +18,7 @@ SLOW_MODULES = {
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
+    "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
     "test_without_native",
