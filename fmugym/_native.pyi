@@ -65,6 +65,9 @@ def statistics() -> dict[str, int]:
         that these jobs were divided into.
     """
 
+def initializations() -> int:
+    """How many initializations the pools of this process have begun."""
+
 def echo_to(memory: Array, /) -> None:
     """Write what FMUs say to memory as well, before they go on.
 

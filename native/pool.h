@@ -302,6 +302,9 @@ bool pool_knows_start(Pool *pool, size_t index, const Access *start, const doubl
 bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size);
 bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed);
 
+/* How many initializations all pools of this process have begun. */
+uint64_t number_of_initializations(void);
+
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -22,7 +23,7 @@ from fmugym.declared.variables import (
     start_value,
 )
 
-__all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term"]
+__all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
 
 BUILT_IN: Final = ("time", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
@@ -31,6 +32,12 @@ AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescal
 """The keys of the agent."""
 
 _RESERVED: Final = frozenset({*BUILT_IN, *CONSTANTS, *FUNCTIONS, "previous"})
+
+
+def is_reserved(name: str) -> bool:
+    """Whether a name cannot be an alias, because it has a meaning of its own in expressions."""
+    return name in _RESERVED or keyword.iskeyword(name)
+
 
 Limits = tuple[float, float]
 
@@ -355,7 +362,7 @@ def _check_names(root: Entry) -> None:
         for entry in _section(root, section):
             if entry.name in seen:
                 raise entry.error(f"the name {entry.name!r} is given twice")
-            if entry.name in _RESERVED:
+            if is_reserved(entry.name):
                 raise entry.error(f"{entry.name!r} has a meaning of its own in expressions")
             if not entry.name.isidentifier():
                 raise entry.error(

@@ -70,7 +70,7 @@ class Plan:
         self._seen = observed_values(declared, self._naming, self._kept, self._time_step)
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
-        self.observation_names = tuple(name for _, name in declared.observed)
+        self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 

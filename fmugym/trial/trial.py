@@ -80,6 +80,11 @@ _LOOK: Final = 0.1
 _EVERY: Final = 10.0
 """Seconds between two messages about a worker that takes long."""
 
+_FRUGAL: Final = (
+    "its initializations are slow or need licences, so no episode returned to earlier start values"
+)
+"""What a trial leaves out to need fewer initializations."""
+
 _MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
 """How glibc begins its messages about memory errors."""
 
@@ -370,7 +375,10 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
     if request.spec is not None and request.spec.keep_states and verdict.complete:
         verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
     verdict = _with_harm(verdict, request.candidate)
-    logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
+    logger.info(
+        "%s was tried with %d instance(s) at once at most, and %d initialization(s) in all",
+        *(name, verdict.instances, verdict.initializations),
+    )
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
     return verdict
@@ -394,11 +402,13 @@ class _Notes:
     def __init__(self) -> None:
         self._answer: dict[str, Any] = {}
         self._deaths: list[Outcome] = []
+        self._initializations = 0
         self.sample: bytes | None = None
 
     def add(self, outcome: Outcome) -> None:
         """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
+        self._initializations += int(outcome.answer.get("initializations", 0))
         self.sample = outcome.sample or self.sample
         if "finished" not in outcome.answer:
             self._deaths.append(outcome)
@@ -414,9 +424,11 @@ class _Notes:
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             neighbours=None if neighbours is None else Neighbours(neighbours),
             instances=int(answer.get("instances", 1)),
+            initializations=self._initializations,
             blind_start=bool(answer.get("blind_start")),
             isolate=any(death.stage in _ALONE for death in self._deaths),
-            reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
+            reasons=(_FRUGAL,) * bool(answer.get("frugal"))
+            + tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
 
     def require_licence(self, name: str, outcome: Outcome) -> None:

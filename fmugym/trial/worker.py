@@ -23,6 +23,7 @@ import numpy as np
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.errors import FMUGymError, LicenceError
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
@@ -59,7 +60,8 @@ class Notes:
         self._answer: dict[str, Any] = {}
 
     def stage(self, stage: str) -> None:
-        """Write down what comes next."""
+        """Write down what comes next, and how many initializations there were so far."""
+        self.answer(initializations=_initializations())
         (self._folder / "stage").write_text(stage)
 
     def call(self, call: str) -> None:
@@ -100,7 +102,7 @@ def main(folder: Path) -> None:
         _try(request, notes)
     except LicenceError as error:
         notes.answer(refused=str(error))
-    notes.answer(finished=True)
+    notes.answer(finished=True, initializations=_initializations())
 
 
 def _try(request: Request, notes: Notes) -> None:
@@ -119,6 +121,16 @@ def _try(request: Request, notes: Notes) -> None:
                 request.spec, reset_method=method, blind_start=notes.found("blind_start")
             )
             _try_several(replace(request, spec=spec), notes)
+
+
+def _initializations() -> int:
+    """How many initializations this process has begun."""
+    count: int = Instance.initializations
+    if has_native_pool():
+        from fmugym import _native
+
+        count += _native.initializations()
+    return count
 
 
 def _end_after(seconds: float) -> None:
@@ -190,14 +202,14 @@ def _try_resets(request: Request, notes: Notes) -> ResetMethod:
     rehearsal = _rehearsal(request, notes)
     if not rehearsal.possible:
         return ResetMethod.RESET
-    notes.answer(deterministic=rehearsal.deterministic)
+    notes.answer(frugal=rehearsal.is_frugal)
     grades: dict[ResetMethod, Grade] = {}
     for method in _methods(request):
         stage = Stage.of(method)
         notes.stage(stage)
         skipped = stage in request.skip
         grades[method] = Grade.FAILS if skipped else rehearsal.grade(method)
-        notes.answer(resets=grades)
+        notes.answer(resets=grades, deterministic=rehearsal.deterministic)
         if grades[method] == Grade.BITWISE:
             break
     if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
@@ -274,7 +286,12 @@ def _disturbed_in_threads(request: Request, notes: Notes, stage: Stage) -> bool:
         return True
     in_turn = stage is Stage.TURNS
     try:
-        return disturb_in_threads(request.candidate, request.spec, one_initialization=in_turn)
+        return disturb_in_threads(
+            request.candidate,
+            request.spec,
+            one_initialization=in_turn,
+            frugal=notes.found("frugal"),
+        )
     except LicenceError:
         raise
     except FMUGymError:  # FMPy cannot load it, or it fails without the caller's values

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -313,6 +313,24 @@ class CompiledEngine(BatchEngine):
         self._spare = np.empty(self._drawn_shape), last, started
         return self._spare
 
+    @contextmanager
+    def single(self, index: int) -> Iterator[FMUEnv]:
+        """See ``Engine.single``."""
+        if self._prepared and not self.env._in_hooks:
+            self._find_done()
+        with super().single(index) as env:
+            yield env
+
+    def _find_done(self) -> None:
+        """Ask the hook on arrays for ``done``: few callers read it, so steps do not store it."""
+        env, env._in_hooks = self.env, True
+        try:
+            with np.errstate(all="ignore"):
+                done = results.flags("_is_done", env._is_done(), self._n)
+        finally:
+            env._in_hooks = False
+        env.done = (done | self._stopped(self._pool.statuses)) & (env.step_count > 0)
+
     def call(
         self,
         name: str,
@@ -417,6 +435,8 @@ class CompiledEngine(BatchEngine):
         """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
+            if started is not None:
+                self.env.done[started] = False
         seen = result.rewards, result.observations
         if troubled or any(not_finite(values) is not None for values in seen):
             self._mend(result, resetting if started is None else started)
