@@ -98,6 +98,8 @@ SLOW_TESTS = (
     "test_rehearsals.py::test_a_step_that_fails",
     "test_rehearsals.py::test_what_a_pool_cannot",
     "test_resources.py::test_linux_libraries",
+    "test_single_compiled.py::TestWays::test_worker_processes",
+    "test_single_compiled.py::test_generated_expressions",
     "test_slow_models.py::TestProgress::test_is_not",
     "test_slow_models.py::TestTime::test_of_a_trial",
     "test_rollouts.py::TestValues::test_of_many_candidates",
