@@ -573,7 +573,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._engine.set_attribute(name, values)
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
         return tuple(self._engine.seed_of(index) for index in range(self.num_envs))
 

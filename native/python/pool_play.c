@@ -191,7 +191,7 @@ static bool take_row(PyPool *self, Playing *playing, PyObject *object, Row *row)
                       (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    *row = (Row){buffer->buf, (size_t)buffer->itemsize};
+    *row = (Row){buffer->buf, (size_t)buffer->itemsize, false};
     return true;
 }
 
@@ -340,31 +340,51 @@ static bool is_sound(const PyPool *self, const Play *play) {
     return sound;
 }
 
-static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
-    static char *names[] = {"start", "start_values", "inputs", "judgement",    "actions", "draws", "states",
-                            "episodes", "kept", "keeps_always", "copies", "variable_starts", "drawn_variables", "input_starts",
-                            NULL};
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    PyObject *start, *values, *inputs, *judgement, *actions, *draws, *states, *episodes, *kept, *copies;
-    PyObject *variable_starts, *drawn, *starts;
+/* The arguments of prepare_play. */
+typedef struct {
+    PyObject *start, *start_values, *inputs, *judgement, *actions, *draws, *states, *episodes;
+    PyObject *kept, *copies, *variable_starts, *drawn_variables, *input_starts;
     int keeps_always;
+} Parts;
 
-    if (!PyArg_ParseTupleAndKeywords(
-            args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &start, &values,
-            &PyTuple_Type, &inputs, &PyTuple_Type, &judgement, &PyDict_Type, &actions, &draws,
-            &states, &PyDict_Type, &episodes, &kept, &keeps_always, &PyTuple_Type, &copies,
-            &PyTuple_Type, &variable_starts, &PyTuple_Type, &drawn, &PyTuple_Type, &starts)) {
-        return false;
-    }
-    playing->play.keeps_always = keeps_always != 0;
-    if (!take_starts(self, playing, start, values) || !take_actions(self, playing, actions)) {
-        return false;
-    }
+static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
+    static char *names[] = {"start",         "start_values", "inputs",
+                            "judgement",     "actions",      "draws",
+                            "states",        "episodes",     "kept",
+                            "keeps_always",  "copies",       "variable_starts",
+                            "drawn_variables", "input_starts", NULL};
+
+    return PyArg_ParseTupleAndKeywords(
+        args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &p->start, &p->start_values,
+        &PyTuple_Type, &p->inputs, &PyTuple_Type, &p->judgement, &PyDict_Type, &p->actions,
+        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->keeps_always,
+        &PyTuple_Type, &p->copies, &PyTuple_Type, &p->variable_starts, &PyTuple_Type,
+        &p->drawn_variables, &PyTuple_Type, &p->input_starts);
+}
+
+static bool take_programs(PyPool *self, Playing *playing, const Parts *p) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
     const size_t elements = playing->play.actions.elements;
-    if (!take_program(inputs, n, elements, &playing->inputs) ||
-        !take_program(judgement, n, elements, &playing->judgement) ||
-        !take_draws(self, playing, draws, states) || !take_episodes(self, playing, episodes) ||
-        !take_kept(self, playing, kept) || !take_variables(self, playing, copies, variable_starts, drawn) || !take_input_starts(self, playing, starts)) {
+
+    return take_program(p->inputs, n, elements, &playing->inputs) &&
+           take_program(p->judgement, n, elements, &playing->judgement);
+}
+
+/* What comes later refers to what comes first. */
+static bool take_parts(PyPool *self, Playing *playing, const Parts *p) {
+    playing->play.keeps_always = p->keeps_always != 0;
+    return take_starts(self, playing, p->start, p->start_values) &&
+           take_actions(self, playing, p->actions) && take_programs(self, playing, p) &&
+           take_draws(self, playing, p->draws, p->states) &&
+           take_episodes(self, playing, p->episodes) && take_kept(self, playing, p->kept) &&
+           take_variables(self, playing, p->copies, p->variable_starts, p->drawn_variables) &&
+           take_input_starts(self, playing, p->input_starts);
+}
+
+static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
+    Parts parts;
+
+    if (!parse(args, kwargs, &parts) || !take_parts(self, playing, &parts)) {
         return false;
     }
     settle_play(self, playing);

@@ -283,7 +283,8 @@ class CompiledEngine(BatchEngine):
         self.has_moved = True
         troubled = self._start(mask, seen, drawn)
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
-        infos = restricted(infos, mask) | _start_infos(self.env._plan, drawn, mask)
+        starts = _start_infos(self.env._plan, drawn, mask)
+        infos = restricted(infos, mask) | starts if infos else starts
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:

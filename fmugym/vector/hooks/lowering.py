@@ -197,7 +197,7 @@ class _Compiler:
             code,
             self._constants_in(registers),
             np.array(self._slots, SLOT),
-            tuple(_call(*call) for call in self._calls),  # type: ignore[misc]
+            tuple(_call(*call) for call in self._calls),  # type: ignore[misc]  # mypy does not follow *call
             tuple(self._rows),
             tuple(self._graph.tables[key] for key in self._tables),
             max(registers.values(), default=-1) + 1,

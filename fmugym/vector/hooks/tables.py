@@ -129,7 +129,7 @@ def _flat_index(graph: Graph, keys: Sequence[Any], lengths: Sequence[int]) -> Sy
     flat: Any = offsets[0]
     for offset in offsets[1:]:
         flat = flat + offset
-    return flat  # type: ignore[no-any-return]
+    return flat  # type: ignore[no-any-return]  # numpy's stubs
 
 
 def _column(table: Symbols, column: npt.NDArray[Any], index: npt.NDArray[Any]) -> Any:
