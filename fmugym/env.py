@@ -24,7 +24,6 @@ from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
-from fmugym.task.readings import LateReading
 from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
@@ -119,17 +118,6 @@ class FMUEnv(Constructed):
     _width = 0
     _tells = False
 
-    # Where these are not attributes of the environment, the pool keeps them.
-    _values = LateReading()
-    state = LateReading()
-    previous_state = LateReading()
-    inputs = LateReading()
-    action = LateReading()
-    previous_action = LateReading()
-    step_count = LateReading()
-    done = LateReading()
-    variables = LateReading()
-
     def __init__(
         self,
         fmu_path: str | os.PathLike[str],
@@ -178,7 +166,8 @@ class FMUEnv(Constructed):
             self._prepare_player(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
-        episode = plan.draw(self.np_random)
+        generator = self._np_random
+        episode = plan.draw(self.np_random if generator is None else generator)
         self._ended = True  # there is no episode if the FMU fails
         try:
             pool.reset(plan.model_variables, episode.start_values)
@@ -216,7 +205,8 @@ class FMUEnv(Constructed):
         self.variables.update(episode.variables)
         self.step_count = 0
         self.action = self.previous_action = self._no_action
-        self.inputs = tuple(self.parameters.get(n, start) for n, start in self._start_inputs)
+        given = self.parameters.get
+        self.inputs = tuple([given(name, start) for name, start in self._start_inputs])
         self.done = self.after_end = False
         self._values = tuple(self._output_row.tolist())
         self.state = self.previous_state = self._values[: self._output_count]
@@ -292,8 +282,7 @@ class FMUEnv(Constructed):
             self._ended = True
             self._halt()
             raise
-        if self._play is not None:
-            self._player.give_back(self)
+        self._player.doubt(self)
         return None
 
     def _completed(self, result: Result) -> Result:

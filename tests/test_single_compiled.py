@@ -380,6 +380,9 @@ class TestWays:
         env = Overriding(hooks="compiled")
         with pytest.raises(ConfigError, match="step is overridden"):
             env.reset(seed=0)
+        env.close()
+
+    def test_worker_processes_run_no_compiled_hooks(self):
         env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
         with pytest.raises(ConfigError, match="pool"):
             env.reset(seed=0)
