@@ -25,7 +25,7 @@ from fmugym.declared.variables import (
 
 __all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
 
-BUILT_IN: Final = ("time", "elapsed", "step", "dt", "dt_h", "done")
+BUILT_IN: Final = ("time", "clock", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
 
 AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescale", "normalize"),)

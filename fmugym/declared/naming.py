@@ -14,7 +14,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Code, Expression, Names, code_of_number
 from fmugym.declared.variables import Record, converted
 
-__all__ = ["Moment", "Naming", "switch_names"]
+__all__ = ["CLOCK", "Moment", "Naming", "switch_names"]
 
 
 class Moment(Enum):
@@ -27,6 +27,9 @@ class Moment(Enum):
     SEEN = "when the agent observes, between two steps"
     FORECAST = "at a later time, which only functions of time know"
 
+
+CLOCK: Final = "clock"
+"""The episode variable with the time of data at the beginning of an episode."""
 
 _SECONDS_PER_HOUR: Final = 3600.0
 
@@ -153,7 +156,8 @@ class Naming:
         if series.is_stepped:
             is_over = moment in (Moment.AFTER, Moment.JUDGED, Moment.UPDATED)
             shift += (_JUST - 1.0 if is_over else _JUST) * self._time_step
-        place = f"remainder((env.time + {shift - series.start!r}), {series.period!r})"
+        now, shift = self._clock(), shift - series.start
+        place = f"remainder(({now} + {shift!r}), {series.period!r})"
         self.constants[f"times_{name}"] = series.times
         self.constants[f"values_{name}"] = series.values
         return f"interp({place}, times_{name}, values_{name})"
@@ -162,6 +166,8 @@ class Naming:
         match name:
             case "time":
                 return Code(f"(env.time + {self._ahead!r})" if self._ahead else "env.time")
+            case "clock":
+                return Code(f"({self._clock()} + {self._ahead!r})")
             case "elapsed":
                 return Code(f"(env.step_count * {self._time_step!r} + {self._ahead!r})")
             case "step":
@@ -171,6 +177,12 @@ class Naming:
             case "dt":
                 return code_of_number(self._time_step)
         return code_of_number(self._time_step / _SECONDS_PER_HOUR)
+
+    def _clock(self) -> str:
+        """Code for the time of data now; that of the FMU if the task sets no other clock."""
+        if self._declared.root.child("clock").value is None:
+            return "env.time"
+        return f"(env.variables[{CLOCK!r}] + env.step_count * {self._time_step!r})"
 
     def _done(self, moment: Moment) -> Code | None:
         if moment is Moment.JUDGED:

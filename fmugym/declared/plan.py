@@ -15,9 +15,10 @@ from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
-from fmugym.declared.naming import Moment, Naming, switch_names
+from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
 from fmugym.declared.observing import histories, normalized, observed_values, remember
 from fmugym.declared.quantities import duration
+from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
@@ -109,7 +110,15 @@ class Plan:
             state, since = switch_names(record)
             switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
-        return remembered | histories | switches | worst
+        return remembered | self._clock() | histories | switches | worst
+
+    def _clock(self) -> dict[str, Any]:
+        """When episodes begin, if the task has a clock of its own."""
+        clock, scenarios = self._root.child("clock"), read_scenarios(self._root.child("scenarios"))
+        if clock.value is None:
+            return {}
+        length = self._times().get("max_episode_steps", 0) * self._time_step
+        return {CLOCK: read_clock(clock, scenarios, length)}
 
     @property
     def _switched(self) -> list[Record]:
