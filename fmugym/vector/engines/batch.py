@@ -311,6 +311,12 @@ class BatchEngine(Engine):
         self._longest = max(self._longest, int(self.env.step_count.max()))
         self._note_foreign(indices, self._has_other_constants(columns["parameters"], indices))
 
+    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
+        """See ``Engine.show_parameters``."""
+        for name, numbers in values.items():
+            self._row(name)[:] = numbers
+        self._note_foreign(slice(None), True)
+
     def _has_other_constants(self, names: Iterable[str], indices: IndexArray) -> bool:
         """Whether these parameters of environments are not all those of the plan."""
         plan = self.env._plan
