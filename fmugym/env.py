@@ -24,7 +24,7 @@ from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
-from fmugym.task.results import FLOAT32_LIMIT, as_info
+from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
@@ -427,7 +427,7 @@ class FMUEnv(Constructed):
         observation = self._get_observation()
         if not self._is_finite(observation):
             raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
-        return observation, self.config.fault_reward, self.done, not self.done, info
+        return observation, as_reward(self._fault_reward()), self.done, not self.done, info
 
     # Snapshots.
 

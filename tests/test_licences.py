@@ -317,6 +317,18 @@ class TestInitializations:
         fmugym.FMUVectorEnv(make, 2).close()
         assert known_verdict(fmugym.FMU(path)).initializations <= 19
 
+    def test_what_is_known_of_one_is_not_tried_again(self, folder, seats):
+        seats.limit(2)
+        path = make_fmu(folder, "licensed")
+        make = functools.partial(DemandingEnv, path, max_initializations_per_second=20.0)
+        make().close()
+        before = known_verdict(fmugym.FMU(path))
+        fmugym.FMUVectorEnv(make, 2).close()
+        after = known_verdict(fmugym.FMU(path))
+        assert after.neighbours == "independent"
+        assert after.resets == before.resets != {}
+        assert after.initializations <= before.initializations + 13
+
     def test_slow_ones_are_measured(self, folder, seats, monkeypatch):
         monkeypatch.setattr(rehearsal, "_SLOW_INITIALIZATION", 0.0)
         candidate = Candidate.of(fmugym.FMU(make_fmu(folder, "licensed")))

@@ -1,11 +1,14 @@
 """A single environment with compiled hooks equals the same one with its hooks in Python."""
 
 import copy
+import gc
 import logging
 import math
 import pickle
 import random
 import warnings
+import weakref
+from types import MethodType
 
 import gymnasium as gym
 import numpy as np
@@ -197,6 +200,25 @@ class TestAttributes:
         env._reward_policy = lambda: 7.0
         assert env.step(0)[1] == 7.0
         assert env.step(0)[1] == 7.0
+
+    def test_methods_that_are_attributes(self):
+        class Bound(Drawing):
+            def __init__(self):
+                self._reward_policy = MethodType(lambda env: 2.0 * env.state[0], self)
+                super().__init__()
+
+        env = with_hooks(Bound, "compiled")
+        env.reset(seed=0)
+        assert env.step(env._no_action)[1] == 2.0 * env.state[0]
+        assert env._play is not None
+        env._reward_policy = MethodType(lambda env: 3.0 * env.state[0], env)
+        env.reset()
+        assert env.step(env._no_action)[1] == 3.0 * env.state[0]
+        reference = weakref.ref(env)
+        env.close()
+        del env
+        gc.collect()
+        assert reference() is None
 
     def test_changes_inside_of_arrays_and_lists_are_noticed(self):
         class Weighted(Drawing):

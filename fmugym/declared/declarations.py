@@ -25,7 +25,7 @@ from fmugym.declared.variables import (
 
 __all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
 
-BUILT_IN: Final = ("time", "elapsed", "step", "dt", "dt_h", "done")
+BUILT_IN: Final = ("time", "clock", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
 
 AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescale", "normalize"),)
@@ -268,6 +268,11 @@ class Declarations:
         actions = [self.records.find(e, e.text(), "action") for e in self._listed("actions")]
         for record in actions:
             self.records.check_input(entry, record)
+            if record.variable is None and not record.is_direct:
+                raise record.entry.error(
+                    f"{record.alias!r} is no input of the FMU: 'delta', 'rate', 'min_on' and "
+                    "'min_off' are for inputs"
+                )
         if len({bool(record.levels) for record in actions}) > 1:
             raise entry.error("either all actions have levels, or none has")
         for record in actions:

@@ -41,6 +41,7 @@ class Player:
         self._pause = STEPS_BEFORE // 2
         self._wait = 0
         self._known = -1
+        self._has_methods = False
         self._task: SingleTask | None = None
         self._variables: Any = None
         self._ended_by_task = False
@@ -54,7 +55,7 @@ class Player:
             has stepped, but Python must judge it. Without compiled hooks, None.
         """
         attributes = vars(env)
-        if self._task is not None and len(attributes) != self._known:
+        if self._task is not None and (self._has_methods or len(attributes) != self._known):
             self._look_again(self._task, attributes)
         if self._task is None:
             if self._wait > 0:
@@ -110,6 +111,7 @@ class Player:
         self._parameters = np.zeros((len(env.parameters), 1))
         self._count = np.zeros(1, np.int64)
         self._seen = tuple(np.zeros(array.shape, array.dtype) for array in task.seen)
+        self._has_methods = any(one.is_method for one in task.watched)
         self._reads_inputs = task.inputs.loads("input")
         self._reads_parameters = task.loads("parameter")
         self._reads_actions = task.loads("load_previous_action")
@@ -134,7 +136,7 @@ class Player:
             copies=tuple(own or [env._observation_row.copy]),
             names=task.keys,
             observed=env._pool_observes,
-            watched=tuple(map(tuple, task.watched)),
+            watched=tuple(tuple(one) for one in task.watched if not one.is_method),
         )
 
     def _actions_of(self, env: FMUEnv, task: SingleTask) -> dict[str, Any]:

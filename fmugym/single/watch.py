@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
+from types import MethodType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,11 @@ class Watched(NamedTuple):
     name: str
     value: Any
     copy: Any
+
+    @property
+    def is_method(self) -> bool:
+        """Whether it is a method; the pool must not hold it, since it leads to the environment."""
+        return isinstance(self.value, MethodType)
 
     def is_in(self, attributes: Mapping[str, Any]) -> bool:
         """Whether the attribute is still the same object, with the same contents."""
@@ -79,6 +85,8 @@ def watched_in(attributes: Mapping[str, Any], names: set[str]) -> tuple[Watched,
 def _watched(name: str, value: Any) -> Watched:
     if type(value) is np.ndarray and value.dtype.kind in "biufc" and value.flags.c_contiguous:
         return Watched(name, value, value.tobytes())
+    if isinstance(value, MethodType) and isinstance(value.__self__, FMUEnv):
+        return Watched(name, value, None)
     if not is_plain(value):
         raise UntraceableError(
             f"it reads self.{name}, and changes inside of a {type(value).__name__} are not noticed"

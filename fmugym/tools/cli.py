@@ -5,8 +5,8 @@
     fmugym info model.fmu [--json] [--all] [--filter GLOB]
     fmugym new model.fmu [--output task.toml]
     fmugym validate task.toml|model.fmu|ID|module:Class [--json]
-    fmugym simulate task.toml|ID|module:Class [--action random|NUMBERS] [--seed N] [--episodes N]
-        [--steps N] [--output run.csv] [--json]
+    fmugym simulate task.toml|ID|module:Class [--action random|NUMBERS] [--scenario NAME]
+        [--seed N] [--episodes N] [--steps N] [--output run.csv] [--json]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
 
@@ -157,6 +157,7 @@ def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     command.add_argument(
         "--action", default="random", help="random (default), or the numbers of one action: 0.5,-1"
     )
+    command.add_argument("--scenario", help="a scenario of the task file")
     command.add_argument("--seed", type=int, default=0, help="of the first episode; default 0")
     command.add_argument("--episodes", type=int, default=1, help="default 1")
     command.add_argument("--steps", type=int, default=10_000, help="at most, in each episode")
@@ -224,7 +225,7 @@ def _simulate(arguments: argparse.Namespace) -> None:
     check_count("--episodes", arguments.episodes)
     check_count("--steps", arguments.steps)
     with ExitStack() as stack:
-        env = stack.enter_context(closing(maker_of(arguments.task)()))
+        env = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
         policy = action_of(env, arguments.action)
         output = arguments.output
         table = None if output is None else stack.enter_context(_new_table(output))

@@ -18,12 +18,13 @@ from fmugym.tools.proposal import Proposal
 __all__ = ["maker_of"]
 
 
-def maker_of(target: str) -> Callable[[], FMUEnv]:
+def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
     """Find what a text names.
 
     Args:
         target: The path of a task file or an FMU, a registered id, or ``"module:Class"``. For an
             FMU it is the task that ``fmugym new`` proposes.
+        scenario: A scenario of the task file; None for any episodes.
 
     Returns:
         A function that makes the environment.
@@ -36,7 +37,9 @@ def maker_of(target: str) -> Callable[[], FMUEnv]:
     if path.suffix.lower() == ".fmu":
         return partial(load, Task.from_dict(tomllib.loads(Proposal(FMU(path)).text())))
     if path.suffix.lower() == ".toml" or path.is_file():
-        return partial(load, Task.read(path))
+        return partial(load, Task.read(path), scenario=scenario)
+    if scenario is not None:
+        raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
     module, separator, name = target.partition(":")
     if separator and name.isidentifier() and "/" not in module:
         return partial(load, Task.from_dict({"class": target}))

@@ -44,6 +44,7 @@ from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = [
+    "FRUGAL",
     "Candidate",
     "Outcome",
     "Request",
@@ -80,7 +81,7 @@ _LOOK: Final = 0.1
 _EVERY: Final = 10.0
 """Seconds between two messages about a worker that takes long."""
 
-_FRUGAL: Final = (
+FRUGAL: Final = (
     "its initializations are slow or need licences, so no episode returned to earlier start values"
 )
 """What a trial leaves out to need fewer initializations."""
@@ -157,6 +158,7 @@ class Request:
         starts: The ``Starts`` of two episodes, or None for the FMU's own start values.
         several: Whether to try several instances.
         alone: Whether it is known that instances must not share a copy of the library.
+        known: The ``Verdict`` of an earlier trial if it lacks only what several instances need.
         skip: The stages in which an earlier worker died.
         sample: The ``Sample`` of an initial state that another worker has made, if this one has to
             try only that.
@@ -171,6 +173,7 @@ class Request:
     several: bool = False
     alone: bool = False
     skip: frozenset[str] = frozenset()
+    known: Any = None
     sample: Any = None
     resume: Any = None
     check_memory: bool = True
@@ -273,7 +276,10 @@ def examine(
     known = Verdict.from_text(recall(key))
     if known is not None and _answers(known, spec, several):
         return _with_harm(known, candidate)
-    found = _examine(Request(candidate, spec, starts, several, alone), must_survive)
+    request = Request(candidate, spec, starts, several, alone)
+    if known is not None and known.complete and _answers(known, spec, several=False):
+        request = replace(request, known=known, check_memory=not known.isolate)
+    found = _examine(request, must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found
@@ -372,7 +378,9 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
     verdict = notes.verdict
-    if request.spec is not None and request.spec.keep_states and verdict.complete:
+    if request.known is not None:
+        verdict = _completed(request.known, verdict)
+    elif request.spec is not None and request.spec.keep_states and verdict.complete:
         verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
     verdict = _with_harm(verdict, request.candidate)
     logger.info(
@@ -382,6 +390,17 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
     return verdict
+
+
+def _completed(known: Verdict, found: Verdict) -> Verdict:
+    """Add to a verdict what several instances need."""
+    return replace(
+        known,
+        neighbours=found.neighbours,
+        instances=found.instances,
+        initializations=known.initializations + found.initializations,
+        reasons=tuple(dict.fromkeys((*known.reasons, *found.reasons))),
+    )
 
 
 def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -> Grade:
@@ -427,7 +446,7 @@ class _Notes:
             initializations=self._initializations,
             blind_start=bool(answer.get("blind_start")),
             isolate=any(death.stage in _ALONE for death in self._deaths),
-            reasons=(_FRUGAL,) * bool(answer.get("frugal"))
+            reasons=(FRUGAL,) * bool(answer.get("frugal"))
             + tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
 

@@ -548,7 +548,7 @@ class BatchEngine(Engine):
         texts[faulty] = list(reasons.values())
         rates = fault_rates(self._pool.health())
         result.infos.update(coded({"fault": texts, "fault_rate": rates}, faulty))
-        result.rewards[faulty] = config.fault_reward
+        result.rewards[faulty] = results.rewards(env._fault_reward(), self._n)[faulty]
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"
 
