@@ -385,6 +385,13 @@ class Pool:
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
 
+    def write(self, access: Access, values: Array, /) -> int:
+        """Set variables of all instances between two steps.
+
+        Returns:
+            The index of an instance that failed, or -1.
+        """
+
     def bundle(self, indices: Array, ends: Array, steps: Array, /) -> bytes | int:
         """Serialize the states of M instances.
 

@@ -307,6 +307,8 @@ uint64_t number_of_initializations(void);
 
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
+/* Sets variables between two steps. Returns the index of the first instance that fails, or -1. */
+ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values);
 
 /* Snapshots. A new snapshot belongs to the pool that saves its states in it. */
 

@@ -158,6 +158,53 @@ class TestValues:
         envs.close()
 
 
+class TestParameters:
+    @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+    @pytest.mark.parametrize("version", ["2.0", "3.0"])
+    def test_of_each_candidate(self, way, version):
+        """A tunable friction, also read by a hook; the same values set before the reset."""
+
+        class Rubbing(Track):
+            def __init__(self, b=1e-4):
+                parameters = {"b": b, "q_0": 0.5, "m": 0.06}
+                super().__init__(fmi_version=version, model_parameters=parameters)
+
+            def _reward_policy(self):
+                return self.out["q"] * self.parameters["b"]
+
+        frictions = np.array([0.0, 1e-4, 2e-4, 3e-4, 1e-3])
+        with Rubbing() as env:
+            env.reset(seed=0)
+            snapshot, actions = env.save_state(), actions_for(env)
+        envs = vector_of(Rubbing, 3, **way)
+        found = envs.rollout(snapshot, actions, parameters={"b": frictions})
+        for index, b in enumerate(frictions):
+            with Rubbing(b) as env:
+                env.reset(seed=0)
+                for step in range(HORIZON):
+                    observation, reward, *_ = env.step(actions[index, step])
+                    assert observation.tolist() == found.observations[index, step].tolist()
+                    assert reward == found.rewards[index, step]
+        same = envs.rollout(snapshot, actions, parameters={"b": 1e-4})
+        assert rows_of(same) == rows_of(envs.rollout(snapshot, actions))
+        envs.close()
+
+    def test_that_are_refused(self):
+        env, envs = halfway(), vector_of(Track, 2)
+        snapshot, actions = env.save_state(), actions_for(env, 2)
+        for parameters, reason in (
+            ({"m": 0.1}, "fixed parameter"),
+            ({"tau": 0.1}, "continuous input"),
+            ({"bb": 0.1}, "'b'"),
+            ({"b": [0.1]}, "1 values of 'b', expected 2"),
+            ({"b": [0.1, float("nan")]}, "finite"),
+            ("b", "parameters"),
+        ):
+            with pytest.raises(ConfigError, match=reason):
+                envs.rollout(snapshot, actions, parameters=parameters)
+        envs.close()
+
+
 class TestFaults:
     @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
     @pytest.mark.parametrize("policy", ["truncate", "terminate"])

@@ -187,6 +187,18 @@ class Pool(ABC):
         """
         raise SimulationError(f"a {type(self).__name__} has no states that could be saved")
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """Set tunable parameters of all instances between two steps.
+
+        Args:
+            variables: The parameters, P of them.
+            values: Shape (P, N).
+
+        Raises:
+            SimulationError: If the pool cannot do it, or an instance refuses.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot set parameters between steps")
+
     def restore_instances(
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> StatusArray:

@@ -335,6 +335,13 @@ class NativePool(SavingPool):
             index, self._access(variables), values.tobytes(), state.outputs, state.data
         )
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """See ``Pool.write``."""
+        values = np.ascontiguousarray(values, np.float64)
+        failed = self._open_pool().write(self._access(variables), values)
+        if failed >= 0:
+            raise SimulationError(self.failure(failed))
+
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)

@@ -40,7 +40,13 @@ from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
-from fmugym.vector.rollouts import Candidates, Rollout, joined_rollouts, roll_out_by_steps
+from fmugym.vector.rollouts import (
+    Candidates,
+    Rollout,
+    joined_rollouts,
+    roll_out_by_steps,
+    tunable_values,
+)
 from fmugym.vector.saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv"]
@@ -410,7 +416,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return self._engine.observe(indices)
 
     def rollout(
-        self, snapshot: Snapshot | None, actions: Any, *, horizon: int | None = None
+        self,
+        snapshot: Snapshot | None,
+        actions: Any,
+        *,
+        horizon: int | None = None,
+        parameters: Mapping[str, Any] | None = None,
     ) -> Rollout:
         """Find out what candidates for the next actions would lead to.
 
@@ -425,14 +436,18 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 returns the actions of N environments, as for ``step``, from their observations;
                 there are N candidates then.
             horizon: The number of steps of a policy.
+            parameters: Tunable parameters of the FMU that candidates have from here on: an array of
+                shape (n,), or one number for all, by name. For other parameters, let each candidate
+                begin with an episode that has been reset with its own.
 
         Raises:
-            ConfigError: If the snapshot or the actions do not fit.
+            ConfigError: If the snapshot, the actions or the parameters do not fit.
             SimulationError: If an episode of the snapshot has ended, an FMU cannot be restored, or,
                 with ``on_fault="raise"``, a step fails.
         """
         self._open_pool("rollout")
         candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
+        candidates.parameters = tunable_values(self._prototype, parameters, candidates.count)
         present = self.save_state() if self._is_ready else None
         start = self._start_of_rollout(snapshot, present, candidates.count)
         try:
@@ -462,23 +477,30 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _roll_out(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
         """Let each environment play the candidate at its place."""
-        engine = self._engine
-        sources = places if len(start) > 1 else np.zeros_like(places)
-        self._place(start, sources)
-        actions = candidates.actions(places)
+        engine, actions = self._engine, candidates.actions(places)
+        self._begin(start, places, candidates)
         if actions is not None:
             engine.has_moved = False
             arrays = engine.roll_out(actions)
             if arrays is not None:
                 return Rollout.of(*arrays)
             if engine.has_moved:  # a step has failed: the engine knows what follows
-                self._place(start, sources)
+                self._begin(start, places, candidates)
         first = None if actions is not None else engine.observe(np.arange(self.num_envs))
         starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
         try:
             return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
         finally:
             engine.starts_at_ends = starts_at_ends
+
+    def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
+        """Bring all environments to the places where candidates begin."""
+        self._place(start, places if len(start) > 1 else np.zeros_like(places))
+        values = {name: column[places] for name, column in candidates.parameters.items()}
+        if values:
+            variables = tuple(map(self._prototype.fmu.variable, values))
+            self._pool.write(variables, np.stack(list(values.values())))
+            self._engine.show_parameters(values)
 
     def _place(self, snapshot: Snapshot, sources: IndexArray) -> None:
         """Let all environments go on from episodes of a snapshot that fits."""

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.checks import check_mapping
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.interface import checked_value
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.infos import copy_rows
 
-__all__ = ["Candidates", "Rollout", "joined_rollouts", "roll_out_by_steps"]
+__all__ = ["Candidates", "Rollout", "joined_rollouts", "roll_out_by_steps", "tunable_values"]
 
 
 class Rollout(NamedTuple):
@@ -84,6 +88,9 @@ class Candidates:
             Environments that are left over play the last candidate, too.
     """
 
+    parameters: Mapping[str, FloatArray] = MappingProxyType({})
+    """What the tunable parameters of each candidate are, arrays of shape (n,) by name."""
+
     def __init__(self, count: int, horizon: int, num_envs: int, given: Any) -> None:
         self.count, self.horizon, self._given = count, horizon, given
         firsts = range(0, count, num_envs)
@@ -119,6 +126,38 @@ class Candidates:
         if actions is None:
             return lambda step, observations: policy(observations)
         return lambda step, observations: actions[step]
+
+
+def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.NDArray[np.float64]]:
+    """Check the parameters of candidates.
+
+    Args:
+        env: Its FMU has the parameters.
+        parameters: An array of shape (n,), or one number for all, by name; None for none.
+        count: n.
+
+    Returns:
+        Arrays of shape (n,) by name.
+
+    Raises:
+        ConfigError: If a parameter is unknown or cannot be set between two steps, or its values do
+            not fit.
+    """
+    given = {} if parameters is None else check_mapping("'parameters'", parameters)
+    found = {}
+    for name, values in given.items():
+        variable = env.fmu.variable(name)
+        if (variable.causality, variable.variability) != ("parameter", "tunable"):
+            raise ConfigError(
+                f"{name!r} is a {variable.variability} {variable.causality}: an FMU lets only "
+                "tunable parameters be set between two steps. Let the candidates begin with "
+                "episodes of their own, whose resets have drawn it"
+            )
+        each = [values] * count if np.ndim(values) == 0 else values
+        if len(each) != count:
+            raise ConfigError(f"there are {len(each)} values of {name!r}, expected {count}")
+        found[name] = np.array([checked_value(variable, value) for value in each])
+    return found
 
 
 def _checked_array(space: Any, actions: Any) -> npt.NDArray[Any]:

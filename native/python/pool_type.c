@@ -491,6 +491,7 @@ static PyMethodDef methods[] = {
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),
     FAST("read", py_read),
+    FAST("write", py_write),
     {"failure", py_failure, METH_O, NULL},
     FAST("knows_start", py_knows_start),
     {"pack", py_pack, METH_O, NULL},

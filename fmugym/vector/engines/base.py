@@ -132,6 +132,10 @@ class Engine(ABC):
     def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
         """Let environments go on from columns; environment ``indices[i]`` from ``sources[i]``."""
 
+    @abstractmethod
+    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
+        """Let hooks read other values of parameters, arrays of shape (N,), in these episodes."""
+
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """Do many steps in one call; nobody needs the episodes afterwards.
 
