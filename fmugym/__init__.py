@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     )
     from fmugym.fmi.status import Status
     from fmugym.pool import Backend, Paced
+    from fmugym.recording import Recorder, Recording, replay
     from fmugym.task.snapshot import Snapshot
     from fmugym.tools.linearization import LinearModel, linearize
     from fmugym.vector import FMUVectorEnv
@@ -53,6 +54,8 @@ __all__ = [
     "LogUniform",
     "Normal",
     "Paced",
+    "Recorder",
+    "Recording",
     "SimulationError",
     "Snapshot",
     "Status",
@@ -65,6 +68,7 @@ __all__ = [
     "linearize",
     "load",
     "register",
+    "replay",
 ]
 
 _MODULES = {
@@ -81,6 +85,7 @@ _MODULES = {
     ],
     "fmi.status": ["Status"],
     "pool": ["Backend", "Paced"],
+    "recording": ["Recorder", "Recording", "replay"],
     "task.snapshot": ["Snapshot"],
     "tools.linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
