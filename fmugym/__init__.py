@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from fmugym.task.snapshot import Snapshot
     from fmugym.tools.linearization import LinearModel, linearize
     from fmugym.vector import FMUVectorEnv
+    from fmugym.vector.sensitivities import derivatives
 
 __all__ = [
     "FMU",
@@ -64,6 +65,7 @@ __all__ = [
     "TaskError",
     "Uniform",
     "bundled_fmu",
+    "derivatives",
     "envs",
     "linearize",
     "load",
@@ -89,6 +91,7 @@ _MODULES = {
     "task.snapshot": ["Snapshot"],
     "tools.linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
+    "vector.sensitivities": ["derivatives"],
 }
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),
