@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import warnings
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -125,17 +126,21 @@ def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, An
     return gym.make_vec(FMUGYM, num_envs, **options)
 
 
-def vector_run(env: Any) -> Run:
+def vector_run(env: Any, chosen: Sequence[Any] | None = None) -> Run:
     """Make a run of steps of a vector environment in its autoreset mode.
 
     A step that only resets an environment, as in ``NEXT_STEP``, is not a transition and does not
     count. In ``DISABLED``, masked resets follow the steps. The clocks stand still while counting.
+
+    Args:
+        env: The vector environment.
+        chosen: The actions of ``STEPS`` steps; None for those of a cart-pole.
     """
-    mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+    mode = getattr(env, "metadata", {}).get("autoreset_mode", AutoresetMode.NEXT_STEP)
     block = _step_and_reset_block if mode is AutoresetMode.DISABLED else _step_block
     workers = [process.pid for process in getattr(env, "processes", ())]
-    dtype = env.action_space.dtype
-    chosen = list(actions(env.num_envs).astype(dtype))
+    if chosen is None:
+        chosen = list(actions(env.num_envs).astype(env.action_space.dtype))
     env.reset(seed=0) if workers else env.reset()
     resetting = 0
 
@@ -153,9 +158,7 @@ def vector_run(env: Any) -> Run:
     return run
 
 
-def _step_block(
-    env: Any, chosen: list[npt.NDArray[np.integer[Any]]], watch: Stopwatch
-) -> list[int]:
+def _step_block(env: Any, chosen: Sequence[Any], watch: Stopwatch) -> list[int]:
     """Step once per action; return how many episodes each step has ended."""
     step, flags = env.step, []
     watch.start()
@@ -166,9 +169,7 @@ def _step_block(
     return [int(np.count_nonzero(one | other)) for one, other in flags]
 
 
-def _step_and_reset_block(
-    env: Any, chosen: list[npt.NDArray[np.integer[Any]]], watch: Stopwatch
-) -> list[int]:
+def _step_and_reset_block(env: Any, chosen: Sequence[Any], watch: Stopwatch) -> list[int]:
     """Step once per action, and reset the environments whose episodes have ended."""
     step, reset = env.step, env.reset
     watch.start()

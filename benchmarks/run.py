@@ -28,6 +28,7 @@ import loaded
 import memory
 import overlap
 import reset
+import rollouts
 import single
 import tasks
 import vector
@@ -39,6 +40,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "vector": vector.tables,
     "tasks": tasks.tables,
     "reset": reset.tables,
+    "rollouts": rollouts.tables,
     "heavy": heavy.tables,
     "isolation": isolation.tables,
     "overlap": overlap.tables,

@@ -8,7 +8,9 @@ from typing import Any
 
 import cart_poles
 import gymnasium as gym
-from cart_poles import GYMNASIUM
+from by_hand import TrackingByHand
+from cart_poles import GYMNASIUM, STEPS
+from gymnasium.vector.utils import batch_space
 from measure import (
     Effort,
     Run,
@@ -21,6 +23,9 @@ from measure import (
     wall_rate,
 )
 from tables import Table, rate, share, times
+from user_tasks import Tracking
+
+import fmugym
 
 __all__ = ["tables"]
 
@@ -29,6 +34,9 @@ MOST = {"fmugym, Python pool": 64, "Gymnasium SyncVectorEnv": 64, "Gymnasium Asy
 """The largest sizes; larger ones would take longer and show nothing new."""
 
 BASE, LIMIT = "Gymnasium make_vec (numpy)", "C limit, 1 thread"
+TRACKING, TRACKING_BASE = "tracking task, fmugym, 1 thread", "tracking task, by hand in numpy"
+"""A task of a user; its ratio is to the same task written by hand."""
+
 TITLES = (
     "Vector environments: steps/s, and how many times that of Gymnasium's numpy vector",
     "Vector environments: steps/CPU-s, and wall-clock share of the C limit with as many threads",
@@ -77,10 +85,27 @@ def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run
     yield BASE, lambda: _gymnasium(stack, size, "vector_entry_point")
     yield "Gymnasium SyncVectorEnv", lambda: _gymnasium(stack, size, "sync")
     yield "Gymnasium AsyncVectorEnv", lambda: _gymnasium(stack, size, "async", context="spawn")
+    yield TRACKING, lambda: _tracking(stack, size, by_hand=False)
+    yield TRACKING_BASE, lambda: _tracking(stack, size, by_hand=True)
     for count, text in threads.items():
         yield f"EnvPool, {text}", lambda n=count: cart_poles.envpool_run(stack, size, n)
     for count, text in threads.items():
         yield f"C limit, {text}", lambda n=count: cart_poles.c_limit_run(size, n)
+
+
+def _tracking(stack: ExitStack, size: int, by_hand: bool) -> Run:
+    cart_poles.require_native_pool()
+    prototype = Tracking()
+    stack.callback(prototype.close)
+    space = batch_space(prototype.action_space, size)
+    space.seed(0)
+    env: Any = (
+        TrackingByHand(prototype, size, prototype.config.max_episode_steps)
+        if by_hand
+        else fmugym.FMUVectorEnv(Tracking, size, threads=1)
+    )
+    stack.callback(env.close)
+    return cart_poles.vector_run(env, [space.sample() for _ in range(STEPS)])
 
 
 def _fmugym(stack: ExitStack, size: int, **options: Any) -> Run:
@@ -100,10 +125,11 @@ def _cells(
 ) -> tuple[str, str, dict[str, Any]]:
     own = samples[name]
     data |= {"steps_per_s": wall_rate(own), "steps_per_cpu_s": cpu_rate(own)}
-    data["of_gymnasium"] = ratio(own, samples[BASE])
-    limit = samples.get(_limit(name, samples))
+    is_tracking = name in {TRACKING, TRACKING_BASE}
+    data["of_base"] = ratio(own, samples[TRACKING_BASE if is_tracking else BASE])
+    limit = None if is_tracking else samples.get(_limit(name, samples))
     data["of_limit"] = ratio(own, limit) if limit else None
-    wall = f"{rate(data['steps_per_s'])} {times(data['of_gymnasium'])}"
+    wall = f"{rate(data['steps_per_s'])} {times(data['of_base'])}"
     part = share(data["of_limit"]) if limit else ""
     return wall, f"{rate(data['steps_per_cpu_s'])} {part}".rstrip(), data
 

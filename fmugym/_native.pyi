@@ -65,6 +65,9 @@ def statistics() -> dict[str, int]:
         that these jobs were divided into.
     """
 
+def initializations() -> int:
+    """How many initializations the pools of this process have begun."""
+
 def echo_to(memory: Array, /) -> None:
     """Write what FMUs say to memory as well, before they go on.
 
@@ -369,6 +372,25 @@ class Pool:
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
+
+    def rollout(
+        self,
+        actions: Array,
+        observations: Array | tuple[Array, ...],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        drawn: Array,
+        /,
+    ) -> int:
+        """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
+
+    def write(self, access: Access, values: Array, /) -> int:
+        """Set variables of all instances between two steps.
+
+        Returns:
+            The index of an instance that failed, or -1.
+        """
 
     def bundle(self, indices: Array, ends: Array, steps: Array, /) -> bytes | int:
         """Serialize the states of M instances.

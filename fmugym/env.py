@@ -24,8 +24,7 @@ from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
-from fmugym.task.readings import LateReading
-from fmugym.task.results import FLOAT32_LIMIT, as_info
+from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
@@ -119,17 +118,6 @@ class FMUEnv(Constructed):
     _width = 0
     _tells = False
 
-    # Where these are not attributes of the environment, the pool keeps them.
-    _values = LateReading()
-    state = LateReading()
-    previous_state = LateReading()
-    inputs = LateReading()
-    action = LateReading()
-    previous_action = LateReading()
-    step_count = LateReading()
-    done = LateReading()
-    variables = LateReading()
-
     def __init__(
         self,
         fmu_path: str | os.PathLike[str],
@@ -178,7 +166,8 @@ class FMUEnv(Constructed):
             self._prepare_player(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
-        episode = plan.draw(self.np_random)
+        generator = self._np_random
+        episode = plan.draw(self.np_random if generator is None else generator)
         self._ended = True  # there is no episode if the FMU fails
         try:
             pool.reset(plan.model_variables, episode.start_values)
@@ -216,7 +205,8 @@ class FMUEnv(Constructed):
         self.variables.update(episode.variables)
         self.step_count = 0
         self.action = self.previous_action = self._no_action
-        self.inputs = tuple(self.parameters.get(n, start) for n, start in self._start_inputs)
+        given = self.parameters.get
+        self.inputs = tuple([given(name, start) for name, start in self._start_inputs])
         self.done = self.after_end = False
         self._values = tuple(self._output_row.tolist())
         self.state = self.previous_state = self._values[: self._output_count]
@@ -292,8 +282,7 @@ class FMUEnv(Constructed):
             self._ended = True
             self._halt()
             raise
-        if self._play is not None:
-            self._player.give_back(self)
+        self._player.doubt(self)
         return None
 
     def _completed(self, result: Result) -> Result:
@@ -438,7 +427,7 @@ class FMUEnv(Constructed):
         observation = self._get_observation()
         if not self._is_finite(observation):
             raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
-        return observation, self.config.fault_reward, self.done, not self.done, info
+        return observation, as_reward(self._fault_reward()), self.done, not self.done, info
 
     # Snapshots.
 
@@ -464,6 +453,7 @@ class FMUEnv(Constructed):
         pool = self._open_pool("save_state")
         if not self._was_reset:
             raise SimulationError("save_state was called before the first reset")
+        self._keep_readings()
         bundle = pool.save_instances(np.zeros(1, np.int64))
         return Snapshot(self._scope, columns_of(self), bundle)
 
@@ -483,13 +473,20 @@ class FMUEnv(Constructed):
         pool = self._open_pool("restore_state")
         columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
         if not self._was_reset:
-            self._prepare_hooks()
+            self._prepare_hooks()  # as in ``reset``
+            self._prepare_player(pool)
+        self._keep_readings()
         self._ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)
         if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         return self._observation_and_info()[0]
+
+    def _keep_readings(self) -> None:
+        """Keep what hooks read in the environment itself until the next step."""
+        if self._play is not None:
+            self._player.give_back(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
         """Make a new environment in the middle of the same episode, if there is one."""

@@ -8,6 +8,7 @@
 #include "initial_states.h"
 #include "inside.h"
 #include "instances.h"
+#include "records.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */
 static bool make_room_for_starts(Pool *pool, const Access *start) {
@@ -57,6 +58,15 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     ends->ended = (size_t)atomic_get(&task.ended);
     ends->started = (size_t)atomic_get(&task.started);
     ends->outside = atomic_get(&task.outside) != 0;
+    return troubled;
+}
+
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside) {
+    const size_t runs = (pool->settings.count + RUN - 1) / RUN;
+    Task task = {.pool = pool, .call = call, .operation = ROLLOUT, .horizon = horizon};
+    const size_t troubled = schedule_run(&task, runs);
+
+    *outside = atomic_get(&task.outside) != 0;
     return troubled;
 }
 
@@ -133,6 +143,40 @@ ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
     for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
         Instance *me = &pool->instances[i];
         if (read_instance(pool, me, access, memory, values + i) > STATUS_WARNING) {
+            failed = (ptrdiff_t)i;
+        }
+    }
+    free(memory);
+    return failed;
+}
+
+/* Sets variables of one instance from a column of values. A record without them is of no use. */
+static Status write_instance(Pool *pool, Instance *me, const Access *access, double *memory,
+                             const double *column) {
+    if (me->phase != PHASE_STEPPING) {
+        return instance_refuse(me, "the instance needs a reset before anything can be set");
+    }
+    for (size_t i = 0; i < access->count; i++) {
+        memory[i] = column[i * pool->settings.count];
+    }
+    record_drop(pool, index_of(pool, me));
+    const Status status = access_set(access, me->library, me->component, memory,
+                                     memory + access->count, &pool->floats);
+    return status > STATUS_WARNING ? instance_fail(pool, me, "setting variables", status) : status;
+}
+
+ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
+    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    ptrdiff_t failed = -1;
+
+    if (memory == NULL) {
+        instance_refuse(&pool->instances[0], "out of memory");
+        return 0;
+    }
+    tape_drop(&pool->tape);
+    for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
+        Instance *me = &pool->instances[i];
+        if (write_instance(pool, me, access, memory, values + i) > STATUS_WARNING) {
             failed = (ptrdiff_t)i;
         }
     }

@@ -23,7 +23,7 @@ static bool has_enough_numbers(const Draw *draw) {
     }
 }
 
-/* A mean outside of the limits might never be left. */
+/* With a mean outside of the limits, drawing again might never end. */
 static bool is_normal(const Draws *draws, const double *numbers) {
     return draws->standard_normal != NULL && isfinite(numbers[0]) && isfinite(numbers[1]) &&
            numbers[2] <= numbers[0] && numbers[0] <= numbers[3];

@@ -54,7 +54,7 @@ bool draws_are_sound(const Draws *draws, size_t number_of_numbers);
 /* Whether all rows are below this number. */
 bool draws_fit(const Draws *draws, size_t rows);
 
-/* Draws an episode. Values that were given stay. The stride is in values. */
+/* Draws the values of an episode, which lie stride values apart. Those that were given stay. */
 void draws_take(const Draws *draws, Stream *stream, double *values, size_t stride);
 
 #endif

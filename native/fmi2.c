@@ -4,6 +4,7 @@
 
 #include "fmi.h"
 #include "log.h"
+#include "shared.h"
 
 enum { CO_SIMULATION = 1, TERMINATED = 3 /* fmi2Terminated of fmi2StatusKind */ };
 
@@ -17,69 +18,50 @@ typedef struct {
 } Callbacks;
 
 typedef struct {
+    Older older;
     void *(*instantiate)(const char *name, int type, const char *token, const char *resources,
                          const Callbacks *callbacks, int visible, int logging);
     int (*set_debug_logging)(void *component, int on, size_t count, const char *const *categories);
-    void (*free_instance)(void *component);
     int (*set_up)(void *component, int has_tolerance, double tolerance, double start_time,
                   int has_stop_time, double stop_time);
     int (*enter_initialization)(void *component);
     int (*exit_initialization)(void *component);
-    int (*terminate)(void *component);
-    int (*reset)(void *component);
     int (*do_step)(void *component, double time, double step, int no_set_state);
     int (*get_boolean_status)(void *component, int kind, int *value);
-    int (*get_real)(void *component, const uint32_t *references, size_t count, double *values);
-    int (*get_integer)(void *component, const uint32_t *references, size_t count, int *values);
-    int (*get_boolean)(void *component, const uint32_t *references, size_t count, int *values);
-    int (*set_real)(void *component, const uint32_t *references, size_t count,
-                    const double *values);
-    int (*set_integer)(void *component, const uint32_t *references, size_t count,
-                       const int *values);
-    int (*set_boolean)(void *component, const uint32_t *references, size_t count,
-                       const int *values);
-    int (*set_string)(void *component, const uint32_t *references, size_t count,
-                      const char *const *values);
-    int (*get_state)(void *component, void **state);
-    int (*set_state)(void *component, void *state);
-    int (*free_state)(void *component, void **state);
-    int (*state_size)(void *component, void *state, size_t *size);
-    int (*serialize)(void *component, void *state, char *bytes, size_t size);
-    int (*deserialize)(void *component, const char *bytes, size_t size, void **state);
 } Functions;
 
 static const Binding bindings[] = {
     {"Instantiate", offsetof(Functions, instantiate), true},
     {"SetDebugLogging", offsetof(Functions, set_debug_logging), false},
-    {"FreeInstance", offsetof(Functions, free_instance), true},
+    {"FreeInstance", offsetof(Functions, older.common.free_instance), true},
     {"SetupExperiment", offsetof(Functions, set_up), true},
     {"EnterInitializationMode", offsetof(Functions, enter_initialization), true},
     {"ExitInitializationMode", offsetof(Functions, exit_initialization), true},
     {"DoStep", offsetof(Functions, do_step), true},
-    {"Terminate", offsetof(Functions, terminate), false},
-    {"Reset", offsetof(Functions, reset), false},
+    {"Terminate", offsetof(Functions, older.common.terminate), false},
+    {"Reset", offsetof(Functions, older.common.reset), false},
     {"GetBooleanStatus", offsetof(Functions, get_boolean_status), false},
-    {"GetReal", offsetof(Functions, get_real), false},
-    {"GetInteger", offsetof(Functions, get_integer), false},
-    {"GetBoolean", offsetof(Functions, get_boolean), false},
-    {"SetReal", offsetof(Functions, set_real), false},
-    {"SetInteger", offsetof(Functions, set_integer), false},
-    {"SetBoolean", offsetof(Functions, set_boolean), false},
-    {"SetString", offsetof(Functions, set_string), false},
-    {"GetFMUstate", offsetof(Functions, get_state), false},
-    {"SetFMUstate", offsetof(Functions, set_state), false},
-    {"FreeFMUstate", offsetof(Functions, free_state), false},
-    {"SerializedFMUstateSize", offsetof(Functions, state_size), false},
-    {"SerializeFMUstate", offsetof(Functions, serialize), false},
-    {"DeSerializeFMUstate", offsetof(Functions, deserialize), false},
+    ELEMENT("GetReal", Functions, older.get, TYPE_FLOAT64),
+    ELEMENT("GetInteger", Functions, older.get, TYPE_INT32),
+    ELEMENT("GetBoolean", Functions, older.get, TYPE_BOOLEAN),
+    ELEMENT("SetReal", Functions, older.set, TYPE_FLOAT64),
+    ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),
+    ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
+    {"SetString", offsetof(Functions, older.set_string), false},
+    {"GetFMUstate", offsetof(Functions, older.common.get_state), false},
+    {"SetFMUstate", offsetof(Functions, older.common.set_state), false},
+    {"FreeFMUstate", offsetof(Functions, older.common.free_state), false},
+    {"SerializedFMUstateSize", offsetof(Functions, older.common.state_size), false},
+    {"SerializeFMUstate", offsetof(Functions, older.common.serialize), false},
+    {"DeSerializeFMUstate", offsetof(Functions, older.common.deserialize), false},
 };
 
 /* FMUs keep the pointer, so it must stay valid as long as any instance exists. */
 static const Callbacks callbacks = {log_message_fmi2, calloc, free, NULL, NULL};
 
 static bool bind(Library *library, char *error, size_t size) {
-    return library_bind(library, "fmi2", bindings, sizeof bindings / sizeof *bindings,
-                        sizeof(Functions), error, size);
+    return library_bind(library, "fmi2", bindings, COUNT_OF(bindings), sizeof(Functions),
+                        error, size);
 }
 
 static const Functions *functions_of(const Library *library) {
@@ -144,99 +126,6 @@ static Status do_step(const Library *library, void *component, double time, doub
     return status == STATUS_DISCARD ? judge_discard(f, component) : status;
 }
 
-static Status get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values) {
-    const Functions *f = functions_of(library);
-
-    if (type == TYPE_FLOAT64 && f->get_real != NULL) {
-        return sane(f->get_real(component, references, count, values));
-    }
-    if (type == TYPE_INT32 && f->get_integer != NULL) {
-        return sane(f->get_integer(component, references, count, values));
-    }
-    if (type == TYPE_BOOLEAN && f->get_boolean != NULL) {
-        return sane(f->get_boolean(component, references, count, values));
-    }
-    return STATUS_ERROR;
-}
-
-static Status set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
-    const Functions *f = functions_of(library);
-
-    if (type == TYPE_FLOAT64 && f->set_real != NULL) {
-        return sane(f->set_real(component, references, count, values));
-    }
-    if (type == TYPE_INT32 && f->set_integer != NULL) {
-        return sane(f->set_integer(component, references, count, values));
-    }
-    if (type == TYPE_BOOLEAN && f->set_boolean != NULL) {
-        return sane(f->set_boolean(component, references, count, values));
-    }
-    return STATUS_ERROR;
-}
-
-static Status set_string(const Library *library, void *component, uint32_t reference,
-                         const char *text) {
-    const Functions *f = functions_of(library);
-    if (f->set_string == NULL) {
-        return STATUS_ERROR;
-    }
-    return sane(f->set_string(component, &reference, 1, &text));
-}
-
-static Status reset(const Library *library, void *component) {
-    const Functions *f = functions_of(library);
-    return f->reset == NULL ? STATUS_ERROR : sane(f->reset(component));
-}
-
-static Status terminate(const Library *library, void *component) {
-    const Functions *f = functions_of(library);
-    return f->terminate == NULL ? STATUS_OK : sane(f->terminate(component));
-}
-
-static void free_instance(const Library *library, void *component) {
-    functions_of(library)->free_instance(component);
-}
-
-static Status get_state(const Library *library, void *component, void **state) {
-    const Functions *f = functions_of(library);
-    return f->get_state == NULL ? STATUS_ERROR : sane(f->get_state(component, state));
-}
-
-static Status set_state(const Library *library, void *component, void *state) {
-    const Functions *f = functions_of(library);
-    return f->set_state == NULL ? STATUS_ERROR : sane(f->set_state(component, state));
-}
-
-static Status free_state(const Library *library, void *component, void **state) {
-    const Functions *f = functions_of(library);
-    return f->free_state == NULL ? STATUS_OK : sane(f->free_state(component, state));
-}
-
-static size_t state_size(const Library *library, void *component, void *state) {
-    const Functions *f = functions_of(library);
-    size_t size = 0;
-    if (f->state_size == NULL) {
-        return 0;
-    }
-    return sane(f->state_size(component, state, &size)) <= STATUS_WARNING ? size : 0;
-}
-
-static Status serialize(const Library *library, void *component, void *state, char *bytes,
-                        size_t size) {
-    const Functions *f = functions_of(library);
-    return f->serialize == NULL ? STATUS_ERROR
-                                : sane(f->serialize(component, state, bytes, size));
-}
-
-static Status deserialize(const Library *library, void *component, const char *bytes, size_t size,
-                          void **state) {
-    const Functions *f = functions_of(library);
-    return f->deserialize == NULL ? STATUS_ERROR
-                                  : sane(f->deserialize(component, bytes, size, state));
-}
-
 static bool exchange(const Library *library, const Exchange *e) {
     return exchange_by(&fmi2, library, e);
 }
@@ -249,9 +138,9 @@ const Fmi fmi2 = {
     .initialize = initialize,
     .do_step = do_step,
     .exchange = exchange,
-    .get = get,
-    .set = set,
-    .set_string = set_string,
+    .get = older_get,
+    .set = older_set,
+    .set_string = older_set_string,
     .reset = reset,
     .terminate = terminate,
     .free_instance = free_instance,

@@ -62,6 +62,12 @@ static Status warm_up(Pool *pool, Instance *me) {
     return STATUS_OK;
 }
 
+static Atomic initializations; /* of all pools */
+
+uint64_t number_of_initializations(void) {
+    return atomic_get(&initializations);
+}
+
 static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
     const Settings *s = &pool->settings;
     StartContext context = {pool, me, start, scratch, UINT32_MAX};
@@ -73,6 +79,7 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     }
     pace_wait(&pool->pace);
     instance_begin_turn(pool);
+    atomic_add(&initializations, 1);
     begin_call(CALL_INITIALIZE);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
                                 (StartValues){set_start_values, &context}, &doing);

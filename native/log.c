@@ -132,7 +132,8 @@ static char *duplicate(const char *text) {
     return copy;
 }
 
-/* Receiving messages. The caller holds the lock. A message is lost if there is no memory for it. */
+/* Receiving messages. Functions without a lock of their own expect the caller to hold it. A message
+ * is lost if there is no memory for it. */
 
 static void enqueue(Log *log, Message *message) {
     if (log->first == NULL) {
@@ -191,7 +192,8 @@ void log_echo_to(char *memory, size_t size) {
     mutex_unlock(&lock);
 }
 
-/* The newest message replaces the oldest ones. If it is too long, only its end is kept. */
+/* Drops as much of the beginning as the new line needs. Only the end of a line that is too long
+ * stays. */
 static void append_to_echo(const char *category, const char *text) {
     char room[TEXT_SIZE + 64];
     const char *line = room;

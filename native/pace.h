@@ -8,7 +8,7 @@
 
 typedef struct {
     uint64_t interval; /* length of a slot in ns; 0 for no limit */
-    uint64_t turn, turns;
+    uint64_t turn, turns; /* of turns processes, this one has the slots whose remainder is turn */
     Atomic next; /* the first slot that is free */
 } Pace;
 

@@ -242,7 +242,8 @@ void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scrat
                             places[results[REWARD]], &verdict->troubled);
 }
 
-/* The program updates no variables where an episode has ended: it stores those from before. */
+/* Marks the environments as ended while the program runs: there it leaves the episode variables as
+ * they were. */
 void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
                   Verdict *verdict) {
     const Play *play = turn->play;

@@ -22,18 +22,18 @@ typedef struct {
     const char *none;         /* what counts as the action of an episode that starts */
 } Actions;
 
-/* What the hooks of a new episode read as an input. */
+/* The value of an input that the hooks read at the start of an episode. */
 typedef struct {
     const double *row; /* NULL stands for the same value everywhere */
     double value;
 } InputStart;
 
-/* A row of episode variables as it was before the step. */
+/* Keeps a row of episode variables as it was before the step. */
 typedef struct {
     Row from, to;
 } RowCopy;
 
-/* What an episode variable is in a new episode, if it is not drawn. */
+/* The value of an episode variable at the start of an episode, unless it is drawn. */
 typedef struct {
     Row row;
     uint64_t bits; /* the value in its first bytes */
@@ -50,7 +50,7 @@ typedef struct {
     size_t count;
     Program inputs;    /* stores the inputs */
     Program judgement; /* stores the rest; its results are done, truncated, reward */
-    Source source;     /* everything that does not change from step to step */
+    Source source;     /* only the statuses; each step sets the rest */
     Actions actions;
     double *input_rows;
     const InputStart *input_starts;
@@ -122,10 +122,12 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 /* Keeps the outputs of a run, before the new ones replace them. */
 void play_keep_outputs(const Play *play, size_t begin, size_t count);
 
-/* Gives the hooks of an episode that has just started what they read after a reset. */
+/* Sets what hooks read at the start of an episode: actions, inputs, episode variables, and the
+ * outputs before the step. */
 void play_start_episode(const Turn *turn, size_t index);
 
-/* For an environment that is neither reset nor stepped because memory ran out. */
+/* Writes the results of an environment that is neither reset nor stepped, because memory ran
+ * out. */
 void play_skip(const Turn *turn, size_t index);
 
 /* Prefetches the memory that play_draw will use. */

@@ -161,7 +161,7 @@ typedef struct {
     uint32_t calls;
 } Cost;
 
-enum { STEP, RESET, MIXED, PLAY, RESTORE, OPERATIONS };
+enum { STEP, RESET, MIXED, PLAY, RESTORE, ROLLOUT, OPERATIONS };
 
 typedef struct Pool {
     struct Pool *next; /* next in the list of all pools */
@@ -286,6 +286,9 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends);
  * and sets outside if a hook looked up an index outside of a table. */
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
+/* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside);
+
 /* A serialized FMU state after initialization. */
 typedef struct {
     const double *start_values; /* one for each variable of the Access */
@@ -299,8 +302,13 @@ bool pool_knows_start(Pool *pool, size_t index, const Access *start, const doubl
 bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size);
 bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed);
 
+/* How many initializations all pools of this process have begun. */
+uint64_t number_of_initializations(void);
+
 /* Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
+/* Sets variables between two steps. Returns the index of the first instance that fails, or -1. */
+ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values);
 
 /* Snapshots. A new snapshot belongs to the pool that saves its states in it. */
 

@@ -25,6 +25,8 @@ static size_t number_of_operands(const Program *program, Instruction i) {
         return 0;
     case CALL:
         return program->calls[i.extra].inputs;
+    case CALL_SQUARE:
+        return 2;
     case STORE_ROW:
     case STORE_SEEN:
     case CAST:
@@ -63,6 +65,8 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
         return i.extra < program->number_of_slots;
     case CALL:
         return i.extra < program->number_of_calls;
+    case CALL_SQUARE:
+        return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2;
     case CAST:
         return i.extra < VALUE_TYPES * VALUE_TYPES;
     case TAKE:
@@ -86,8 +90,9 @@ static bool instruction_is_sound(const Program *program, size_t action_elements,
         return false;
     }
     for (size_t k = 0; k < 3; k++) {
-        /* Loops are compiled for operands that are not overwritten. */
-        const bool overwritten = !stores && k < number_of_operands(program, i) && operands[k] == i.to;
+        /* The loops promise the compiler, by restrict, that they do not write to operands. */
+        const bool overwritten =
+            !stores && k < number_of_operands(program, i) && operands[k] == i.to;
         if (operands[k] >= program->registers || overwritten) {
             return false;
         }
@@ -157,7 +162,7 @@ void program_prepare(const Program *program, Register *memory, Registers *regist
         break;                                                                                     \
     }
 
-/* Copies values of some bytes; the steps count values. */
+/* Copies count values of size bytes each. The steps are in values. */
 static void copy_values(void *to, size_t to_step, const void *from, size_t from_step, size_t count,
                         size_t size) {
     if (to_step == 1 && from_step == 1) {
@@ -172,14 +177,16 @@ static void copy_values(void *to, size_t to_step, const void *from, size_t from_
     }
 }
 
-/* The values after the last of a run are 0, so that no operation meets what others have left. */
+/* Sets the values after the last of a run to 0. Whole blocks are computed, and what an earlier run
+ * has left there could be slow to compute with, or undefined to cast. */
 static void clear_rest(Register *to, size_t count, size_t lanes, size_t size) {
     if (count < lanes) {
         memset(to->bytes + count * size, 0, (lanes - count) * size);
     }
 }
 
-/* Returns the place of values that follow each other in memory; copies others to a register. */
+/* Returns where whole blocks of the values lie: at their own place if they follow each other there,
+ * otherwise in a register, to which it copies them. */
 static const void *loaded(const char *from, size_t step, size_t size, size_t count,
                           size_t lanes, Register *to) {
     if (step == 1 && count == lanes) {
@@ -194,7 +201,7 @@ static const void *load_row(const Row *row, size_t begin, size_t count, size_t l
                             Register *to) {
     const char *from = row->data + begin * row->size;
 
-    if (row->changes) { /* a view of it would change as well */
+    if (row->changes) { /* a later STORE_ROW must not change what was loaded */
         memcpy(to, from, count * row->size);
         clear_rest(to, count, lanes, row->size);
         return to;
@@ -240,7 +247,7 @@ static void load_stopped(const Source *s, size_t begin, size_t count, uint8_t *t
 
 static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1};
 
-/* Looks at all first, because nearly always all are finite. */
+/* The first loop looks whether there is any such value; nearly always there is none. */
 #define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
     WIDE static void name(const Type *values, size_t count, Notes *notes) {                        \
         Whole any = 0; /* as wide as the values, so that the compiler can vectorize */             \
@@ -278,7 +285,7 @@ static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t c
 
 /* Operations of numpy */
 
-/* The loops of numpy do not write to what they read. */
+/* The casts drop const: a loop of numpy does not write to its inputs. */
 static void call(const Called *called, size_t count, size_t lanes, const Registers *registers,
                  Instruction i) {
     const void *const *places = registers->places;
@@ -290,11 +297,54 @@ static void call(const Called *called, size_t count, size_t lanes, const Registe
     clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->inputs]);
 }
 
-/* The number of blocks makes the compiler see that no value is left over. */
+/* Computing the end from the blocks shows the compiler that no value is left over. */
 #define EACH_LANE(statement)                                                                       \
     for (size_t j = 0; j < blocks * PROGRAM_BLOCK; j++) {                                          \
         statement;                                                                                 \
     }
+
+/* The power of 2, by a loop whose error is less than 0.55 units in the last place. Dekker's product
+ * gives the error of the rounded square. Where it is less than 0.45 units, no such loop can round
+ * in the other direction. Below a power of two the units are half as long; the loop handles those,
+ * and numbers whose product might not be exact. */
+static inline uint8_t square_one(double x, double *square) {
+    const double shifted = x * 134217729.0, high = shifted - (shifted - x), low = x - high;
+    const double rounded = x * x;
+    const double error = ((high * high - rounded) + 2.0 * high * low) + low * low;
+    uint64_t bits, leading;
+    double power;
+
+    memcpy(&bits, &rounded, sizeof bits);
+    leading = bits & UINT64_C(0x7ff) << 52;
+    memcpy(&power, &leading, sizeof power);
+    *square = rounded;
+    return !((fabs(error) <= 0.45 * DBL_EPSILON * power) & (bits != leading) &
+             (rounded > 1e-250) & (rounded < 1e250));
+}
+
+WIDE static void square(const double *restrict x, size_t blocks, double *restrict to,
+                        uint8_t *restrict doubtful) {
+    EACH_LANE(doubtful[j] = square_one(x[j], &to[j]));
+}
+
+static void call_square(const Called *called, size_t count, size_t lanes, const double *x,
+                        const void *exponent, double *to) {
+    uint8_t doubtful[PROGRAM_WIDTH], places[PROGRAM_WIDTH];
+    double bases[PROGRAM_WIDTH], powers[PROGRAM_WIDTH];
+    ptrdiff_t number = 0;
+
+    square(x, lanes / PROGRAM_BLOCK, to, doubtful);
+    for (size_t j = 0; j < count; j++) {
+        places[number] = (uint8_t)j;
+        bases[number] = x[j];
+        number += doubtful[j];
+    }
+    char *data[] = {(char *)bases, (char *)exponent, (char *)powers};
+    called->loop(called->context, data, &number, called->sizes, called->auxiliary);
+    for (ptrdiff_t k = 0; k < number; k++) {
+        to[places[k]] = powers[k];
+    }
+}
 
 #define CAST_LOOP(number, From, To)                                                                \
     case number: {                                                                                 \
@@ -355,7 +405,7 @@ static void take(const Table *table, const int64_t *indices, size_t count, char 
     }
 }
 
-/* The last coordinate that is not greater than x, of at least one. */
+/* The index of the last coordinate that is not greater than x; 0 if there is none. */
 static size_t place_of(double x, const double *coordinates, size_t count) {
     size_t low = 0, high = count;
 
@@ -545,7 +595,8 @@ static inline size_t whole_blocks(size_t count) {
     return (count + PROGRAM_BLOCK - 1) / PROGRAM_BLOCK * PROGRAM_BLOCK;
 }
 
-/* What moves values between registers and the memory of others. Returns false for anything else. */
+/* Moves values between registers and memory that is not the program's. Returns false for any other
+ * instruction. */
 static bool move(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers *registers, Instruction i, Notes *notes) {
     const size_t lanes = whole_blocks(count);
@@ -598,6 +649,10 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
             break;
         case CALL:
             call(&program->calls[i.extra], count, lanes, registers, i);
+            break;
+        case CALL_SQUARE:
+            call_square(&program->calls[i.extra], count, lanes, places[i.a], places[i.b],
+                        to->doubles);
             break;
         case CAST:
             cast(i.extra, places[i.a], lanes / PROGRAM_BLOCK, to);

@@ -28,6 +28,7 @@ enum {
     X(STORE_ROW, "store_row")                                                                      \
     X(STORE_SEEN, "store_seen")                                                                    \
     X(CALL, "call")                                                                                \
+    X(CALL_SQUARE, "call_square")                                                                  \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \
@@ -99,10 +100,11 @@ extern const char *const operation_names[NUMBER_OF_OPERATIONS];
     X(uint8_t, 'B')                                                                                \
     X(Flag, '?')
 
+enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
 enum { VALUE_TYPES = 11, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_INT64 = 2, VALUE_FLAG = 10 };
 
-/* What extra means depends on the operation: the row, the element of an action, the slot, the
- * call, the table, the pair of types. */
+/* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a
+ * slot, a call, a table or a pair of types, as the operation needs it. */
 typedef struct {
     uint16_t operation, extra, to, a, b, c;
 } Instruction;
@@ -115,7 +117,8 @@ typedef union {
     uint8_t flags[PROGRAM_WIDTH];
 } Register;
 
-/* The first registers have the same value for all instances throughout. */
+/* A value that the program only reads, the same for all instances. Constants have the first
+ * registers. */
 typedef struct {
     uint64_t bits; /* the value in its first bytes */
     uint16_t to, size;
@@ -191,7 +194,8 @@ typedef struct {
 /* Writes a constant in all places of a register. */
 void program_fill(const Constant *constant, Register *filled);
 
-/* Must be called once before the first run with these registers, which use this memory. */
+/* To be called once, before the first run with these registers. They use the memory, one Register
+ * for each of the program. */
 void program_prepare(const Program *program, Register *memory, Registers *registers);
 
 /* Whether every operand refers to something that exists. The program writes and reads count
@@ -201,8 +205,9 @@ bool program_is_sound(const Program *program, size_t action_elements);
 /* Sets what the program would store in the arrays of one instance to 0. */
 void program_clear_seen(const Program *program, char *const *seen, size_t index);
 
-/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Operations of its
- * own compute whole blocks, because loops of a fixed length become vector instructions. */
+/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Its own operations
+ * compute whole blocks, because compilers turn such loops into vector instructions without a
+ * remainder; the loops of numpy compute exactly count values. */
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers *registers, Notes *notes);
 

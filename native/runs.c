@@ -324,7 +324,7 @@ static void record_inputs(const Task *task, size_t begin, size_t count, const do
     }
 }
 
-static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
+size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) {
     gather_inputs(task, begin, count, scratch.inputs);
     if (task->pool->records != NULL) {
         record_inputs(task, begin, count, scratch.inputs);
@@ -348,7 +348,7 @@ static size_t do_run(Task *task, size_t begin, size_t count, Scratch scratch) {
 size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch) {
     size_t troubled = 0;
     for (size_t first = begin; first < end; first += RUN) {
-        troubled += do_run(task, first, length_of_run(first, end), scratch);
+        troubled += run_step(task, first, length_of_run(first, end), scratch);
     }
     return troubled;
 }
@@ -363,7 +363,7 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
     for (size_t first = begin; first < end; first += RUN) {
         const size_t count = length_of_run(first, end);
         play_prepare(turn, first, count, &registers);
-        troubled += do_run(task, first, count, scratch);
+        troubled += run_step(task, first, count, scratch);
         play_judge(turn, first, count, &registers, &verdict);
         if (turn->started != NULL) {
             const PlayedRun run = {first, count, &registers, &verdict};

@@ -16,6 +16,9 @@ static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;
 }
 
+/* Steps or resets one run. */
+size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch);
+
 /* All three work on the items from begin to end and return how many instances have a status
  * worse than a warning. This one resets or restores instances that need not be neighbours: */
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);

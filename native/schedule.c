@@ -4,6 +4,7 @@
 #include <stdlib.h>
 
 #include "inside.h"
+#include "rollouts.h"
 #include "threads.h"
 
 /* All in ns. */
@@ -21,6 +22,9 @@ enum {
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 
+    if (task->operation == ROLLOUT) { /* the caller goes another way */
+        return end - begin;
+    }
     for (size_t i = begin; i < end; i++) {
         const size_t index = task->listed ? task->pool->chosen[i] : i;
         instance_refuse(&task->pool->instances[index], "out of memory");
@@ -47,13 +51,20 @@ static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
     if (task->listed) {
         return run_listed(task, begin, end, scratch);
     }
+    if (task->operation == ROLLOUT) {
+        return run_rollout(task, begin, end, scratch);
+    }
     return task->operation == PLAY ? run_play(task, begin, end, scratch)
                                    : run_steps(task, begin, end, scratch);
 }
 
+static size_t length_of_longest_run(const Task *task, size_t begin, size_t end) {
+    return task->listed ? 0 : task->operation == ROLLOUT ? RUN : length_of_run(begin, end);
+}
+
 static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     const Settings *s = &task->pool->settings;
-    const size_t most = most_values(task), run = task->listed ? 0 : length_of_run(begin, end);
+    const size_t most = most_values(task), run = length_of_longest_run(task, begin, end);
     const size_t in = run * s->inputs->count, size = 2 * most + in + run * s->outputs->count;
     double stack[STACK_VALUES];
     double *memory = size <= STACK_VALUES ? stack : malloc(size * sizeof *memory);

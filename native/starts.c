@@ -9,7 +9,7 @@ static float *observation_of(const Task *task, size_t index) {
     return task->call->observations + index * task->pool->settings.num_observed;
 }
 
-/* A float32 may be infinite where the output is a finite float64. */
+/* A finite output may be infinite as a float32. */
 static bool has_finite_observation(const Task *task, size_t index) {
     const float *values = observation_of(task, index);
     bool finite = true;
@@ -39,7 +39,7 @@ size_t starts_one(Task *task, size_t index, Scratch scratch) {
     return troubled > 0 || !has_finite_observation(task, index);
 }
 
-/* What ends by a fault stays as it is, so that the owner can say what the fault was. */
+/* After a fault, the environment stays as it is, so that the caller can say what the fault was. */
 static bool has_ended_well(const Task *task, const PlayedRun *run, size_t index) {
     const Turn *turn = task->call->turn;
 

@@ -1,23 +1,23 @@
-/* Starts of episodes, which draw, reset the instances and hand out the first observations. */
+/* Starting episodes: drawing, resetting the instance, and writing the first observation. */
 
 #ifndef FMUGYM_STARTS_H
 #define FMUGYM_STARTS_H
 
 #include "task.h"
 
-/* A run of a step that plays. */
+/* A run of instances that have just been stepped and judged. */
 typedef struct {
     size_t begin, count;
     PlayScratch *registers;
     Verdict *verdict; /* on this run */
 } PlayedRun;
 
-/* Starts the next episodes of those environments of a run whose episodes have just ended without
- * trouble. Keeps their last observations. Adds to started how many they are, and returns how many
- * environments are in trouble. */
+/* Starts the next episodes of the environments whose episodes have just ended without trouble, and
+ * keeps their last observations. Adds their number to started. Returns how many of them are in
+ * trouble. */
 size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started);
 
-/* Starts an episode outside of a step. Returns whether it is in trouble. */
+/* Starts an episode of one environment. Returns 1 if it is in trouble, otherwise 0. */
 size_t starts_one(Task *task, size_t index, Scratch scratch);
 
 #endif

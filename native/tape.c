@@ -85,7 +85,7 @@ void tape_add(Tape *tape, const double *inputs, const double *outputs, int statu
               int64_t position) {
     const size_t row = tape->rows;
 
-    if (position == tape->position) { /* it was reset or left alone */
+    if (position == tape->position) { /* the call has only reset the instance, or skipped it */
         return;
     }
     memcpy(tape->inputs + row * tape->width_in, inputs, tape->width_in * sizeof *inputs);

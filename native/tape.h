@@ -36,8 +36,8 @@ typedef struct {
  * steps in all. */
 void tape_wait(Tape *tape, int64_t resets, int64_t steps);
 
-/* To be called at each reset of the first instance: ends a recording. Returns whether another one
- * begins. */
+/* To be called at each reset of the first instance. Ends a recording that has a step. Returns
+ * whether a recording is to begin now. */
 bool tape_turn(Tape *tape, int64_t steps);
 
 /* Begins a recording, except for first_outputs. Returns false if memory runs out. */

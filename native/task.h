@@ -13,6 +13,7 @@ typedef struct {
     int operation;
     const Snapshot *snapshot; /* the snapshot to restore */
     const States *states;     /* or the serialized states */
+    size_t horizon;           /* the steps of a rollout, whose items are runs */
     bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */

@@ -1,6 +1,6 @@
 """Compile the libraries of test FMUs, each once for all processes of a test run."""
 
-import atexit
+import contextlib
 import functools
 import hashlib
 import os
@@ -36,10 +36,12 @@ def library(*sources, flags=(), stubs=None):
         stubs: The text of the file that the sources include as ``STUBS``.
     """
     digest = hashlib.sha256(repr((sources, flags, stubs)).encode()).hexdigest()[:16]
-    path = shared_folder() / f"{digest}{fmpy.sharedLibraryExtension}"
-    if not path.exists():
-        _compile(path, sources, flags, stubs)
-    return path.read_bytes()
+    with contextlib.ExitStack() as stack:
+        folder = os.environ.get(FOLDER) or stack.enter_context(tempfile.TemporaryDirectory())
+        path = Path(folder) / f"{digest}{fmpy.sharedLibraryExtension}"
+        if not path.exists():
+            _compile(path, sources, flags, stubs)
+        return path.read_bytes()
 
 
 def _compile(path, sources, flags, stubs):
@@ -53,13 +55,3 @@ def _compile(path, sources, flags, stubs):
         command += [*(HERE / source for source in sources), "-o", built, "-lm", "-lpthread"]
         subprocess.run(command, check=True)
         built.replace(path)
-
-
-@functools.cache
-def shared_folder():
-    """The folder of the test run; outside of one, a folder of this process."""
-    if FOLDER in os.environ:
-        return Path(os.environ[FOLDER])
-    folder = tempfile.mkdtemp(prefix="fmugym-tests-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)

@@ -16,13 +16,12 @@ When and where a signal arrives depends on the machine, so a case cannot be repe
 ``fuzz_driver.py``. Not for Windows, which has no such timers.
 """
 
-import atexit
 import collections
 import contextlib
 import functools
 import gc
 import logging
-import shutil
+import os
 import signal
 import sys
 import tempfile
@@ -38,6 +37,8 @@ from fmugym.envs import CartPoleEnv
 
 NUM_ENVS = 3
 LOGGING = {"model_parameters": {"log_status": 1}}
+PROBE = "FMUGYM_FUZZ_PROBE"
+"""The environment variable with the path of the FMU that logs."""
 LOSING = ("weakref.py", "_weakrefset.py", "in __del__", "etree.parse(", "zipfile.py")
 """Where Python or lxml may drop or replace what a signal handler raises, as a stack names it."""
 
@@ -121,20 +122,15 @@ class Talkative(fmu_tools.PlainEnv):
     """Its FMU logs in every step."""
 
     def __init__(self, **options):
-        super().__init__(_probe(), fmu_tools.probe_config(**LOGGING), logging.CRITICAL, **options)
+        super().__init__(
+            os.environ[PROBE], fmu_tools.probe_config(**LOGGING), logging.CRITICAL, **options
+        )
 
     def _get_action_space(self):
         return gym.spaces.Discrete(2)
 
     def _get_inputs(self):
         return 0.5 * self.action
-
-
-@functools.cache
-def _probe():
-    folder = tempfile.mkdtemp(prefix="fmugym-fuzz-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return fmu_tools.probe_fmu(folder)
 
 
 WAYS = {
@@ -233,7 +229,8 @@ def program():
 
     before, sys.unraisablehook = sys.unraisablehook, lambda unraisable: None
     try:
-        with contextlib.closing(stage):
+        with tempfile.TemporaryDirectory() as folder, contextlib.closing(stage):
+            os.environ[PROBE] = str(fmu_tools.probe_fmu(folder))
             yield make
         gc.collect()
     finally:

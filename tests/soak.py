@@ -136,6 +136,38 @@ def resets(count):
     env.close()
 
 
+def snapshots(count):
+    """States saved and restored, also in another environment, and played again for FMI 1.0."""
+    envs = [CartPoleEnv(fmi_version=version) for version in FMI_VERSIONS]
+    twins = [CartPoleEnv(fmi_version=version) for version in FMI_VERSIONS]
+    for env in envs:
+        env.reset(seed=0)
+        env.step(1)
+    for size in portions(count):
+        for index in range(size):
+            env, twin = envs[index % 3], twins[index % 3]
+            snapshot = env.save_state()
+            twin.restore_state(snapshot)
+            env.step(index & 1)
+            env.restore_state(twin.save_state())
+        yield
+    for env in (*envs, *twins):
+        env.close()
+
+
+def rollouts(count):
+    """Rollouts of 64 candidates, 10 steps each."""
+    envs = fmugym.FMUVectorEnv(CartPoleEnv, NUM_ENVS)
+    actions = np.random.default_rng(0).integers(0, 2, (NUM_ENVS, 10))
+    with CartPoleEnv() as env:
+        env.reset(seed=0)
+        for size in portions(count // NUM_ENVS // 10):
+            for _ in range(size):
+                envs.rollout(env.save_state(), actions)
+            yield
+    envs.close()
+
+
 def cycles(count, **config):
     """Environments opened, used and closed, of each FMI version in turn."""
     for size in portions(count):
@@ -199,6 +231,8 @@ SOAKS = {
     "vector steps": Soak(vector_steps, "steps"),
     "isolated vector steps": Soak(isolated_steps, "steps"),
     "resets": Soak(resets, "resets"),
+    "snapshots": Soak(snapshots, "resets"),
+    "rollouts": Soak(rollouts, "steps"),
     "open and close": Soak(cycles, "cycles"),
     "open and close, isolated": Soak(isolated_cycles, "cycles", 0.4),
     "crash and restart": Soak(crashes, "crashes"),

@@ -99,6 +99,9 @@ def load_at(time):
 def test_an_episode_has_the_declared_values():
     env = fmugym.load(EVERYTHING)
     assert env.action_space.low == [-1]
+    assert env.observation_names[:3] == ("q", "tau", "price")
+    assert env.observation_names[9:11] == ("price[+0.5 s]", "price[+1 s]")
+    assert env.observation_names[-1] == "load[-0.75 s]"
     observation, info = env.reset(seed=4)
     amplitude, goal = info["drawn"]["wave_amplitude"], info["drawn"]["goal"]
     angles, torques, total = [env.state[0]], [0.0], 0.0

@@ -36,11 +36,14 @@ def test_returns_are_those_of_one_vector_environment(example):
 
 
 def test_the_program_finds_better_policies():
-    command = [sys.executable, EXAMPLES / "half_batches.py", "--num-envs", "60", "--rounds", "7"]
+    options = ["--num-envs", "60", "--rounds", "7", "--compare"]
+    command = [sys.executable, EXAMPLES / "half_batches.py", *options]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (ended.returncode, ended.stderr) == (0, "")
-    *rounds, last = ended.stdout.splitlines()
+    *rounds, last, ratio = ended.stdout.splitlines()
     means = [float(line.split()[-1]) for line in rounds]
     assert len(means) == 7
     assert max(means[3:]) > means[0] + 200
     assert last.startswith("weights:")
+    assert float(ratio.split()[0]) > 0.0
+    assert ratio.endswith("times the rate without overlap")

@@ -16,7 +16,9 @@ import fmugym
 from fmugym.errors import LicenceError
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.tools.cli import main
-from fmugym.trial.trial import known_verdict
+from fmugym.trial import rehearsal
+from fmugym.trial.neighbours import default_spec
+from fmugym.trial.trial import Candidate, known_verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -288,3 +290,58 @@ def test_odd_values_are_refused(key, value):
         fmugym.EnvConfig.from_dict(
             {"model_input_names": "u", "model_output_names": "y", key: value}
         )
+
+
+class TestInitializations:
+    """A trial says how many it took, and takes fewer where they are slow or need licences."""
+
+    @pytest.mark.parametrize(("config", "most"), [({}, 9), ({"licence_wait": 1.0}, 6)])
+    def test_of_one_environment(self, folder, seats, caplog, capsys, config, most):
+        caplog.set_level(logging.INFO, "fmugym")
+        path = make_fmu(folder, "licensed")
+        DemandingEnv(path, **config).close()
+        verdict = known_verdict(fmugym.FMU(path))
+        assert 4 <= verdict.initializations <= most
+        assert verdict.reset_method == "restore"
+        text = f"and {verdict.initializations} initialization(s) in all"
+        assert text in caplog.text
+        assert main(["info", str(path)]) == 0
+        assert f"{verdict.initializations} initializations" in capsys.readouterr().out
+        left_out = "no episode returned to earlier start values" in "".join(verdict.reasons)
+        assert left_out == bool(config)
+
+    def test_of_a_vector_environment(self, folder, seats):
+        seats.limit(2)
+        path = make_fmu(folder, "licensed")
+        make = functools.partial(DemandingEnv, path, max_initializations_per_second=20.0)
+        fmugym.FMUVectorEnv(make, 2).close()
+        assert known_verdict(fmugym.FMU(path)).initializations <= 19
+
+    def test_what_is_known_of_one_is_not_tried_again(self, folder, seats):
+        seats.limit(2)
+        path = make_fmu(folder, "licensed")
+        make = functools.partial(DemandingEnv, path, max_initializations_per_second=20.0)
+        make().close()
+        before = known_verdict(fmugym.FMU(path))
+        fmugym.FMUVectorEnv(make, 2).close()
+        after = known_verdict(fmugym.FMU(path))
+        assert after.neighbours == "independent"
+        assert after.resets == before.resets != {}
+        assert after.initializations <= before.initializations + 13
+
+    def test_slow_ones_are_measured(self, folder, seats, monkeypatch):
+        monkeypatch.setattr(rehearsal, "_SLOW_INITIALIZATION", 0.0)
+        candidate = Candidate.of(fmugym.FMU(make_fmu(folder, "licensed")))
+        trial = rehearsal.Rehearsal(candidate, default_spec(candidate.open()), rehearsal.Starts())
+        assert trial.is_frugal
+        assert trial.grade("restore") == "bitwise"
+
+    def test_each_environment_counts_its_own_instances(self, folder, seats):
+        """As docs/foreign-fmus.md says."""
+        seats.limit(2)
+        path = make_fmu(folder, "licensed")
+        envs = [DemandingEnv(path, max_instances=1) for _ in range(2)]
+        assert [play(env) for env in envs] == [EXPECTED] * 2
+        assert seats.taken == 2
+        for env in envs:
+            env.close()

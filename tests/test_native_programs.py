@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from fmugym.pool import has_native_pool
-from fmugym.vector.hooks.loops import loop_of
+from fmugym.vector.hooks import loops, lowering
+from fmugym.vector.hooks.graph import Graph
+from fmugym.vector.hooks.loops import loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
 
 pytestmark = pytest.mark.skipif(not has_native_pool(), reason="programs run in the native pool")
@@ -100,3 +102,59 @@ def test_a_row_that_is_not_aligned():
     row = np.zeros(25, np.uint8)[1:].view(np.float64)
     with pytest.raises(ValueError, match="aligned"):
         evaluate((("load_row", 0, 0),), (row,), np.zeros(3))
+
+
+def squares(values, operation):
+    """Raise values to the power of 2 in C."""
+    loop = loop_of(np.float_power, (DOUBLE,) * 3), 2, (8, 0, 8, 0)
+    code = ("load_row", 0, 1), (operation, 0, 2, 1, 0), ("store_row", 1, 0, 2)
+    stored = np.zeros_like(values)
+    evaluate(code, (values, stored), np.zeros_like(values), constants=(2.0,), calls=(loop,))
+    return stored
+
+
+def hard_numbers(count):
+    """Numbers of all magnitudes, and those whose squares lie between two floats or on one."""
+    rng = np.random.default_rng(1)
+    mixed = rng.normal(size=count) * 10.0 ** rng.uniform(-170, 170, count)
+    roots = np.sqrt(2.0 ** rng.integers(-40, 40, count)) * rng.choice([1.0, 1 - 2**-53], count)
+    odd = (2.0 * rng.integers(2**25, 2**26, count) + 1.0) * 2.0**-30
+    few = [0.0, -0.0, 1.0, -2.0, np.inf, -np.inf, np.nan, 5e-324, 1e-160, 1.3e154, 1e-125, 1e125]
+    return np.concatenate([mixed, roots, odd, rng.uniform(-8.0, 8.0, 20 * count), few])
+
+
+@pytest.mark.skipif(
+    not squares_nearly_exactly(), reason="the error of this system's pow is not known"
+)
+def test_powers_of_2_are_those_of_numpy():
+    values = hard_numbers(20_000)
+    with np.errstate(all="ignore"):
+        expected = np.float_power(values, 2.0)
+        assert (expected != values * values).sum() > 100  # a product would not do
+    for operation in ("call", "call_square"):
+        np.testing.assert_array_equal(squares(values, operation), expected)
+
+
+@pytest.mark.parametrize(
+    ("function", "exponent", "is_known", "operation"),
+    [
+        (np.float_power, 2.0, True, "call_square"),
+        (np.float_power, 2.0, False, "call"),
+        (np.float_power, 3.0, True, "call"),
+        (np.power, 2.0, True, "call"),
+    ],
+)
+def test_which_powers_are_squared(function, exponent, is_known, operation, monkeypatch):
+    monkeypatch.setattr(lowering, "squares_nearly_exactly", lambda: is_known)
+    graph = Graph()
+    cells = graph.load("row", ("output", 0), DOUBLE, None), graph.constant(exponent, DOUBLE)
+    node = graph.apply(function, cells, DOUBLE).node
+    compiled = lowering.compile_graph(graph, [lowering.Store(node, ("input", 0))], [], 0)
+    names = [OPERATIONS[line[0]] for line in compiled.code]
+    assert names == ["load_row", operation, "store_row"]
+
+
+def test_powers_that_are_less_exact_are_not_taken_for_squares():
+    values = np.linspace(1.0, 2.0, 1001)
+    assert loops._is_within(np.float_power(values, 2.0), values, 0.55)
+    assert not loops._is_within(np.nextafter(values * values, 9.0), values, 0.55)

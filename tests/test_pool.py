@@ -1,6 +1,7 @@
 """The contract of ``fmugym.pool.base``, for every implementation of it."""
 
 import logging
+import pickle
 
 import fmpy
 import numpy as np
@@ -319,6 +320,53 @@ class TestSnapshots:
         set_up(pool)
         with pytest.raises(SimulationError, match="cannot get and set its state"):
             pool.save()
+
+
+class TestSavedInstances:
+    """``save_instances`` and ``restore_instances``, whether states are serialized or replayed."""
+
+    STEPS = 6
+
+    def halfway(self, plant, num_instances=3):
+        pool = plant.pool(num_instances)
+        inputs = plant.inputs(2, 2 * self.STEPS, num_instances)
+        values = plant.start_values(3, num_instances)
+        plant.rollout(pool, values, inputs[: self.STEPS])
+        return pool, inputs[self.STEPS :]
+
+    def go_on(self, pool, inputs):
+        return np.array([pool.step(row)[0].copy() for row in inputs])
+
+    def test_go_on_as_before(self, plant):
+        pool, inputs = self.halfway(plant)
+        saved = pool.save_instances(np.arange(3))
+        assert saved.method == ("replay" if plant.version.startswith("1") else "state")
+        expected = self.go_on(pool, inputs)
+        for _ in range(2):
+            statuses = pool.restore_instances(saved, np.arange(3), np.arange(3))
+            assert not statuses.any()
+            assert np.array_equal(self.go_on(pool, inputs), expected)
+
+    def test_go_on_in_other_instances_of_another_pool(self, plant):
+        pool, inputs = self.halfway(plant)
+        saved = pickle.loads(pickle.dumps(pool.save_instances(np.array([2, 0]))))
+        expected = self.go_on(pool, inputs)
+        pool.close()
+        other = plant.pool(4)  # its instances were never initialized
+        set_up(other, np.array([True, False, False, False]))
+        first = other.outputs[:, 0].copy()
+        other.restore_instances(saved, np.array([0, 1, 0]), np.array([1, 2, 3]))
+        assert np.array_equal(other.outputs[:, 0], first)
+        given = inputs[:, :, [0, 2, 0, 2]]
+        assert np.array_equal(self.go_on(other, given)[:, :, 1:], expected[:, :, [2, 0, 2]])
+
+    def test_after_a_reset_that_follows_all_is_as_ever(self, plant):
+        pool, inputs = self.halfway(plant, 1)
+        saved = pool.save_instances(np.zeros(1, int))
+        values = plant.start_values(5, 1)
+        expected = plant.rollout(pool, values, inputs)
+        pool.restore_instances(saved, np.zeros(1, int), np.zeros(1, int))
+        assert np.array_equal(plant.rollout(pool, values, inputs), expected)
 
 
 class TestFaults:

@@ -216,7 +216,7 @@ def test_how_often(monkeypatch):
         assert count <= 1e-3 * resets
         assert count * 2 * tape.TAPE_ROWS <= 1e-3 * 8 * steps
         rehearsals.count += 1
-    assert 8 * steps < 11 * 2**24
+    assert 8 * steps < 11 * 2**26
 
 
 def test_a_spare_that_crashes(make_fmu, caplog):

@@ -438,7 +438,7 @@ def test_odd_arguments_raise_nothing_but_our_own_errors():
     tally = fuzz_driver.run(fuzz_rendering.program, 300, seed="tests")
     assert tally.failures == []
     assert tally.total("accepted") + tally.total("refused") == 300
-    assert min(tally.total("accepted"), tally.total("refused")) > 20
+    assert min(tally.total("accepted"), tally.total("refused")) > 5
 
 
 def test_a_window_without_a_display_says_so_each_time(monkeypatch):

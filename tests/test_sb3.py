@@ -163,9 +163,10 @@ def test_sb3s_own_checker_passes_and_warns_of_nothing_more_than_for_gymnasiums_o
     assert complaints(env_id) == (complaints(TWINS[env_id]) if env_id in TWINS else [])
 
 
+@pytest.mark.parametrize("overlap", [False, True], ids=["in_turn", "overlap"])
 @pytest.mark.parametrize("env", [*IDS, Reaching, OneByOne], ids=str)
-def test_it_is_the_equal_of_single_environments_in_sb3s_dummy_vec_env(env, make):
-    ours, theirs = make(env, 4), singles(env, 4)
+def test_it_is_the_equal_of_single_environments_in_sb3s_dummy_vec_env(env, overlap, make):
+    ours, theirs = make(env, 4, overlap=overlap), singles(env, 4)
     assert (ours.observation_space, ours.action_space) == (
         theirs.observation_space,
         theirs.action_space,
@@ -438,11 +439,13 @@ def weights(model):
 
 def test_ppo_learns_the_same_as_on_single_environments(make):
     trained = []
-    for env in (make(num_envs=4), singles("fmugym/CartPole-v0", 4)):
+    overlapping = make(num_envs=4, overlap=True)
+    for env in (make(num_envs=4), overlapping, singles("fmugym/CartPole-v0", 4)):
         model = sb3.PPO("MlpPolicy", env, **small(n_steps=32, batch_size=64, n_epochs=2))
         trained.append(weights(model.learn(512)))
         env.close()
-    assert_same(*trained)
+    assert_same(trained[0], trained[1])
+    assert_same(trained[0], trained[2])
 
 
 def test_sac_learns_the_same_as_on_single_environments(make):

@@ -1,10 +1,14 @@
 """A single environment with compiled hooks equals the same one with its hooks in Python."""
 
 import copy
+import gc
 import logging
 import math
 import pickle
+import random
 import warnings
+import weakref
+from types import MethodType
 
 import gymnasium as gym
 import numpy as np
@@ -197,6 +201,25 @@ class TestAttributes:
         assert env.step(0)[1] == 7.0
         assert env.step(0)[1] == 7.0
 
+    def test_methods_that_are_attributes(self):
+        class Bound(Drawing):
+            def __init__(self):
+                self._reward_policy = MethodType(lambda env: 2.0 * env.state[0], self)
+                super().__init__()
+
+        env = with_hooks(Bound, "compiled")
+        env.reset(seed=0)
+        assert env.step(env._no_action)[1] == 2.0 * env.state[0]
+        assert env._play is not None
+        env._reward_policy = MethodType(lambda env: 3.0 * env.state[0], env)
+        env.reset()
+        assert env.step(env._no_action)[1] == 3.0 * env.state[0]
+        reference = weakref.ref(env)
+        env.close()
+        del env
+        gc.collect()
+        assert reference() is None
+
     def test_changes_inside_of_arrays_and_lists_are_noticed(self):
         class Weighted(Drawing):
             def __init__(self):
@@ -379,6 +402,9 @@ class TestWays:
         env = Overriding(hooks="compiled")
         with pytest.raises(ConfigError, match="step is overridden"):
             env.reset(seed=0)
+        env.close()
+
+    def test_worker_processes_run_no_compiled_hooks(self):
         env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
         with pytest.raises(ConfigError, match="pool"):
             env.reset(seed=0)
@@ -437,6 +463,24 @@ class TestLife:
         env.reset(seed=0)
         assert env.step(1)[1] == 1.0
 
+    @pytest.mark.parametrize("cls", [Tracking, Counting])
+    def test_snapshots(self, cls):
+        one, other = (with_hooks(cls, hooks) for hooks in ("compiled", "python"))
+        rng, results = np.random.default_rng(0), []
+        size = one.action_space.shape
+        actions = [rng.uniform(-0.01, 0.01, size).astype(np.float32) for _ in range(6)]
+        for env in (one, other):
+            env.reset(seed=6)
+            found = [env.step(action) for action in actions[:2]]
+            snapshot = env.save_state()
+            found += [env.step(action) for action in actions[2:4]]
+            env.restore_state(snapshot)
+            found += [env.step(action) for action in actions[2:]]
+            results.append(found)
+        assert all(map(same, *results))
+        assert one._play is not None
+        require_readings(one, other)
+
     def test_draws_in_hooks_are_refused(self):
         class Random(Drawing):
             def _is_done(self):
@@ -467,6 +511,74 @@ class TestLife:
             warnings.simplefilter("ignore")  # the action space is Gymnasium's own
             check_env(env, skip_render_check=True)
         check_fmu_env(compiled_cart())
+
+
+class Meter:
+    def __init__(self):
+        self.count = 0
+
+    def add(self, value):
+        self.count += 1
+        return value
+
+
+METER, SEEN, TABLE = Meter(), [], [1.0, 2.0]
+
+
+class TestSideEffects:
+    """Hooks that do more than compute are called once a step, as ever."""
+
+    def play(self, expression, attributes=None):
+        names = {"METER": METER, "SEEN": SEEN, "TABLE": TABLE, "np": np, "random": random}
+        reward = eval(f"lambda self: {expression}", names)
+        members = {"_reward_policy": reward, "meter": Meter(), **(attributes or {})}
+        cls = type("Acting", (Drawing,), members)
+        env = with_hooks(cls, "auto", max_episode_steps=5000)
+        env.reset(seed=0)
+        for _ in range(1020):
+            env.step(env._no_action)
+        return env
+
+    @pytest.mark.parametrize(
+        ("expression", "count"),
+        [
+            ("METER.add(self.state[0])", lambda env: METER.count),
+            ("self.meter.add(self.state[0])", lambda env: env.meter.count),
+            ("SEEN.append(1) or self.state[0]", lambda env: len(SEEN)),
+        ],
+    )
+    def test_objects_are_used_once_a_step(self, expression, count):
+        METER.count = 0
+        SEEN.clear()
+        env = self.play(expression)
+        assert count(env) == 1020
+        assert env._play is None
+
+    def test_output(self, capsys):
+        self.play("print('once') or self.state[0]")
+        assert capsys.readouterr().out == "once\n" * 1020
+
+    @pytest.mark.parametrize("draw", ["random.random()", "np.random.random()"])
+    def test_the_user_s_own_random_numbers(self, draw):
+        random.seed(1)
+        np.random.seed(1)  # noqa: NPY002  (that is what the user's hook does)
+        self.play(f"self.state[0] + {draw}")
+        after = random.random(), np.random.random()  # noqa: NPY002
+        random.seed(1)
+        np.random.seed(1)  # noqa: NPY002
+        for _ in range(1020):
+            eval(draw)
+        assert after == (random.random(), np.random.random())  # noqa: NPY002
+
+    def test_constants_may_be_global(self):
+        assert self.play("TABLE[1] * self.state[0]")._play is not None
+
+    def test_another_environment(self):
+        other = fmugym.envs.CartPoleEnv(hooks="python")
+        other.reset(seed=0)
+        env = self.play("self.other.state[0] + self.state[0]", {"other": other})
+        assert env._play is None
+        other.close()
 
 
 # Expressions

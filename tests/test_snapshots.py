@@ -28,7 +28,7 @@ ACTIONS = np.random.default_rng(5).uniform(-1, 1, (60, 1)).astype(np.float32)
 class Track(fmugym.FMI2CSEnv):
     """Follow a target that moves; an integral, a history, drawn values and short episodes."""
 
-    def __init__(self, fmi_version="2.0", backend=None, **changes):
+    def __init__(self, fmi_version="2.0", backend=None, hooks="auto", **changes):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
@@ -44,7 +44,7 @@ class Track(fmugym.FMI2CSEnv):
             "max_episode_steps": 12,
         }
         fmu = fmugym.bundled_fmu("Pendulum", fmi_version)
-        super().__init__(fmu, config | changes, backend=backend)
+        super().__init__(fmu, config | changes, backend=backend, hooks=hooks)
 
     fmi_version = None
 
@@ -141,6 +141,18 @@ class TestSingle:
         assert dict(other.parameters) == dict(env.parameters)
         assert play(other) == play(env)
         other.close()
+
+    @pytest.mark.parametrize("ways", [("compiled", "python"), ("python", "compiled")])
+    def test_compiled_hooks_go_on_as_those_in_python(self, halfway, ways):
+        first, second = (halfway(hooks=way) for way in ways)
+        assert first.save_state() == second.save_state()
+        expected = play(first)
+        second.restore_state(halfway(hooks=ways[0]).save_state())
+        assert play(second) == expected
+        snapshot = first.save_state()
+        expected = play(first)
+        first.restore_state(snapshot)
+        assert play(first) == expected
 
     @pytest.mark.parametrize("version", VERSIONS)
     def test_deep_copies_are_in_the_same_episode(self, halfway, version):

@@ -7,6 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
     CART_POLE,
     Drawing,
+    each_mode,
     each_way,
     require_equal,
     run_side_by_side,
@@ -72,6 +73,32 @@ def test_hooks_stay_compiled_with_attributes_for_each_environment(values, monkey
             assert vector.get_attr("weight") == tuple(now)
     monkeypatch.setattr(BatchEngine, "step", None)
     ways[0].step(ways[0].action_space.sample())
+    for vector in ways:
+        vector.close()
+
+
+@each_mode
+def test_done_is_that_of_the_last_step_in_all_ways_of_calling_hooks(mode):
+    """Compiled, it stayed False: a program keeps no array of it."""
+    ways = [
+        FMUVectorEnv(CART_POLE, 6, hooks=hooks, autoreset_mode=mode, max_episode_steps=12)
+        for hooks in ("auto", "array", "per_env")
+    ]
+    for vector in ways:
+        vector.reset(seed=0)
+    number = 0
+    for actions in sampled_actions(ways[0], 40):
+        results = [vector.step(actions) for vector in ways]
+        done, *others = [vector.get_attr("done") for vector in ways]
+        assert others == [done, done]
+        number += sum(done)
+        ended = results[0][2] | results[0][3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            for vector in ways:
+                vector.reset(options={"reset_mask": ended})
+            done, *others = [vector.get_attr("done") for vector in ways]
+            assert others == [done, done]
+    assert (number > 0) == (mode is not AutoresetMode.SAME_STEP)
     for vector in ways:
         vector.close()
 

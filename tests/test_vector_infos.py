@@ -97,3 +97,22 @@ def test_infos_are_zero_outside_of_their_masks(cls, mode, backend, hooks):
         told += "drawn" in infos and not infos["_drawn"].all()
     assert told > 0
     vector.close()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_infos_that_are_first_read_after_later_steps(mode):
+    """The arrays of drawn values and of last observations serve only until an episode starts."""
+    at_once, later = (
+        FMUVectorEnv(fmugym.envs.CartPoleEnv, 6, autoreset_mode=mode) for _ in range(2)
+    )
+    at_once.reset(seed=5)
+    later.reset(seed=5)
+    read, kept = [], []
+    for actions in sampled_actions(at_once, 60):
+        read.append(pickle.dumps(dict(at_once.step(actions)[4])))
+        kept.append(later.step(actions)[4])
+    assert sum("drawn" in infos for infos in kept) > 5
+    for one, other in zip(read, kept, strict=True):
+        assert pickle.dumps(dict(other)) == one
+    at_once.close()
+    later.close()

@@ -47,6 +47,9 @@ TABLES = (
     "np.take(GOAL, self.step_count % 2)",
     "np.take(COUNTS, self.step_count % 3, axis=1)[0]",
     "self.table[self.step_count % 3]",
+    "float(self.table[1]) * self.state[0] + int(self.on_class[0])",
+    f"np.interp({Q}, self.table - 2.0, self.table)",
+    f"self.table[np.minimum(np.searchsorted(self.table, {Q}), 2)]",
     "self.on_class[self.step_count % 2]",
     "looked_up(self.step_count % 4)",
     "np.searchsorted([-0.5, 0.0, 0.5], self.state[0])",
@@ -125,6 +128,7 @@ ARRAYS = (
 )
 
 PRODUCTS = (
+    f"self.table.dot(np.array([{Q}, {Q}, {W}]))",
     "-(GAINS @ self.state)",
     "(MATRIX @ self.state)[1]",
     "(self.state.T @ MATRIX).T[0]",

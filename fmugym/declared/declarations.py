@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -22,15 +23,21 @@ from fmugym.declared.variables import (
     start_value,
 )
 
-__all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term"]
+__all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
 
-BUILT_IN: Final = ("time", "elapsed", "step", "dt", "dt_h", "done")
+BUILT_IN: Final = ("time", "clock", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
 
 AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescale", "normalize"),)
 """The keys of the agent."""
 
 _RESERVED: Final = frozenset({*BUILT_IN, *CONSTANTS, *FUNCTIONS, "previous"})
+
+
+def is_reserved(name: str) -> bool:
+    """Whether a name cannot be an alias, because it has a meaning of its own in expressions."""
+    return name in _RESERVED or keyword.iskeyword(name)
+
 
 Limits = tuple[float, float]
 
@@ -261,6 +268,11 @@ class Declarations:
         actions = [self.records.find(e, e.text(), "action") for e in self._listed("actions")]
         for record in actions:
             self.records.check_input(entry, record)
+            if record.variable is None and not record.is_direct:
+                raise record.entry.error(
+                    f"{record.alias!r} is no input of the FMU: 'delta', 'rate', 'min_on' and "
+                    "'min_off' are for inputs"
+                )
         if len({bool(record.levels) for record in actions}) > 1:
             raise entry.error("either all actions have levels, or none has")
         for record in actions:
@@ -355,7 +367,7 @@ def _check_names(root: Entry) -> None:
         for entry in _section(root, section):
             if entry.name in seen:
                 raise entry.error(f"the name {entry.name!r} is given twice")
-            if entry.name in _RESERVED:
+            if is_reserved(entry.name):
                 raise entry.error(f"{entry.name!r} has a meaning of its own in expressions")
             if not entry.name.isidentifier():
                 raise entry.error(

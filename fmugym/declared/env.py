@@ -15,7 +15,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.plan import Plan
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
-from fmugym.errors import shown, unknown_name
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["TaskEnv", "fmu_path"]
 
@@ -57,7 +57,7 @@ class TaskEnv(FMUEnv):
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
         self.cost_limits = plan.cost_limits
-        self._observation_names = plan.observation_names
+        self._observation_names, self._masks = plan.observation_names, plan.action_masks
         for name, function in plan.hooks.items():
             if name not in _own_hooks(type(self)):
                 setattr(self, name, MethodType(function, self))
@@ -77,6 +77,20 @@ class TaskEnv(FMUEnv):
         if "_get_observation" in _own_hooks(type(self)):
             return None
         return self._observation_names
+
+    def action_masks(self) -> Any:
+        """Tell which levels of the actions take effect now, as MaskablePPO of sb3-contrib asks.
+
+        Returns:
+            Booleans of shape (levels,), the levels of the first action first. A level is masked if
+            the least time on or off keeps its action from being switched to it.
+
+        Raises:
+            ConfigError: If the actions have no levels.
+        """
+        if self._masks is None:
+            raise ConfigError("action_masks needs actions with 'levels'")
+        return self._masks(self)
 
     def _is_done(self) -> Any:
         """Episodes of a task that says nothing about their end are only truncated."""

@@ -13,12 +13,13 @@ from fmugym.errors import ArgumentError, shown
 __all__ = ["load"]
 
 
-def load(config: Any = None, **arguments: Any) -> FMUEnv:
+def load(config: Any = None, *, scenario: str | None = None, **arguments: Any) -> FMUEnv:
     """Make the environment that a task file declares.
 
     Args:
         config: The path of a TOML file, a dict with the same keys, or a ``Task``. See
             ``docs/task-file.md``.
+        scenario: The name of a scenario of the task, in which the episodes then take place.
         arguments: Arguments of the environment, such as ``render_mode``; see ``TaskEnv``.
 
     Raises:
@@ -29,6 +30,8 @@ def load(config: Any = None, **arguments: Any) -> FMUEnv:
     if config is None:
         raise ArgumentError("give the argument 'config': the path of a task file, or a dict")
     task = Task.of(config)
+    if scenario is not None:
+        task = task.in_scenario(scenario)
     if task.root.child("class").value is None:
         if task.root.child("arguments").value is not None:
             raise task.root.child("arguments").error("'arguments' are for a task with a 'class'")

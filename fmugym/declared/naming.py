@@ -14,7 +14,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Code, Expression, Names, code_of_number
 from fmugym.declared.variables import Record, converted
 
-__all__ = ["Moment", "Naming"]
+__all__ = ["CLOCK", "Moment", "Naming", "switch_names"]
 
 
 class Moment(Enum):
@@ -23,9 +23,13 @@ class Moment(Enum):
     BEFORE = "before the FMU steps"
     AFTER = "after the FMU has stepped"
     JUDGED = "when it is known whether the task has ended"
+    UPDATED = "when it is being found out whether the task has ended"
     SEEN = "when the agent observes, between two steps"
     FORECAST = "at a later time, which only functions of time know"
 
+
+CLOCK: Final = "clock"
+"""The episode variable with the time of data at the beginning of an episode."""
 
 _SECONDS_PER_HOUR: Final = 3600.0
 
@@ -34,6 +38,11 @@ _JUST: Final = 1e-6
 
 So the rounding of times does not matter.
 """
+
+
+def switch_names(record: Record) -> tuple[str, str]:
+    """The episode variables that know whether an action is on, and for how many steps."""
+    return f"{record.alias} is on", f"steps since {record.alias} was switched"
 
 
 class Naming:
@@ -145,9 +154,10 @@ class Naming:
         """The value now. One that holds for a while is, after a step, that of the step."""
         series, shift = self._declared.series[name], self._ahead
         if series.is_stepped:
-            is_over = moment in (Moment.AFTER, Moment.JUDGED)
+            is_over = moment in (Moment.AFTER, Moment.JUDGED, Moment.UPDATED)
             shift += (_JUST - 1.0 if is_over else _JUST) * self._time_step
-        place = f"remainder((env.time + {shift - series.start!r}), {series.period!r})"
+        now, shift = self._clock(), shift - series.start
+        place = f"remainder(({now} + {shift!r}), {series.period!r})"
         self.constants[f"times_{name}"] = series.times
         self.constants[f"values_{name}"] = series.values
         return f"interp({place}, times_{name}, values_{name})"
@@ -156,15 +166,33 @@ class Naming:
         match name:
             case "time":
                 return Code(f"(env.time + {self._ahead!r})" if self._ahead else "env.time")
+            case "clock":
+                return Code(f"({self._clock()} + {self._ahead!r})")
             case "elapsed":
                 return Code(f"(env.step_count * {self._time_step!r} + {self._ahead!r})")
             case "step":
                 return Code(f"(env.step_count + {self._ahead / self._time_step!r})")
             case "done":
-                return Code("env.done", True) if moment is Moment.JUDGED else None
+                return self._done(moment)
             case "dt":
                 return code_of_number(self._time_step)
         return code_of_number(self._time_step / _SECONDS_PER_HOUR)
+
+    def _clock(self) -> str:
+        """Code for the time of data now; that of the FMU if the task sets no other clock."""
+        if self._declared.root.child("clock").value is None:
+            return "env.time"
+        return f"(env.variables[{CLOCK!r}] + env.step_count * {self._time_step!r})"
+
+    def _done(self, moment: Moment) -> Code | None:
+        if moment is Moment.JUDGED:
+            return Code("env.done", True)
+        if moment is not Moment.UPDATED:
+            return None
+        flags, entry = self._declared.flags, self._declared.root.child("terminated")
+        if "terminated" not in flags:
+            return Code("False", True, False)
+        return self.code(entry, flags["terminated"], Moment.AFTER)
 
     def _code_of_derived(self, name: str, moment: Moment) -> Code:
         derived = self._declared.derived[name]
@@ -183,8 +211,10 @@ class Naming:
         declared = self._declared
         if moment is Moment.FORECAST:
             raise record.entry.error(f"there is no forecast of {name!r}: no function of time")
-        if record in declared.actions and (moment is Moment.BEFORE or record.variable is None):
+        if record in declared.actions and record.variable is None:
             return self.action_code(record, "action")
+        if record in declared.actions and moment is Moment.BEFORE:
+            return self.input_code(record)
         if name in declared.written:
             return converted(record.conversion, f"env.inputs[{declared.written.index(name)}]")
         if name in declared.parameters:
@@ -195,7 +225,8 @@ class Naming:
     def _previous_code_of(self, name: str) -> Code | None:
         declared, record = self._declared, self._declared.records.get(name)
         if record is not None and record in declared.actions:
-            return Code(self.action_code(record, "previous_action"))
+            is_known = record.is_direct
+            return Code(self.action_code(record, "previous_action")) if is_known else None
         if record is None or name not in self.outputs:
             return None
         place = self.outputs.index(name)
@@ -217,8 +248,46 @@ class Naming:
         element = f"env.{attribute}" if is_one else f"env.{attribute}[{place}]"
         return f"take(levels_{place}, {element})"
 
+    def input_code(self, record: Record) -> str:
+        """Code for the value that an action gives an input, in the unit of the task."""
+        chosen = self.action_code(record, "action")
+        if record.is_direct:
+            return chosen
+        now = converted(
+            record.conversion, f"env.inputs[{self._declared.written.index(record.alias)}]"
+        )
+        if record.delta:
+            chosen = f"fn_clip(({now} + {chosen}), {record.low!r}, {record.high!r})"
+        if record.rate < np.inf:
+            most = record.rate * self._time_step
+            chosen = f"fn_clip({chosen}, ({now} - {most!r}), ({now} + {most!r}))"
+        if record.is_switched:
+            chosen = f"where({self.blocked_code(record, chosen)}, {now}, {chosen})"
+        return chosen
+
+    def blocked_code(self, record: Record, chosen: str) -> str:
+        """Code for whether it is too early to switch to a value.
+
+        Args:
+            record: A variable with a least time on or off.
+            chosen: Code for the value.
+        """
+        state, since = (f"env.variables[{name!r}]" for name in switch_names(record))
+        on, off = (np.ceil(t / self._time_step - _JUST) for t in (record.min_on, record.min_off))
+        stays_on = f"(({state} > 0.5) & ({chosen} == 0.0) & ({since} < {float(on)!r}))"
+        stays_off = f"(({state} < 0.5) & ({chosen} != 0.0) & ({since} < {float(off)!r}))"
+        return f"({stays_on} | {stays_off})"
+
+    def switch_codes(self, record: Record) -> tuple[str, str]:
+        """Code for the new values of the variables that ``switch_names`` names."""
+        state, since = (f"env.variables[{name!r}]" for name in switch_names(record))
+        is_on = f"((env.inputs[{self._declared.written.index(record.alias)}] != 0.0) * 1.0)"
+        return is_on, f"where({is_on} == {state}, ({since} + 1.0), 1.0)"
+
     def _rescaled(self, record: Record, element: str) -> str:
         """Code that turns an action from -1 to 1 into one from the lowest to the highest value."""
+        if record.delta:
+            return f"({record.delta!r} * {element})"
         middle, half = (record.low + record.high) / 2, (record.high - record.low) / 2
         return f"({middle!r} + {half!r} * {element})"
 

@@ -24,6 +24,7 @@ class Seen(NamedTuple):
         name: What it is the value of.
         code: Its code.
         low, high: Its limits.
+        place: Which value of a forecast or history it is, such as ``"[+3600 s]"``.
     """
 
     entry: Entry
@@ -31,6 +32,7 @@ class Seen(NamedTuple):
     code: str
     low: float
     high: float
+    place: str = ""
 
 
 class History(NamedTuple):
@@ -115,7 +117,8 @@ def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iter
             name = one.text()
             for index in range(1, count + 1):
                 code = naming.forecast(one, name, index * step)
-                yield Seen(one, name, code, *declared.limits_of(name))
+                place = f"[+{index * step:g} s]"
+                yield Seen(one, name, code, *declared.limits_of(name), place)
 
 
 def _past(
@@ -132,7 +135,7 @@ def _past(
                 code = f"where(env.step_count == 0, {history.first}, {past})"
             else:
                 code = naming.forecast(entry, name, -(index + 1) * time_step)
-            yield Seen(entry, name, code, *limits)
+            yield Seen(entry, name, code, *limits, f"[-{(index + 1) * time_step:g} s]")
 
 
 def _count(entry: Entry, step: float) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -14,11 +15,13 @@ from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
-from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
 from fmugym.declared.observing import histories, normalized, observed_values, remember
 from fmugym.declared.quantities import duration
+from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
+from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
 
@@ -33,6 +36,12 @@ _OF_SECTIONS: Final = frozenset(
 """Keys of a config that other sections of a task determine."""
 
 _OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
+
+WORST: Final = "worst reward"
+"""The episode variable with the lowest reward until now, or 0."""
+
+_LONG_AGO: Final = 1e9
+"""Steps since an action was switched, at the beginning of an episode."""
 
 Hook = Callable[[Any], Any]
 
@@ -49,6 +58,8 @@ class Plan:
         config: The config for ``FMUEnv``.
         hooks: Functions of the environment by the names of the hooks that they are.
         observation_names: The names of the elements of the observation.
+        action_masks: A function of the environment that tells which levels of the actions are not
+            blocked, shape (levels,); None if the actions have no levels.
         cost_limits: What the costs of an episode may add up to, by name.
 
     Raises:
@@ -70,7 +81,8 @@ class Plan:
         self._seen = observed_values(declared, self._naming, self._kept, self._time_step)
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
-        self.observation_names = tuple(name for _, name in declared.observed)
+        self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
+        self.action_masks = self._action_masks()
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 
@@ -92,7 +104,41 @@ class Plan:
 
     def _variables(self) -> dict[str, Any]:
         remembered = {name: memory.start for name, memory in self._declared.memory.items()}
-        return remembered | {one.variable: np.zeros(one.length) for one in self._kept}
+        histories = {one.variable: np.zeros(one.length) for one in self._kept}
+        switches: dict[str, float] = {}
+        for record in self._switched:
+            state, since = switch_names(record)
+            switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
+        worst = {WORST: 0.0} if self._has_worst else {}
+        return remembered | self._clock() | histories | switches | worst
+
+    def _clock(self) -> dict[str, Any]:
+        """When episodes begin, if the task has a clock of its own."""
+        clock, scenarios = self._root.child("clock"), read_scenarios(self._root.child("scenarios"))
+        if clock.value is None:
+            return {}
+        length = self._times().get("max_episode_steps", 0) * self._time_step
+        return {CLOCK: read_clock(clock, scenarios, length)}
+
+    @property
+    def _switched(self) -> list[Record]:
+        """The actions with a least time on or off."""
+        return [record for record in self._declared.actions if record.is_switched]
+
+    def _is_on_at_start(self, record: Record) -> float:
+        own = 0.0 if record.variable is None else record.variable.start_number
+        _, start = self._declared.parameters.get(record.alias, (record, own))
+        if is_distribution(start):
+            raise record.entry.error(f"the start value of {record.alias!r} must not be drawn")
+        return float(start != 0)
+
+    @cached_property
+    def _has_worst(self) -> bool:
+        """Whether failed steps cost as much as the worst one, and that is not known ahead."""
+        own, rewards = self._root.child("config").child("fault_reward"), self._declared.rewards
+        if own.value is not None or not rewards:
+            return False
+        return any(not _is_number(code) for code in self._terms(rewards).values())
 
     def _own_config(self) -> dict[str, Any]:
         section = self._root.child("config")
@@ -153,7 +199,7 @@ class Plan:
         if are_inputs and not self._declared.inputs and not rescales:
             return None
         if not records[0].levels:
-            limits = [(record.low, record.high) for record in records]
+            limits = [(-r.delta, r.delta) if r.delta else (r.low, r.high) for r in records]
             return _box([(-1.0, 1.0)] * len(records) if rescales else limits)
         counts = [len(record.levels) for record in records]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
@@ -162,7 +208,7 @@ class Plan:
         """Write the FMU's inputs, in their units."""
         declared = self._declared
         codes = [
-            inverted(record.conversion, self._naming.action_code(record, "action"))
+            inverted(record.conversion, self._naming.input_code(record))
             for record in declared.actions
             if record.variable is not None
         ]
@@ -175,6 +221,17 @@ class Plan:
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
             )
         return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+
+    def _action_masks(self) -> Hook | None:
+        codes = []
+        for record in self._declared.actions:
+            for level in record.levels:
+                blocked = self._naming.blocked_code(record, repr(level))
+                codes.append(f"({blocked} ^ True)" if record.is_switched else "True")
+        if not codes:
+            return None
+        masks = self._function(_tuple(codes))
+        return lambda env: np.array(masks(env), dtype=np.bool_)
 
     def _observation_space(self) -> spaces.Space[Any] | None:
         """The observation space; None if it is that of the outputs as they are."""
@@ -195,7 +252,12 @@ class Plan:
 
     def _hooks_of_steps(self) -> dict[str, Hook]:
         declared, hooks = self._declared, {}
-        updates = [*self._updates_of_memory(), *self._updates_of_histories()]
+        updates = [
+            *self._updates_of_memory(),
+            *self._updates_of_histories(),
+            *self._updates_of_switches(),
+            *self._updates_of_worst(),
+        ]
         if updates:
             hooks["_update"] = _in_turn(updates)
         if "terminated" in declared.flags:
@@ -204,6 +266,7 @@ class Plan:
             hooks["_is_truncated"] = self._condition("truncated", Moment.JUDGED)
         if declared.rewards:
             hooks["_reward_policy"] = self._function(_sum(self._terms(declared.rewards)))
+            hooks["_fault_reward"] = self._fault_reward()
         if declared.costs or declared.has_reward_terms:
             hooks["_get_info"] = self._function(self._info())
         return hooks
@@ -214,6 +277,18 @@ class Plan:
         values, fills = ([history.now for history in self._kept], [h.fill for h in self._kept])
         return [remember(self._kept, self._function(_tuple(values)), self._function(_tuple(fills)))]
 
+    def _updates_of_switches(self) -> list[Hook]:
+        codes: dict[str, str] = {}
+        for record in self._switched:
+            codes |= zip(switch_names(record), self._naming.switch_codes(record), strict=True)
+        return self._assignments(codes)
+
+    def _updates_of_worst(self) -> list[Hook]:
+        if not self._has_worst:
+            return []
+        reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
+        return self._assignments({WORST: f"fn_min(env.variables[{WORST!r}], {reward})"})
+
     def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""
         codes = {
@@ -221,6 +296,10 @@ class Plan:
             for name, memory in self._declared.memory.items()
             if memory.update is not None
         }
+        return self._assignments(codes)
+
+    def _assignments(self, codes: Mapping[str, str]) -> list[Hook]:
+        """A function that writes variables; none if there are no variables."""
         if not codes:
             return []
         names, values = list(codes), self._function(_tuple(codes.values()))
@@ -231,6 +310,16 @@ class Plan:
 
         return [update]
 
+    def _fault_reward(self) -> Hook:
+        """A failed step gives the reward that the file says, or no more than any step before."""
+        own = self._root.child("config").child("fault_reward")
+        if own.value is not None:
+            return lambda env: env.config.fault_reward
+        if self._has_worst:
+            return lambda env: env.variables[WORST]
+        reward = self._function(_sum(self._terms(self._declared.rewards)))
+        return lambda env: min(0.0, reward(env))
+
     def _condition(self, name: str, moment: Moment) -> Hook:
         entry = self._root.child(name)
         code = self._naming.code(entry, self._declared.flags[name], moment)
@@ -238,11 +327,11 @@ class Plan:
             raise entry.error(f"expected a condition such as 'x > 1', got {shown(entry.value)}")
         return self._function(code.text)
 
-    def _terms(self, terms: Mapping[str, Term]) -> dict[str, str]:
+    def _terms(self, terms: Mapping[str, Term], moment: Moment = Moment.JUDGED) -> dict[str, str]:
         """Code for rewards or costs by name, weights included."""
         codes = {}
         for name, term in terms.items():
-            code = self._naming.code(term.entry, term.expression, Moment.JUDGED).number.text
+            code = self._naming.code(term.entry, term.expression, moment).number.text
             codes[name] = code if term.weight == 1.0 else f"({term.weight!r} * {code})"
         return codes
 
@@ -279,6 +368,15 @@ def _time_step(root: Entry, description: ModelDescription) -> float:
     if description.step_size is None:
         raise root.error("the key 'time_step' is missing, and the FMU has no default step size")
     return description.step_size
+
+
+def _is_number(code: str) -> bool:
+    """Whether code is a constant."""
+    try:
+        float(code.strip("()"))
+    except ValueError:
+        return False
+    return True
 
 
 def _has_own_limits(record: Record) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 
 from fmugym.checks import check_integer, check_mapping, check_path
 from fmugym.declared.entries import Entry, Source
+from fmugym.declared.seasons import read_scenarios, scenario_of
 from fmugym.declared.writing import as_toml
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -26,7 +27,7 @@ VERSION: Final = 1
 
 KEYS: Final = (
     *("version", "extends", "description", "fmu", "class", "arguments"),
-    *("time_step", "substeps", "episode_length", "warm_up", "start_time"),
+    *("time_step", "substeps", "episode_length", "warm_up", "start_time", "clock", "scenarios"),
     *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
     "agent",
     *("reward", "costs", "terminated", "truncated", "config"),
@@ -121,6 +122,18 @@ class Task:
     def root(self) -> Entry:
         """The table of all keys, with the places in the files."""
         return Entry(self.document, (), self.sources)
+
+    def in_scenario(self, name: str) -> Task:
+        """Return the task in one of its scenarios: its beginning and its length are given.
+
+        Raises:
+            ConfigError: If there is no such scenario.
+        """
+        section = self.root.child("scenarios")
+        with section.placing():
+            scenario = scenario_of(read_scenarios(section), name)
+        times = {"clock": scenario.start, "episode_length": scenario.length}
+        return Task({**self.document, **times}, self.sources)
 
     @property
     def name(self) -> str:

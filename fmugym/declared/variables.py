@@ -11,7 +11,7 @@ from fmugym.archive.description import ModelDescription, Variable
 from fmugym.checks import check_mapping, check_option, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
-from fmugym.declared.quantities import IDENTITY, Conversion, conversion_between
+from fmugym.declared.quantities import IDENTITY, Conversion, conversion_between, duration
 from fmugym.distributions import Choice, Normal, Uniform, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import SAMPLINGS
@@ -29,8 +29,14 @@ __all__ = [
     "start_value",
 ]
 
-VARIABLE_KEYS: Final = ("name", "unit", "min", "max", "levels", "sample", "description")
+VARIABLE_KEYS: Final = (
+    *("name", "unit", "min", "max", "levels", "delta", "rate", "min_on", "min_off", "sample"),
+    "description",
+)
 """The keys of a variable."""
+
+
+_OF_ACTUATOR: Final = ("delta", "rate", "min_on", "min_off")
 
 
 def number(entry: Entry) -> float:
@@ -58,6 +64,10 @@ class Record:
         low, high: The limits in the unit of the task; infinite where there are none.
         levels: The values that an action chooses from; empty for a continuous one.
         sample: What a step gives of the values after each substep, one of ``SAMPLINGS``.
+        delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
+            value itself.
+        rate: The largest change in a second; infinite for no limit.
+        min_on, min_off: How many seconds an action stays other than 0, and stays 0, at least.
     """
 
     alias: str
@@ -69,6 +79,20 @@ class Record:
     high: float
     levels: tuple[float, ...] = ()
     sample: str = "last"
+    delta: float = 0.0
+    rate: float = math.inf
+    min_on: float = 0.0
+    min_off: float = 0.0
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether an action reaches the FMU as the agent has chosen it."""
+        return not self.delta and self.rate == math.inf and not self.is_switched
+
+    @property
+    def is_switched(self) -> bool:
+        """Whether there is a least time on or off."""
+        return self.min_on > 0 or self.min_off > 0
 
     @property
     def fmu_name(self) -> str:
@@ -174,6 +198,8 @@ class Records:
         Raises:
             ConfigError: If it cannot.
         """
+        if not self[name].is_direct or self[name].levels:
+            raise self[name].entry.error(f"{name!r} is observed, not an action: it has no such key")
         with entry.placing():
             output_variable(self._description, self[name].fmu_name)
 
@@ -195,7 +221,10 @@ class Records:
             conversion = conversion_between(own, wanted, self._description.units)
         limited = None if sample == "integral" else variable
         low, high = _limits(entry, limited, conversion)
-        return Record(alias, entry, variable, wanted, conversion, low, high, _levels(entry), sample)
+        levels, limits = _levels(entry), _limits_of_actuator(entry)
+        return Record(
+            alias, entry, variable, wanted, conversion, low, high, levels, sample, **limits
+        )
 
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
@@ -218,6 +247,21 @@ def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[floa
     limits = (min(values), max(values)) if values else (variable.minimum, variable.maximum)
     low, high = sorted(map(conversion, limits))
     return low, high
+
+
+def _limits_of_actuator(entry: Entry) -> dict[str, float]:
+    """How fast an action may change."""
+    given = {key: entry.child(key) for key in _OF_ACTUATOR}
+    limits: dict[str, float] = {}
+    for key, one in given.items():
+        if one.value is None:
+            continue
+        limits[key] = one.check(duration) if key in ("min_on", "min_off") else number(one)
+        if not limits[key] > 0:
+            raise one.error(f"{key} must be positive, got {limits[key]:g}")
+    if "delta" in limits and "levels" in (entry.value or {}):
+        raise entry.error("an action has either 'levels' or 'delta'")
+    return limits
 
 
 def _sample(entry: Entry) -> str:
@@ -254,7 +298,7 @@ def inverted(conversion: Conversion, text: str) -> str:
 
 def is_plain(record: Record) -> bool:
     """Whether the values of the task are those of the FMU."""
-    return record.conversion == IDENTITY and not record.levels
+    return record.conversion == IDENTITY and not record.levels and record.is_direct
 
 
 def number_or_distribution(entry: Entry) -> Any:

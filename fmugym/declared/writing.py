@@ -10,7 +10,7 @@ from fmugym.errors import ConfigError, shown
 
 __all__ = ["as_toml"]
 
-_INLINE: Final = ("fmu", "start_time", "warm_up")
+_INLINE: Final = ("fmu", "clock")
 """Tables that describe one value; they are written in one line."""
 
 

@@ -61,6 +61,8 @@ class Instance(ABC):
     slave_class: ClassVar[Any]
     dtypes: ClassVar[dict[str, Any]]
     """numpy's type for each C type of this FMI version."""
+    initializations: ClassVar = 0
+    """How many initializations all instances of this process have begun."""
     enumeration_type: ClassVar = "Integer"
     """The C type of enumerations in this FMI version."""
     _deserialize: ClassVar = "Deserialize"
@@ -250,6 +252,7 @@ class Instance(ABC):
             SimulationError: If the FMU fails.
         """
         self._require(Phase.INSTANTIATED, "initialize")
+        Instance.initializations += 1
         try:
             self._initialize(Span(start_time, stop_time, tolerance), set_start_values)
         except BaseException:  # initialization is incomplete: only a reset is legal now

@@ -30,7 +30,8 @@ def restore_arithmetic() -> None:
 def _resetter() -> Callable[[], Any]:
     """Make a function that restores the default floating-point environment of this thread."""
     if sys.platform == "win32":
-        return ctypes.CDLL("msvcrt")._fpreset  # type: ignore[no-any-return]
+        reset: Callable[[], Any] = ctypes.CDLL("msvcrt")._fpreset
+        return reset
     library = ctypes.CDLL(None)
     default = ctypes.c_void_p(-1)  # FE_DFL_ENV of glibc and musl
     if sys.platform == "darwin":

@@ -187,6 +187,18 @@ class Pool(ABC):
         """
         raise SimulationError(f"a {type(self).__name__} has no states that could be saved")
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """Set tunable parameters of all instances between two steps.
+
+        Args:
+            variables: The parameters, P of them.
+            values: Shape (P, N).
+
+        Raises:
+            SimulationError: If the pool cannot do it, or an instance refuses.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot set parameters between steps")
+
     def restore_instances(
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> StatusArray:
@@ -236,6 +248,14 @@ class Pool(ABC):
         surroundings: Any,
     ) -> Callable[..., tuple[int, int, int]]:
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``can_play``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+
+    def roll_out(self, *arrays: Any) -> int:
+        """Do many steps of the prepared play in one call; see ``NativePool``.
 
         Raises:
             SimulationError: If the pool does not support it; see ``can_play``.

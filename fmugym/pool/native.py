@@ -335,6 +335,13 @@ class NativePool(SavingPool):
             index, self._access(variables), values.tobytes(), state.outputs, state.data
         )
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """See ``Pool.write``."""
+        values = np.ascontiguousarray(values, np.float64)
+        failed = self._open_pool().write(self._access(variables), values)
+        if failed >= 0:
+            raise SimulationError(self.failure(failed))
+
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
@@ -557,6 +564,19 @@ class NativePool(SavingPool):
             **surroundings,
         )
         return self._pool.play
+
+    def roll_out(self, *arrays: Any) -> int:
+        """Do many steps of the prepared play in one call; episodes that end are not followed.
+
+        Args:
+            arrays: Actions, observations, rewards, terminated and truncated as for the function
+                that ``prepare_play`` returns, each with a first axis for the steps; and memory for
+                drawn values, which are not drawn.
+
+        Returns:
+            How many instances or numbers were in trouble; if there are any, not all steps are done.
+        """
+        return self._open_pool().rollout(*arrays)
 
     def prepare_single(self, **groups: Any) -> SingleCalls:
         """Prepare a pool of one instance to do whole steps of a single environment.

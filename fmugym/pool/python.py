@@ -163,6 +163,15 @@ class PythonPool(SavingPool):
                 self._note(index, self._slots[index].restore(snapshot[index]))
         return self.outputs, self.statuses
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """See ``Pool.write``."""
+        try:
+            with fmu_calls:
+                for index, slot in enumerate(self._slots):
+                    slot.write(variables, values[:, index])
+        finally:
+            restore_arithmetic()
+
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         chosen = [self._slots[index] for index in indices.tolist()]

@@ -433,6 +433,18 @@ class Slot:
         self._begin_counting_at(snapshot.count)
         return self._read_outputs(Status.OK)
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """Set variables between two steps.
+
+        Raises:
+            SimulationError: If the FMU refuses.
+        """
+        if self._instance.phase is not _STEPPING:
+            raise SimulationError("the instance needs a reset before anything can be set")
+        self._played = None
+        access = Access(self._instance, variables, np.array(values))
+        self._instance.check("setting variables", access.set())
+
     @property
     def count(self) -> int:
         """The number of communication steps in this episode."""

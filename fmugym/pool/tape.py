@@ -28,7 +28,7 @@ TAPE_ROWS: Final = 64
 _FIRST_RESETS: Final = 1024
 _FIRST_STEPS: Final = 2**18
 _FACTOR: Final = 4
-_LONGEST: Final = 3
+_LONGEST: Final = 4
 """After so many, the distance from one rehearsal to the next stays the same."""
 
 Array = npt.NDArray[Any]

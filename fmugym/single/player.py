@@ -16,7 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.single.compare import require_equal
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
-from fmugym.task.readings import LATE, LateReading
+from fmugym.task.readings import LATE, LateReading, make_late
 from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.hooks.program import Row, UntraceableError
@@ -40,6 +40,8 @@ class Player:
         self._required = required
         self._pause = STEPS_BEFORE // 2
         self._wait = 0
+        self._known = -1
+        self._has_methods = False
         self._task: SingleTask | None = None
         self._variables: Any = None
         self._ended_by_task = False
@@ -53,9 +55,8 @@ class Player:
             has stepped, but Python must judge it. Without compiled hooks, None.
         """
         attributes = vars(env)
-        if self._task is not None and not self._task.still_holds(attributes):
-            self._task, self._pause = None, 2 * self._pause
-            self._wait = self._pause
+        if self._task is not None and (self._has_methods or len(attributes) != self._known):
+            self._look_again(self._task, attributes)
         if self._task is None:
             if self._wait > 0:
                 self._wait -= 1
@@ -68,6 +69,19 @@ class Player:
         env._width = len(attributes)
         return self._calls.step
 
+    def doubt(self, env: FMUEnv) -> None:
+        """Leave a step to Python; before the next one, look for attributes that have changed."""
+        self._known = -1
+        if env._play is not None:
+            self.give_back(env)
+
+    def _look_again(self, task: SingleTask, attributes: Mapping[str, Any]) -> None:
+        """Drop the programs if an attribute has changed that they depend on."""
+        self._known = len(attributes)
+        if not task.still_holds(attributes):
+            self._task, self._pause = None, 2 * self._pause
+            self._wait = self._pause
+
     # Compiling.
 
     def _compile(self, env: FMUEnv, action: Any) -> None:
@@ -76,7 +90,9 @@ class Player:
             task = trace_single(env, action)
             require_equal(env, task)
             self._prepare(env, task)
+            make_late(FMUEnv)
             self._task, self._required = task, False
+            self._known = len(vars(env))
         except Exception as reason:  # hooks may raise anything
             env._player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
@@ -95,6 +111,8 @@ class Player:
         self._parameters = np.zeros((len(env.parameters), 1))
         self._count = np.zeros(1, np.int64)
         self._seen = tuple(np.zeros(array.shape, array.dtype) for array in task.seen)
+        self._has_methods = any(one.is_method for one in task.watched)
+        self._reads_inputs = task.inputs.loads("input")
         self._reads_parameters = task.loads("parameter")
         self._reads_actions = task.loads("load_previous_action")
         self._reads_variables = task.loads("variable") or task.loads("before")
@@ -118,7 +136,7 @@ class Player:
             copies=tuple(own or [env._observation_row.copy]),
             names=task.keys,
             observed=env._pool_observes,
-            watched=tuple(map(tuple, task.watched)),
+            watched=tuple(tuple(one) for one in task.watched if not one.is_method),
         )
 
     def _actions_of(self, env: FMUEnv, task: SingleTask) -> dict[str, Any]:
@@ -175,7 +193,8 @@ class Player:
                 return False
             self._current[...] = env.action
         self._count[0] = env.step_count
-        env._input_row[:] = env.inputs
+        if self._reads_inputs:
+            env._input_row[:] = env.inputs
         self._calls.begin(env.action)
         self._ended_by_task = False
         return True
@@ -279,5 +298,5 @@ def _is_plain(env: FMUEnv, action: Any) -> bool:
 def _require_late(env: FMUEnv) -> None:
     """Refuse classes that have attributes of their own in the place of readings."""
     for name in (*LATE, "variables"):
-        if not isinstance(getattr_static(type(env), name), LateReading):
+        if not isinstance(getattr_static(type(env), name, None), LateReading | None):
             raise UntraceableError(f"the class has an attribute {name!r} of its own")

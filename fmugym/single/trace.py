@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.single.purity import unchanged_globals
 from fmugym.single.watch import Watched, noting_reads, watched_in
 from fmugym.task.readings import Readings, reading
 from fmugym.task.results import FLOAT32_LIMIT
@@ -118,6 +119,7 @@ def trace_single(env: FMUEnv, action: Any) -> SingleTask:
     attributes = dict(vars(env))
     with (
         exclusive(),
+        unchanged_globals(env),
         borrowed(env),
         tables_in(env),
         reading(env, Readings.of(env)),

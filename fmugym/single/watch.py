@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from typing import Any, Final, NamedTuple
+from types import MethodType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fmugym.env import FMUEnv
+from fmugym.single.purity import is_ours, is_plain
 from fmugym.task.readings import READINGS
 from fmugym.vector.hooks.program import UntraceableError
 
 __all__ = ["Watched", "noting_reads", "watched_in"]
-
-_LEAVES: Final = (bool, int, float, complex, str, bytes, type(None), range)
-
-_OURS: Final = ("fmugym", "gymnasium", "logging")
-"""Packages whose objects hooks only read."""
 
 
 class Watched(NamedTuple):
@@ -33,6 +30,11 @@ class Watched(NamedTuple):
     name: str
     value: Any
     copy: Any
+
+    @property
+    def is_method(self) -> bool:
+        """Whether it is a method; the pool must not hold it, since it leads to the environment."""
+        return isinstance(self.value, MethodType)
 
     def is_in(self, attributes: Mapping[str, Any]) -> bool:
         """Whether the attribute is still the same object, with the same contents."""
@@ -77,33 +79,19 @@ def watched_in(attributes: Mapping[str, Any], names: set[str]) -> tuple[Watched,
         UntraceableError: If changes of one could not be noticed.
     """
     read = sorted(names & attributes.keys() - set(READINGS))
-    return tuple(
-        _watched(name, attributes[name]) for name in read if not _is_ours(attributes[name])
-    )
-
-
-def _is_ours(value: Any) -> bool:
-    module = getattr(value, "__module__", None) or type(value).__module__
-    return isinstance(module, str) and module.partition(".")[0] in _OURS
+    return tuple(_watched(name, attributes[name]) for name in read if not is_ours(attributes[name]))
 
 
 def _watched(name: str, value: Any) -> Watched:
     if type(value) is np.ndarray and value.dtype.kind in "biufc" and value.flags.c_contiguous:
         return Watched(name, value, value.tobytes())
-    if not _is_plain(value):
+    if isinstance(value, MethodType) and isinstance(value.__self__, FMUEnv):
+        return Watched(name, value, None)
+    if not is_plain(value):
         raise UntraceableError(
             f"it reads self.{name}, and changes inside of a {type(value).__name__} are not noticed"
         )
     return Watched(name, value, deepcopy(value) if _can_change(value) else None)
-
-
-def _is_plain(value: Any) -> bool:
-    """Whether it is a number or a text, or a container of them."""
-    if isinstance(value, (*_LEAVES, np.generic)):
-        return True
-    if type(value) is dict:
-        return all(map(_is_plain, value)) and all(map(_is_plain, value.values()))
-    return type(value) in (list, tuple) and all(map(_is_plain, value))
 
 
 def _can_change(value: Any) -> bool:

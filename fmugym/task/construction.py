@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Collection, Mapping
+from functools import cache
 from math import floor, nan
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, cast
@@ -93,7 +94,7 @@ class Constructed(Pictured):
         self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_hooks()
-        self._own_names = frozenset(dir(self._base))
+        self._own_names = _names_of(self._base)
         self._note_own_names(foreign)
 
     def _open(self, backend: Any, isolation: str | None) -> None:
@@ -251,6 +252,13 @@ class Constructed(Pictured):
             self.config.episode_variables,
             overrides.keys(),
         )
+
+
+@cache
+def _names_of(base: type) -> frozenset[str]:
+    """The attributes that a class has or announces."""
+    announced = (name for cls in base.__mro__ for name in vars(cls).get("__annotations__", ()))
+    return frozenset(dir(base)).union(announced)
 
 
 def _set_level(logger: logging.Logger, level: Any) -> None:

@@ -100,6 +100,7 @@ class EpisodePlan:
             self._distributions.extend(own)
         self._sampler = Sampler(self._distributions)
         self._start_values = self.constants.reshape(-1, 1).copy()
+        self._starts: Any = self._start_values.reshape(-1).data  # faster to write to
 
     @cached_property
     def parameter_names(self) -> list[str]:
@@ -194,9 +195,9 @@ class EpisodePlan:
         values = iter(self.draw_values(rng))
         parameters, variables = self._parameters.copy(), self._variables.copy()
         drawn: dict[str, Any] = {}
+        starts = self._starts
         for (index, name, _), value in zip(self._random_parameters, values, strict=False):
-            drawn[name] = parameters[name] = value
-            self._start_values[index, 0] = value
+            drawn[name] = parameters[name] = starts[index] = value
         for name, array in self._random_variables:
             own = next(values) if array is None else array.of_episode(values)
             drawn[name] = variables[name] = own

@@ -133,6 +133,13 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
             achieved, desired = np.moveaxis(achieved, -1, 0), np.moveaxis(desired, -1, 0)
         return self._goal_reward(achieved, desired)
 
+    def _fault_reward(self) -> Any:
+        """The reward of a step that failed; by default ``fault_reward`` of the config.
+
+        It is called in the state before that step.
+        """
+        return self.config.fault_reward
+
     def _get_observation(self) -> Any:
         """The observation, a new array (or dict of new arrays).
 

@@ -12,7 +12,7 @@ from fmugym.task.values import EpisodeVariables
 if TYPE_CHECKING:
     from fmugym.task.hooks import Hooks
 
-__all__ = ["LATE", "READINGS", "LateReading", "Readings", "reading"]
+__all__ = ["LATE", "READINGS", "LateReading", "Readings", "make_late", "reading"]
 
 
 @dataclass(slots=True)
@@ -83,7 +83,7 @@ class LateReading:
     its name. It then makes the value from what the pool keeps.
     """
 
-    def __set_name__(self, owner: type, name: str) -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
 
     def __get__(self, env: Any, owner: type | None = None) -> Any:
@@ -104,3 +104,14 @@ LATE: Final = (
 
 So it does with ``variables`` if hooks use any.
 """
+
+
+def make_late(cls: type[Any]) -> None:
+    """Give a class the readings that the pool keeps, which it then has for good.
+
+    Without them, reading an attribute of an environment is faster, so that only processes with
+    compiled steps of single environments need them.
+    """
+    for name in (*LATE, "variables"):
+        if name not in vars(cls):
+            setattr(cls, name, LateReading(name))

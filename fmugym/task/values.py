@@ -85,7 +85,7 @@ class EpisodeVariables(dict[str, Any]):
                 raise unknown_name("episode variable", name, self)
         super().update(new)
 
-    def __ior__(self, other: Any) -> EpisodeVariables:  # type: ignore[misc, override]
+    def __ior__(self, other: Any) -> EpisodeVariables:  # type: ignore[misc, override]  # dict overloads it
         self.update(other)
         return self
 

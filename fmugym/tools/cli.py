@@ -1,14 +1,18 @@
-"""The command line: a first look at an FMU, and the first lines of an environment for it.
+"""The command line: from a first look at an FMU to episodes of a task.
 
 ::
 
     fmugym info model.fmu [--json] [--all] [--filter GLOB]
+    fmugym new model.fmu [--output task.toml]
+    fmugym validate task.toml|model.fmu|ID|module:Class [--json]
+    fmugym simulate task.toml|ID|module:Class [--action random|NUMBERS] [--scenario NAME]
+        [--seed N] [--episodes N] [--steps N] [--output run.csv] [--json]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
 
-None of them executes anything of the FMU. Output is printable ASCII. The exit code is 0, 1 if the
-FMU or a file cannot be used (one line on the error stream says why), or 2 if the arguments are
-wrong.
+Only ``validate`` and ``simulate`` execute the FMU. Output is printable ASCII. The exit code is 0; 1
+if something cannot be used (one line on the error stream says why) or ``validate`` finds an error;
+2 if the arguments are wrong; 130 after Ctrl-C, which keeps the lines of a table until then.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -47,17 +51,27 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack, closing
 from importlib.metadata import version
 from pathlib import Path
+from typing import Final, TextIO
 
 from fmugym.archive.fmu import FMU
+from fmugym.checks import check_count, check_seed
 from fmugym.errors import FMUGymError
 from fmugym.tools.overview import as_text, overview, plain
+from fmugym.tools.proposal import Proposal
+from fmugym.tools.simulation import action_of, simulate
 from fmugym.tools.skeleton import Skeleton
 from fmugym.tools.stand_in import build_stand_in
+from fmugym.tools.targets import maker_of
+from fmugym.tools.validation import validate
 
 __all__ = ["main"]
+
+_INTERRUPTED: Final = 130
+_TASK: Final = "a task file, a registered id or module:Class"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,15 +81,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: The arguments; by default those of the process.
 
     Returns:
-        The exit code, 0 or 1.
+        The exit code, 0, 1 or 130.
 
     Raises:
         SystemExit: With the code 2 if the arguments are wrong, 0 after ``--help``.
     """
     arguments = _parser().parse_args(argv)
     try:
-        arguments.run(arguments)
+        code: int = arguments.run(arguments) or 0
         sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        return _INTERRUPTED
     except BrokenPipeError:  # the reader, for example ``head``, has ended
         _drop_output()
     except (FMUGymError, OSError) as error:
@@ -86,11 +103,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        "fmugym", description="Look at a co-simulation FMU and make an environment of it."
+        "fmugym", description="Look at a co-simulation FMU, make a task of it, and run that."
     )
     parser.add_argument("--version", action="version", version=version("fmugym-toolbox"))
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_info(commands)
+    _add_new(commands)
+    _add_validate(commands)
+    _add_simulate(commands)
     _add_skeleton(commands)
     _add_stand_in(commands)
     return parser
@@ -109,6 +129,40 @@ def _add_info(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         help="list only variables with a matching name, of any causality; * is any text, "
         "? one character",
     )
+
+
+def _add_new(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "write a task file for an FMU, to be filled in"
+    command = commands.add_parser("new", help=text, description=text.capitalize() + ".")
+    command.set_defaults(run=_new)
+    command.add_argument("fmu", type=Path, metavar="FMU")
+    command.add_argument(
+        "--output", type=Path, metavar="FILE", help="a new file, instead of standard output"
+    )
+
+
+def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "run a few short episodes and say what is wrong with a task, and what to do about it"
+    command = commands.add_parser("validate", help=text, description=text.capitalize() + ".")
+    command.set_defaults(run=_validate)
+    command.add_argument("task", metavar="TASK", help=f"{_TASK}, or an FMU")
+    command.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "play episodes with random or constant actions"
+    command = commands.add_parser("simulate", help=text, description=text.capitalize() + ".")
+    command.set_defaults(run=_simulate)
+    command.add_argument("task", metavar="TASK", help=_TASK)
+    command.add_argument(
+        "--action", default="random", help="random (default), or the numbers of one action: 0.5,-1"
+    )
+    command.add_argument("--scenario", help="a scenario of the task file")
+    command.add_argument("--seed", type=int, default=0, help="of the first episode; default 0")
+    command.add_argument("--episodes", type=int, default=1, help="default 1")
+    command.add_argument("--steps", type=int, default=10_000, help="at most, in each episode")
+    command.add_argument("--output", type=Path, metavar="FILE", help="a new CSV file of all steps")
+    command.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_skeleton(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -137,15 +191,62 @@ def _info(arguments: argparse.Namespace) -> None:
     print(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else as_text(facts))
 
 
+def _new(arguments: argparse.Namespace) -> None:
+    output: Path | None = arguments.output
+    proposal = Proposal(FMU(arguments.fmu), None if output is None else output.parent)
+    _write(proposal.text(), output)
+    _print_notes(proposal.notes())
+
+
+def _write(text: str, output: Path | None) -> None:
+    if output is None:
+        print(text, end="")
+        return
+    with output.open("x", encoding="ascii", newline="\n") as file:
+        file.write(text)
+
+
+def _print_notes(notes: Iterable[str]) -> None:
+    for note in notes:
+        print(f"fmugym: note: {plain(note)}", file=sys.stderr)
+
+
+def _validate(arguments: argparse.Namespace) -> int:
+    report = validate(maker_of(arguments.task))
+    if arguments.json:
+        print(json.dumps({"task": arguments.task, **report.as_dict()}, indent=2))
+    else:
+        print(report.as_text())
+    return int(report.verdict == "error")
+
+
+def _simulate(arguments: argparse.Namespace) -> None:
+    check_seed(arguments.seed)
+    check_count("--episodes", arguments.episodes)
+    check_count("--steps", arguments.steps)
+    with ExitStack() as stack:
+        env = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
+        policy = action_of(env, arguments.action)
+        output = arguments.output
+        table = None if output is None else stack.enter_context(_new_table(output))
+        summaries = []
+        for seed in range(arguments.seed, arguments.seed + arguments.episodes):
+            summaries.append(simulate(env, policy, seed, arguments.steps, table))
+            if not arguments.json:
+                print(plain(summaries[-1].as_text()))
+    if arguments.json:
+        episodes = [summary.as_dict() for summary in summaries]
+        print(json.dumps({"schema": 1, "task": arguments.task, "episodes": episodes}, indent=2))
+
+
+def _new_table(path: Path) -> TextIO:
+    return path.open("x", encoding="utf-8", newline="")
+
+
 def _skeleton(arguments: argparse.Namespace) -> None:
     skeleton = Skeleton(FMU(arguments.fmu))
-    if arguments.output is None:
-        print(skeleton.text(), end="")
-    else:
-        with arguments.output.open("x", encoding="ascii", newline="\n") as file:
-            file.write(skeleton.text())
-    for note in skeleton.notes():
-        print(f"fmugym: note: {plain(note)}", file=sys.stderr)
+    _write(skeleton.text(), arguments.output)
+    _print_notes(skeleton.notes())
 
 
 def _stand_in(arguments: argparse.Namespace) -> None:

@@ -93,6 +93,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "cannot_be_read_before_a_step": verdict.blind_start,
         "initial_state": None if verdict.states is None else str(verdict.states),
         "instances_at_once": verdict.instances,
+        "initializations": verdict.initializations,
         "deaths": list(verdict.reasons),
     }
 
@@ -235,6 +236,7 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
     count = trial["instances_at_once"]
     parts = parts or ["it survived"]
     parts.append(f"tried with {count} {'instance' if count == 1 else 'instances'} at once")
+    parts.append(f"{trial['initializations']} initializations")
     return "; ".join([*parts, *trial["deaths"]])
 
 

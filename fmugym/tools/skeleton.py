@@ -18,7 +18,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError
 from fmugym.tools.overview import plain, start_value
 
-__all__ = ["Skeleton"]
+__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
 
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
@@ -44,6 +44,8 @@ _SOLVER: Final = re.compile(
     re.VERBOSE | re.IGNORECASE,
 )
 """Names of parameters that set up the exporter's solver rather than the model."""
+
+_NO_STEP_SIZE: Final = "TODO: the FMU gives none that fits"
 
 _PROGRAM: Final = '''\
 """An environment for the FMU {file}. Decide what is marked with TODO.
@@ -140,7 +142,7 @@ class Skeleton:
 
     @cached_property
     def _settable_parameters(self) -> list[Variable]:
-        usable = (v for v in self._of("parameter") if v.settable_at_start and _literal(v))
+        usable = (v for v in self._of("parameter") if v.settable_at_start and literal(v))
         return [v for v in usable if not _SOLVER.search(v.name)]
 
     def _of(self, causality: str) -> list[Variable]:
@@ -155,13 +157,13 @@ class Skeleton:
 
     def notes(self) -> Iterator[str]:
         """What the user has to decide before the file is useful."""
-        for variable in filter(_needs_bounds, self.inputs):
+        for variable in filter(needs_bounds, self.inputs):
             yield f"the FMU gives no limits of input {variable.name!r}; set them in 'bounds'"
         if not self.inputs:
             yield "the FMU has no numeric input"
         if not self._of("output"):
             yield "the FMU has no outputs; locals replace them"
-        if not self._has_step_size:
+        if not self.has_step_size:
             yield "the FMU gives no step size that fits its default experiment; set 'time_step'"
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
@@ -188,27 +190,34 @@ class Skeleton:
         yield from self._times()
 
     def _bounds(self) -> Iterator[str]:
-        unbounded = [v for v in self.inputs if _needs_bounds(v)]
+        unbounded = [v for v in self.inputs if needs_bounds(v)]
         if unbounded:
             yield "# TODO: the FMU gives no limits of these; (low, high) is a guess."
             yield from _listing("bounds", [_bounds_line(v) for v in unbounded], "{}")
 
     def _parameter_lines(self) -> Iterator[str]:
         for variable in self.parameters:
-            yield f"{_quoted(variable.name)}: {_literal(variable)},{_comment(variable)}"
+            yield f"{_quoted(variable.name)}: {literal(variable)},{remark(variable)}"
         left_out = len(self._of("parameter")) - len(self.parameters)
         if left_out:
             yield f"# {left_out} more are listed by: fmugym info"
 
     def _times(self) -> Iterator[str]:
-        if self._has_step_size:
-            step = self._description.step_size or 0.0
-            yield f'"time_step": {step!r},  # s, the default of the FMU'
-        else:
-            step = self._guessed_step
-            yield f'"time_step": {step!r},  # s; TODO: the FMU gives none that fits'
-        steps = self._duration / step
-        yield f'"max_episode_steps": {round(steps) if 1 <= steps <= MOST_STEPS else 200},'
+        note = "the default of the FMU" if self.has_step_size else _NO_STEP_SIZE
+        yield f'"time_step": {self.time_step!r},  # s, {note}'
+        yield f'"max_episode_steps": {self.episode_steps},'
+
+    @property
+    def time_step(self) -> float:
+        """The step size of the FMU in seconds, or a guess."""
+        own = self._description.step_size
+        return own if self.has_step_size and own is not None else self._guessed_step
+
+    @property
+    def episode_steps(self) -> int:
+        """As many steps as the default experiment has, unless that is no episode."""
+        steps = self._duration / self.time_step
+        return round(steps) if 1 <= steps <= MOST_STEPS else 200
 
     @property
     def _duration(self) -> float:
@@ -218,7 +227,7 @@ class Skeleton:
         return max(seconds - description.start_time, 0.0) if seconds else 0.0
 
     @property
-    def _has_step_size(self) -> bool:
+    def has_step_size(self) -> bool:
         """Whether the FMU's own step size is not longer than its default experiment."""
         step = self._description.step_size
         return step is not None and (self._duration == 0.0 or step <= self._duration)
@@ -244,16 +253,25 @@ def _listing(key: str, lines: list[str], brackets: str = "[]") -> Iterator[str]:
 
 
 def _name_line(variable: Variable) -> str:
-    return f"{_quoted(variable.name)},{_comment(variable)}"
+    return f"{_quoted(variable.name)},{remark(variable)}"
 
 
-def _needs_bounds(variable: Variable) -> bool:
+def needs_bounds(variable: Variable) -> bool:
+    """Whether the FMU leaves a limit of an input open."""
     limits = variable.minimum, variable.maximum
     return variable.kind in {"real", "integer"} and not all(map(math.isfinite, limits))
 
 
 def _bounds_line(variable: Variable) -> str:
-    """Guess missing limits: a model often fails far away from its start value."""
+    low, high = guessed_bounds(variable)
+    return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # TODO"
+
+
+def guessed_bounds(variable: Variable) -> tuple[float, float]:
+    """The limits of an input; missing ones are guessed.
+
+    A model often fails far away from its start value.
+    """
     low, high = variable.minimum, variable.maximum
     down, up = _reach(variable)
     start = _start(variable)
@@ -261,7 +279,7 @@ def _bounds_line(variable: Variable) -> str:
         low = min(start, high) - down
     if not math.isfinite(high):
         high = max(start, low) + up
-    return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # TODO"
+    return low, high
 
 
 def _start(variable: Variable) -> float:
@@ -291,7 +309,7 @@ def _round_down(value: float) -> float:
     return float(f"{digit * power:.0e}")
 
 
-def _literal(variable: Variable) -> str:
+def literal(variable: Variable) -> str:
     """The start value as the config takes it; empty if the config takes none."""
     value = start_value(variable)
     if variable.kind == "string" and not variable.shape and isinstance(value, str):
@@ -310,7 +328,8 @@ def _quoted(text: str) -> str:
     return literal if '"' in literal else f'"{literal[1:-1]}"'
 
 
-def _comment(variable: Variable) -> str:
+def remark(variable: Variable) -> str:
+    """A comment with the unit and the description of a variable; empty if it has none."""
     unit = f"[{variable.unit}] " if variable.unit else ""
     text = textwrap.shorten(plain(unit + variable.description), 60, placeholder=" ...")
     return f"  # {text}" if text else ""

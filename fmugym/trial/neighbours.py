@@ -165,7 +165,11 @@ def _trajectory(
 
 
 def disturb_in_threads(
-    candidate: Candidate, spec: PoolSpec, *, one_initialization: bool = False
+    candidate: Candidate,
+    spec: PoolSpec,
+    *,
+    one_initialization: bool = False,
+    frugal: bool = False,
 ) -> bool:
     """Compare a lone instance with instances that are made and stepped at the same time.
 
@@ -174,6 +178,7 @@ def disturb_in_threads(
         spec: What to do in a step.
         one_initialization: Whether instances are made, initialized and freed in turn, so that only
             steps run at the same time as other calls.
+        frugal: Whether to do with as few initializations as possible.
 
     Returns:
         Whether an instance gave different outputs, or failed, while another thread ran.
@@ -188,7 +193,8 @@ def disturb_in_threads(
         if lives[0]() != lives[0].outputs:
             return False  # a lone instance does not repeat its outputs: nothing to compare
         company = _Turns() if one_initialization else _Crowd()
-        return not _Race(lives, company).is_undisturbed()
+        rounds = 1 if frugal and not one_initialization else 2
+        return not _Race(lives, company, rounds).is_undisturbed()
     finally:
         library.close()
 
@@ -255,8 +261,8 @@ class _Turns(_Crowd):
 class _Race:
     """Two threads that each make, run and free an instance at the same time, several times."""
 
-    def __init__(self, lives: Sequence[_Life], company: _Company) -> None:
-        self._lives, self._company = lives, company
+    def __init__(self, lives: Sequence[_Life], company: _Company, least_rounds: int) -> None:
+        self._lives, self._company, self._least_rounds = lives, company, least_rounds
         self._refusal: LicenceError | None = None
         self._deadline = time.perf_counter() + _THREAD_SECONDS
         self._disturbed = False
@@ -273,10 +279,10 @@ class _Race:
 
     def _run(self, life: _Life) -> None:
         try:
-            for number in range(_ROUNDS):
+            for number in range(1, _ROUNDS + 1):
                 if life(self._company) != life.outputs:
                     self._disturbed = True
-                is_late = number > 0 and time.perf_counter() > self._deadline
+                is_late = number >= self._least_rounds and time.perf_counter() > self._deadline
                 if self._disturbed or is_late:
                     break
         except LicenceError as error:

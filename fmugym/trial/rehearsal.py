@@ -39,6 +39,9 @@ _LONGEST: Final = 400
 _LONG_SECONDS: Final = 0.1
 """The real time in seconds after which a long episode of a slow FMU ends."""
 
+_SLOW_INITIALIZATION: Final = 2.0
+"""The real time in seconds from which an initialization counts as slow."""
+
 _AMPLITUDES: Final = (1.0, 0.1, 0.0)
 """How far inputs move, as fractions of their range; the smaller ones for FMUs that fail."""
 
@@ -130,6 +133,8 @@ class Rehearsal:
 
     Attributes:
         deterministic: Whether two fresh instances give the same outputs.
+        is_frugal: Whether fewer episodes are played, because initializations are slow or need
+            licences.
         reason: The FMU's message if even a fresh instance cannot play an episode, otherwise "".
     """
 
@@ -143,9 +148,10 @@ class Rehearsal:
         self._candidate, self._starts = candidate, starts
         self._spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
         self.deterministic, self.reason = True, ""
+        self.is_frugal = spec.initialization_interval > 0.0 or spec.licence_wait > 0.0
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
         self._references: list[_Run] = []
-        self._tolerance = tolerance_of(spec)
+        self._tolerance, self._knows_noise = tolerance_of(spec), False
         self._sample = sample
         if sample is None:
             self._find_reference()
@@ -167,7 +173,6 @@ class Rehearsal:
             first = self._play_fresh(0, measured=True)
             if first.status in _PLAYED:
                 self._references = [first, self._play_with_other_starts()]
-                self._compare_fresh_instances()
                 return
             self.reason = first.failure
 
@@ -181,6 +186,8 @@ class Rehearsal:
         return self._play_fresh(1)
 
     def _compare_fresh_instances(self) -> None:
+        """Find out, when an episode first differs, whether fresh instances differ as well."""
+        self._knows_noise = True
         again = self._play_fresh(0)
         if not _same(again, self._references[0]):
             self.deterministic = False
@@ -207,9 +214,13 @@ class Rehearsal:
 
     def _play(self, pool: Pool, start: int, steps: int, *, measured: bool = False) -> _Run:
         """Play one episode; a measured one determines how many steps a long episode has."""
-        deadline = time.perf_counter() + _LONG_SECONDS
+        begin = time.perf_counter()
         outputs, statuses = pool.reset(self._starts.variables, self._starts.column(start))
         require_licence(pool)
+        now = time.perf_counter()
+        deadline = now + _LONG_SECONDS
+        if measured and now - begin > _SLOW_INITIALIZATION:
+            self.is_frugal = True
         rows = [outputs[:, 0].copy()]
         for row in self._inputs[:steps]:
             if statuses[0] > Status.WARNING:
@@ -286,8 +297,13 @@ class Rehearsal:
         return worst
 
     def _episodes(self) -> Sequence[tuple[int, int]]:
-        """The start values and numbers of steps; each kind follows a short and a long episode."""
+        """The start values and numbers of steps; each kind follows a short and a long episode.
+
+        If initializations are precious, the first start values do not come back after the others.
+        """
         short, long = min(_SHORT, self._steps), self._steps
+        if self.is_frugal:
+            return ((0, short), (0, long), (0, short), (1, long))
         return ((0, short), (0, long), (0, long), (1, short), (0, short), (0, long), (1, long))
 
     def _compare(self, run: _Run, reference: _Run) -> Grade:
@@ -295,6 +311,8 @@ class Rehearsal:
             return Grade.FAILS
         if _same(run, reference):
             return Grade.BITWISE
+        if not self._knows_noise:
+            self._compare_fresh_instances()
         close = len(run.rows) == len(reference.rows) and run.status == reference.status
         if close and difference(run.rows, reference.rows) <= self._tolerance:
             return Grade.TOLERANCE

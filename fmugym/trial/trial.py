@@ -44,6 +44,7 @@ from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = [
+    "FRUGAL",
     "Candidate",
     "Outcome",
     "Request",
@@ -79,6 +80,11 @@ _LOOK: Final = 0.1
 
 _EVERY: Final = 10.0
 """Seconds between two messages about a worker that takes long."""
+
+FRUGAL: Final = (
+    "its initializations are slow or need licences, so no episode returned to earlier start values"
+)
+"""What a trial leaves out to need fewer initializations."""
 
 _MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
 """How glibc begins its messages about memory errors."""
@@ -152,6 +158,7 @@ class Request:
         starts: The ``Starts`` of two episodes, or None for the FMU's own start values.
         several: Whether to try several instances.
         alone: Whether it is known that instances must not share a copy of the library.
+        known: The ``Verdict`` of an earlier trial if it lacks only what several instances need.
         skip: The stages in which an earlier worker died.
         sample: The ``Sample`` of an initial state that another worker has made, if this one has to
             try only that.
@@ -166,6 +173,7 @@ class Request:
     several: bool = False
     alone: bool = False
     skip: frozenset[str] = frozenset()
+    known: Any = None
     sample: Any = None
     resume: Any = None
     check_memory: bool = True
@@ -268,7 +276,10 @@ def examine(
     known = Verdict.from_text(recall(key))
     if known is not None and _answers(known, spec, several):
         return _with_harm(known, candidate)
-    found = _examine(Request(candidate, spec, starts, several, alone), must_survive)
+    request = Request(candidate, spec, starts, several, alone)
+    if known is not None and known.complete and _answers(known, spec, several=False):
+        request = replace(request, known=known, check_memory=not known.isolate)
+    found = _examine(request, must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found
@@ -367,13 +378,29 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         else:
             request = replace(request, skip=request.skip | {outcome.stage})
     verdict = notes.verdict
-    if request.spec is not None and request.spec.keep_states and verdict.complete:
+    if request.known is not None:
+        verdict = _completed(request.known, verdict)
+    elif request.spec is not None and request.spec.keep_states and verdict.complete:
         verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
     verdict = _with_harm(verdict, request.candidate)
-    logger.info("%s was tried with %d instance(s) at once at most", name, verdict.instances)
+    logger.info(
+        "%s was tried with %d instance(s) at once at most, and %d initialization(s) in all",
+        *(name, verdict.instances, verdict.initializations),
+    )
     if verdict.complete:
         remember(_content_key(request.candidate.path), verdict.to_text())
     return verdict
+
+
+def _completed(known: Verdict, found: Verdict) -> Verdict:
+    """Add to a verdict what several instances need."""
+    return replace(
+        known,
+        neighbours=found.neighbours,
+        instances=found.instances,
+        initializations=known.initializations + found.initializations,
+        reasons=tuple(dict.fromkeys((*known.reasons, *found.reasons))),
+    )
 
 
 def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -> Grade:
@@ -394,11 +421,13 @@ class _Notes:
     def __init__(self) -> None:
         self._answer: dict[str, Any] = {}
         self._deaths: list[Outcome] = []
+        self._initializations = 0
         self.sample: bytes | None = None
 
     def add(self, outcome: Outcome) -> None:
         """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
+        self._initializations += int(outcome.answer.get("initializations", 0))
         self.sample = outcome.sample or self.sample
         if "finished" not in outcome.answer:
             self._deaths.append(outcome)
@@ -414,9 +443,11 @@ class _Notes:
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             neighbours=None if neighbours is None else Neighbours(neighbours),
             instances=int(answer.get("instances", 1)),
+            initializations=self._initializations,
             blind_start=bool(answer.get("blind_start")),
             isolate=any(death.stage in _ALONE for death in self._deaths),
-            reasons=tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
+            reasons=(FRUGAL,) * bool(answer.get("frugal"))
+            + tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
 
     def require_licence(self, name: str, outcome: Outcome) -> None:

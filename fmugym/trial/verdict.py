@@ -57,6 +57,7 @@ class Verdict:
         states: The grade of an initial state in a second process; None if it was not tried.
         blind_start: Whether the FMU cannot be read before its first step.
         instances: How many instances the trial used at once, each of which may take a licence.
+        initializations: How many initializations the trial took, which may be slow.
         reasons: The observations, one sentence each, for the log and ``fmugym info``.
     """
 
@@ -68,6 +69,7 @@ class Verdict:
     states: Grade | None = None
     blind_start: bool = False
     instances: int = 1
+    initializations: int = 0
     reasons: tuple[str, ...] = ()
 
     @property
@@ -92,6 +94,7 @@ class Verdict:
                 "states": None if self.states is None else str(self.states),
                 "blind_start": self.blind_start,
                 "instances": self.instances,
+                "initializations": self.initializations,
                 "reasons": list(self.reasons),
             }
         )
@@ -125,5 +128,6 @@ class Verdict:
             states=None if data["states"] is None else Grade(data["states"]),
             blind_start=flags[3],
             instances=data["instances"],
+            initializations=int(data["initializations"]),
             reasons=tuple(reasons),
         )

@@ -23,6 +23,7 @@ import numpy as np
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.errors import FMUGymError, LicenceError
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
@@ -35,7 +36,7 @@ from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
 from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
-from fmugym.trial.trial import Request, Stage, patience
+from fmugym.trial.trial import FRUGAL, Request, Stage, patience
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 _NO_DIALOGUES: Final = 0x0003
@@ -59,7 +60,8 @@ class Notes:
         self._answer: dict[str, Any] = {}
 
     def stage(self, stage: str) -> None:
-        """Write down what comes next."""
+        """Write down what comes next, and how many initializations there were so far."""
+        self.answer(initializations=_initializations())
         (self._folder / "stage").write_text(stage)
 
     def call(self, call: str) -> None:
@@ -100,7 +102,7 @@ def main(folder: Path) -> None:
         _try(request, notes)
     except LicenceError as error:
         notes.answer(refused=str(error))
-    notes.answer(finished=True)
+    notes.answer(finished=True, initializations=_initializations())
 
 
 def _try(request: Request, notes: Notes) -> None:
@@ -110,15 +112,26 @@ def _try(request: Request, notes: Notes) -> None:
     if request.resume is not None:
         _try_resuming(request, notes)
         return
+    if request.known is not None:
+        notes.answer(complete=True, frugal=FRUGAL in request.known.reasons)
+        _try_several(request, notes, request.known)
+        return
     complete = _try_alone(request, notes)
     notes.answer(complete=complete)
     if complete and request.spec is not None:
-        method = _try_resets(request, notes)
+        verdict = _try_resets(request, notes)
         if request.several:
-            spec = replace(
-                request.spec, reset_method=method, blind_start=notes.found("blind_start")
-            )
-            _try_several(replace(request, spec=spec), notes)
+            _try_several(request, notes, verdict)
+
+
+def _initializations() -> int:
+    """How many initializations this process has begun."""
+    count: int = Instance.initializations
+    if has_native_pool():
+        from fmugym import _native
+
+        count += _native.initializations()
+    return count
 
 
 def _end_after(seconds: float) -> None:
@@ -182,27 +195,31 @@ def _reset_and_step(pool: Pool, spec: PoolSpec, notes: Notes) -> None:
         pool.step(start_inputs(spec)[:, None])
 
 
-def _try_resets(request: Request, notes: Notes) -> ResetMethod:
-    """Grade the reset methods, fastest first, until one is exact to the last bit; return it."""
+def _try_resets(request: Request, notes: Notes) -> Verdict:
+    """Grade the reset methods, fastest first, until one is exact to the last bit.
+
+    Returns:
+        The verdict on the resets of a lone instance.
+    """
     notes.stage(Stage.REFERENCE)
     if Stage.REFERENCE in request.skip:
-        return ResetMethod.RESET
+        return Verdict()
     rehearsal = _rehearsal(request, notes)
     if not rehearsal.possible:
-        return ResetMethod.RESET
-    notes.answer(deterministic=rehearsal.deterministic)
+        return Verdict()
+    notes.answer(frugal=rehearsal.is_frugal)
     grades: dict[ResetMethod, Grade] = {}
     for method in _methods(request):
         stage = Stage.of(method)
         notes.stage(stage)
         skipped = stage in request.skip
         grades[method] = Grade.FAILS if skipped else rehearsal.grade(method)
-        notes.answer(resets=grades)
+        notes.answer(resets=grades, deterministic=rehearsal.deterministic)
         if grades[method] == Grade.BITWISE:
             break
     if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
         _make_sample(rehearsal, request, notes)
-    return Verdict(resets=grades).reset_method
+    return Verdict(resets=grades, blind_start=notes.found("blind_start"))
 
 
 def _rehearsal(request: Request, notes: Notes) -> Rehearsal:
@@ -251,7 +268,17 @@ def _methods(request: Request) -> list[ResetMethod]:
     return [*methods, ResetMethod.LIBRARY] if has_native_pool() else methods
 
 
-def _try_several(request: Request, notes: Notes) -> None:
+def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
+    """Find out what several instances need.
+
+    Args:
+        request: What the parent wants to know.
+        notes: Get the answer.
+        alone: The verdict on a lone instance.
+    """
+    method, blind = alone.reset_method, alone.blind_start
+    spec = replace(request.spec, reset_method=method, blind_start=blind)
+    request = replace(request, spec=spec)
     notes.answer(instances=2)
     notes.answer(neighbours=_need_of_several(request, notes))
 
@@ -274,7 +301,12 @@ def _disturbed_in_threads(request: Request, notes: Notes, stage: Stage) -> bool:
         return True
     in_turn = stage is Stage.TURNS
     try:
-        return disturb_in_threads(request.candidate, request.spec, one_initialization=in_turn)
+        return disturb_in_threads(
+            request.candidate,
+            request.spec,
+            one_initialization=in_turn,
+            frugal=notes.found("frugal"),
+        )
     except LicenceError:
         raise
     except FMUGymError:  # FMPy cannot load it, or it fails without the caller's values

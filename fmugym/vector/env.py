@@ -40,6 +40,13 @@ from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
+from fmugym.vector.rollouts import (
+    Candidates,
+    Rollout,
+    joined_rollouts,
+    roll_out_by_steps,
+    tunable_values,
+)
 from fmugym.vector.saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv"]
@@ -408,6 +415,99 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = self._is_ready = True
         return self._engine.observe(indices)
 
+    def rollout(
+        self,
+        snapshot: Snapshot | None,
+        actions: Any,
+        *,
+        horizon: int | None = None,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> Rollout:
+        """Find out what candidates for the next actions would lead to.
+
+        The environments return to their present episodes afterwards, if they have any. Hooks are
+        included. With compiled hooks, one call of the C extension does all steps on all threads.
+
+        Args:
+            snapshot: Where the candidates begin: a snapshot of one environment, or of one for each
+                candidate. None stands for the present episodes of all environments.
+            actions: The actions of n candidates, shape (n, horizon, ...). n may be larger than the
+                number of environments, unless ``snapshot`` is None. Or a policy: a function that
+                returns the actions of N environments, as for ``step``, from their observations;
+                there are N candidates then.
+            horizon: The number of steps of a policy.
+            parameters: Tunable parameters of the FMU that candidates have from here on: an array of
+                shape (n,), or one number for all, by name. For other parameters, let each candidate
+                begin with an episode that has been reset with its own.
+
+        Raises:
+            ConfigError: If the snapshot, the actions or the parameters do not fit.
+            SimulationError: If an episode of the snapshot has ended, an FMU cannot be restored, or,
+                with ``on_fault="raise"``, a step fails.
+        """
+        self._open_pool("rollout")
+        candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
+        candidates.parameters = tunable_values(self._prototype, parameters, candidates.count)
+        present = self.save_state() if self._is_ready else None
+        start = self._start_of_rollout(snapshot, present, candidates.count)
+        try:
+            parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
+            return joined_rollouts(parts, candidates.count)
+        finally:
+            self._is_ready = False
+            if present is not None:
+                self._place(present, np.arange(self.num_envs))
+                self._is_ready = True
+
+    def _start_of_rollout(
+        self, snapshot: Snapshot | None, present: Snapshot | None, count: int
+    ) -> Snapshot:
+        if snapshot is None and present is None:
+            raise SimulationError("rollout without a snapshot was called before the first reset")
+        start = checked_snapshot(present if snapshot is None else snapshot)
+        if len(start) not in ((count,) if snapshot is None else (1, count)):
+            raise ConfigError(
+                f"there are {count} candidates, but {len(start)} episodes where they may begin"
+            )
+        columns = start.columns_for(self._scope)
+        self._engine.require_fit(columns)
+        if np.any(columns["ended"]):
+            raise SimulationError("an episode where candidates begin has ended: reset it first")
+        return start
+
+    def _roll_out(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
+        """Let each environment play the candidate at its place."""
+        engine, actions = self._engine, candidates.actions(places)
+        self._begin(start, places, candidates)
+        if actions is not None:
+            engine.has_moved = False
+            arrays = engine.roll_out(actions)
+            if arrays is not None:
+                return Rollout.of(*arrays)
+            if engine.has_moved:  # a step has failed: the engine knows what follows
+                self._begin(start, places, candidates)
+        first = None if actions is not None else engine.observe(np.arange(self.num_envs))
+        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
+        try:
+            return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
+        finally:
+            engine.starts_at_ends = starts_at_ends
+
+    def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
+        """Bring all environments to the places where candidates begin."""
+        self._place(start, places if len(start) > 1 else np.zeros_like(places))
+        values = {name: column[places] for name, column in candidates.parameters.items()}
+        if values:
+            variables = tuple(map(self._prototype.fmu.variable, values))
+            self._pool.write(variables, np.stack(list(values.values())))
+            self._engine.show_parameters(values)
+
+    def _place(self, snapshot: Snapshot, sources: IndexArray) -> None:
+        """Let all environments go on from episodes of a snapshot that fits."""
+        everywhere = np.arange(self.num_envs)
+        self._restore(snapshot.bundle, sources, everywhere)
+        self._engine.place(snapshot.columns_for(self._scope), sources, everywhere)
+
     def _restore(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         statuses = self._pool.restore_instances(bundle, sources, indices)
         for index in indices[statuses[indices] > Status.WARNING].tolist():
@@ -495,7 +595,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._engine.set_attribute(name, values)
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
         return tuple(self._engine.seed_of(index) for index in range(self.num_envs))
 

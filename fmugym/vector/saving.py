@@ -14,7 +14,15 @@ from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.snapshot import Columns, Snapshot
 
-__all__ = ["chosen", "columns_of", "place_columns", "require_fit", "sources_for", "values_of"]
+__all__ = [
+    "chosen",
+    "columns_of",
+    "place_column",
+    "place_columns",
+    "require_fit",
+    "sources_for",
+    "which_of",
+]
 
 _FIRST = ("_values", "previous_state", "inputs", "action", "previous_action", "done", "after_end")
 """The attributes of a batch with the environments on their last axis."""
@@ -66,6 +74,16 @@ def sources_for(snapshot: Snapshot, indices: IndexArray) -> IndexArray:
     return np.arange(len(indices))
 
 
+Which = IndexArray | slice
+"""Some environments; a slice for all of them, which is faster."""
+
+
+def which_of(indices: IndexArray, count: int) -> Which:
+    """The indices, or a slice where they are all of so many in their order."""
+    in_order = len(indices) == count and np.array_equal(indices, np.arange(count))
+    return slice(None) if in_order else indices
+
+
 def columns_of(env: FMUEnv, parameters: Mapping[str, Any], indices: IndexArray) -> Columns:
     """Copy what hooks read in some environments of a batch.
 
@@ -74,28 +92,36 @@ def columns_of(env: FMUEnv, parameters: Mapping[str, Any], indices: IndexArray) 
         parameters: The parameters, arrays of shape (N,).
         indices: The environments, shape (M,).
     """
-    first = {name.lstrip("_"): _rows(getattr(env, name), indices) for name in _FIRST}
+    which = which_of(indices, len(env.step_count))
+    first = {name.lstrip("_"): _rows(getattr(env, name), which) for name in _FIRST}
     return first | {
-        "step_count": env.step_count[indices],
-        "parameters": {name: row[indices] for name, row in parameters.items()},
-        "variables": {name: _rows(row, indices) for name, row in env.variables.items()},
+        "step_count": _rows(env.step_count, which),
+        "parameters": {name: _rows(row, which) for name, row in parameters.items()},
+        "variables": {name: _rows(row, which) for name, row in env.variables.items()},
         "pictured": None,
         "attributes": None,
     }
 
 
-def _rows(values: Any, indices: IndexArray) -> npt.NDArray[Any]:
+def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
     """Values with environments on the last axis, as a new array with them on the first."""
-    return np.ascontiguousarray(np.moveaxis(np.asarray(values)[..., indices], -1, 0))
+    rows = np.asarray(values)[..., which]
+    return np.array(rows if rows.ndim == 1 else np.moveaxis(rows, -1, 0), order="C")
 
 
-def place_columns(env: FMUEnv, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
+def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
     env.done = env.done.copy()  # the caller holds this array
-    for name in _FIRST:
-        values = values_of(columns[name.lstrip("_")], sources)
-        getattr(env, name)[..., indices] = np.moveaxis(values, 0, -1)
-    env.step_count[indices] = values_of(columns["step_count"], sources)
+    for name in (*_FIRST, "step_count"):
+        place_column(getattr(env, name), columns[name.lstrip("_")], sources, which)
+
+
+def place_column(row: npt.NDArray[Any], column: Any, sources: Which, which: Which) -> None:
+    """Write values of a column to an array with the environments on its last axis."""
+    values = np.asarray(column)[sources]
+    if values.dtype == np.object_:  # None where an episode has no such parameter
+        values = values.astype(row.dtype)
+    row[..., which] = values if values.ndim == 1 else np.moveaxis(values, 0, -1)
 
 
 def require_fit(columns: Columns) -> None:
@@ -116,10 +142,3 @@ def require_fit(columns: Columns) -> None:
             "the snapshot has a random generator other than numpy.random.PCG64; reset the "
             "environment with a seed before"
         )
-
-
-def values_of(column: Any, sources: IndexArray) -> npt.NDArray[Any]:
-    """The values of a column at these places, as an array."""
-    if isinstance(column, np.ndarray):
-        return column[sources]
-    return np.array([column[source] for source in sources.tolist()])

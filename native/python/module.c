@@ -57,6 +57,12 @@ static PyObject *statistics(PyObject *module, PyObject *unused) {
                          (unsigned long long)s.chunks);
 }
 
+static PyObject *initializations(PyObject *module, PyObject *unused) {
+    (void)module;
+    (void)unused;
+    return PyLong_FromUnsignedLongLong(number_of_initializations());
+}
+
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
@@ -64,6 +70,7 @@ static PyMethodDef functions[] = {
     {"distributions", distributions, METH_NOARGS, NULL},
     {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
+    {"initializations", initializations, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
     {NULL, NULL, 0, NULL},
 };

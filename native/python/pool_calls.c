@@ -184,6 +184,36 @@ PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return done && report_messages(self) ? PyLong_FromSsize_t(reading.failed) : NULL;
 }
 
+typedef struct {
+    const Access *access;
+    const double *values;
+    ptrdiff_t failed;
+} Writing;
+
+static void do_write(PyPool *self, bool alone, void *context) {
+    Writing *w = context;
+    (void)alone;
+    w->failed = pool_write(&self->pool, w->access, w->values);
+}
+
+PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    Py_buffer values;
+
+    if (!has_arguments(nargs, 2) || !is_access(self, args[0])) {
+        return NULL;
+    }
+    const Access *access = &((PyAccess *)args[0])->access;
+    if (!take_matrix(args[1], &values, IN_PLACE, "values", ITEM_FLOAT64,
+                     (Py_ssize_t)access->count, (Py_ssize_t)self->pool.settings.count)) {
+        return NULL;
+    }
+    Writing writing = {access, values.buf, -1};
+    const bool done = perform(self, NEVER_SHORT, do_write, &writing);
+    PyBuffer_Release(&values);
+    return done && report_messages(self) ? PyLong_FromSsize_t(writing.failed) : NULL;
+}
+
 /* Queries */
 
 typedef struct {

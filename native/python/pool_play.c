@@ -191,7 +191,7 @@ static bool take_row(PyPool *self, Playing *playing, PyObject *object, Row *row)
                       (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    *row = (Row){buffer->buf, (size_t)buffer->itemsize};
+    *row = (Row){buffer->buf, (size_t)buffer->itemsize, false};
     return true;
 }
 
@@ -340,31 +340,51 @@ static bool is_sound(const PyPool *self, const Play *play) {
     return sound;
 }
 
-static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
-    static char *names[] = {"start", "start_values", "inputs", "judgement",    "actions", "draws", "states",
-                            "episodes", "kept", "keeps_always", "copies", "variable_starts", "drawn_variables", "input_starts",
-                            NULL};
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    PyObject *start, *values, *inputs, *judgement, *actions, *draws, *states, *episodes, *kept, *copies;
-    PyObject *variable_starts, *drawn, *starts;
+/* The arguments of prepare_play. */
+typedef struct {
+    PyObject *start, *start_values, *inputs, *judgement, *actions, *draws, *states, *episodes;
+    PyObject *kept, *copies, *variable_starts, *drawn_variables, *input_starts;
     int keeps_always;
+} Parts;
 
-    if (!PyArg_ParseTupleAndKeywords(
-            args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &start, &values,
-            &PyTuple_Type, &inputs, &PyTuple_Type, &judgement, &PyDict_Type, &actions, &draws,
-            &states, &PyDict_Type, &episodes, &kept, &keeps_always, &PyTuple_Type, &copies,
-            &PyTuple_Type, &variable_starts, &PyTuple_Type, &drawn, &PyTuple_Type, &starts)) {
-        return false;
-    }
-    playing->play.keeps_always = keeps_always != 0;
-    if (!take_starts(self, playing, start, values) || !take_actions(self, playing, actions)) {
-        return false;
-    }
+static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
+    static char *names[] = {"start",         "start_values", "inputs",
+                            "judgement",     "actions",      "draws",
+                            "states",        "episodes",     "kept",
+                            "keeps_always",  "copies",       "variable_starts",
+                            "drawn_variables", "input_starts", NULL};
+
+    return PyArg_ParseTupleAndKeywords(
+        args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &p->start, &p->start_values,
+        &PyTuple_Type, &p->inputs, &PyTuple_Type, &p->judgement, &PyDict_Type, &p->actions,
+        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->keeps_always,
+        &PyTuple_Type, &p->copies, &PyTuple_Type, &p->variable_starts, &PyTuple_Type,
+        &p->drawn_variables, &PyTuple_Type, &p->input_starts);
+}
+
+static bool take_programs(PyPool *self, Playing *playing, const Parts *p) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
     const size_t elements = playing->play.actions.elements;
-    if (!take_program(inputs, n, elements, &playing->inputs) ||
-        !take_program(judgement, n, elements, &playing->judgement) ||
-        !take_draws(self, playing, draws, states) || !take_episodes(self, playing, episodes) ||
-        !take_kept(self, playing, kept) || !take_variables(self, playing, copies, variable_starts, drawn) || !take_input_starts(self, playing, starts)) {
+
+    return take_program(p->inputs, n, elements, &playing->inputs) &&
+           take_program(p->judgement, n, elements, &playing->judgement);
+}
+
+/* What comes later refers to what comes first. */
+static bool take_parts(PyPool *self, Playing *playing, const Parts *p) {
+    playing->play.keeps_always = p->keeps_always != 0;
+    return take_starts(self, playing, p->start, p->start_values) &&
+           take_actions(self, playing, p->actions) && take_programs(self, playing, p) &&
+           take_draws(self, playing, p->draws, p->states) &&
+           take_episodes(self, playing, p->episodes) && take_kept(self, playing, p->kept) &&
+           take_variables(self, playing, p->copies, p->variable_starts, p->drawn_variables) &&
+           take_input_starts(self, playing, p->input_starts);
+}
+
+static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
+    Parts parts;
+
+    if (!parse(args, kwargs, &parts) || !take_parts(self, playing, &parts)) {
         return false;
     }
     settle_play(self, playing);
@@ -606,6 +626,124 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     }
     PyObject *playing = Py_NewRef(self->playing);
     PyObject *result = play_with(self, playing, args);
+    Py_DECREF(playing);
+    return result;
+}
+
+/* Rollouts: each array has a row for each step. */
+
+typedef struct {
+    PyTurn turn;
+    size_t horizon;
+} PyRollout;
+
+static bool has_bad_action(const PyRollout *r) {
+    const Play *play = r->turn.turn.play;
+    const size_t size = play->count * play->actions.elements * play->actions.size;
+    Turn turn = r->turn.turn;
+    bool bad = false;
+
+    for (size_t step = 0; step < r->horizon && !bad; step++, turn.actions += size) {
+        bad = play_has_bad_action(&turn);
+    }
+    return bad;
+}
+
+static void do_rollout(PyPool *self, bool alone, void *context) {
+    PyRollout *r = context;
+    PyTurn *t = &r->turn;
+
+    t->call.alone = alone;
+    t->ends.outside = false;
+    t->bad_action = has_bad_action(r);
+    if (!t->bad_action) {
+        t->troubled = pool_rollout(&self->pool, &t->call, r->horizon, &t->ends.outside);
+    }
+}
+
+/* Takes memory that must have so many bytes, whatever its items are. */
+static bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
+    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
+        return false;
+    }
+    if ((size_t)buffer->len != size) {
+        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
+    }
+    return (size_t)buffer->len == size;
+}
+
+static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObject *seen,
+                                     PyRollout *r) {
+    const Settings *s = &self->pool.settings;
+    const size_t count = playing->judgement.program.number_of_seen;
+    PyTurn *t = &r->turn;
+
+    if (count == 0 && !PyTuple_Check(seen)) {
+        return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
+                          r->horizon * s->count * s->num_observed * sizeof(float));
+    }
+    for (size_t i = 0; i < count; i++) {
+        const size_t size = (size_t)playing->judgement.seen_bytes[i];
+        PyObject *array = PyTuple_Check(seen) ? PyTuple_GetItem(seen, (Py_ssize_t)i) : seen;
+        if (array == NULL ||
+            !take_bytes(array, &t->seen_buffers[i], PyBUF_WRITABLE, r->horizon * size)) {
+            return false;
+        }
+        t->seen[i] = t->seen_buffers[i].buf;
+        t->seen_sizes[i] = size / s->count;
+    }
+    return true;
+}
+
+static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *args,
+                         PyRollout *r) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
+    const Actions *a = &playing->play.actions;
+    Py_buffer *b = r->turn.buffers;
+
+    if (!take_matrix(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, ANY_LENGTH, n)) {
+        return false;
+    }
+    const Py_ssize_t horizon = b[REWARDS].shape[0];
+    r->horizon = (size_t)horizon;
+    return take_bytes(args[ACTIONS], &b[ACTIONS], PyBUF_SIMPLE,
+                      r->horizon * (size_t)n * a->elements * a->size) &&
+           take_rolled_observations(self, playing, args[SEEN], r) &&
+           take_matrix(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN,
+                       horizon, n) &&
+           take_matrix(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, horizon,
+                       n) &&
+           take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
+                       (Py_ssize_t)playing->play.draws->count, n);
+}
+
+static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
+    PyRollout r = {.horizon = 0};
+    bool done = false;
+
+    clear_turn(playing, &r.turn);
+    if (take_rollout(self, playing, args, &r)) {
+        settle_turn(self, playing, &r.turn);
+        done = perform(self, NEVER_SHORT, do_rollout, &r) && !is_outside(&r.turn) &&
+               report_messages(self);
+    }
+    if (done && r.turn.bad_action) {
+        PyErr_SetString(PyExc_ValueError, "an action is out of range");
+        done = false;
+    }
+    release_turn(playing, &r.turn);
+    return done ? PyLong_FromSize_t(r.turn.troubled) : NULL;
+}
+
+PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+
+    if (!has_arguments(nargs, LAST) || !is_prepared(self)) {
+        return NULL;
+    }
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = roll_out(self, playing, args);
     Py_DECREF(playing);
     return result;
 }

@@ -5,8 +5,6 @@
 
 #include "python.h"
 
-enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
-
 /* A program, and references to everything that it uses. */
 typedef struct {
     Program program;

@@ -90,6 +90,7 @@ PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_recycle(PyObject *object, PyObject *unused);
@@ -113,6 +114,7 @@ PyObject *py_seed(PyObject *module, PyObject *args);
 
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs);

@@ -150,21 +150,6 @@ void zoo_free(Animal *me) {
     free(me);
 }
 
-/* Reads a table as JAnimalica's weather models do: not safe in threads. */
-static int read_table(void) {
-    int rows = 0;
-    char table[400] = "";
-
-    for (int i = 0; i < 40; i++) {
-        strcat(table, "12 34;");
-    }
-    for (char *row = strtok(table, ";"); row != NULL; row = strtok(NULL, ";")) {
-        rows++;
-        usleep(20);
-    }
-    return rows == 40 ? OK : ERROR;
-}
-
 int zoo_exit(Animal *me) {
     note_call();
     if (!take_seat(me)) {
@@ -174,7 +159,7 @@ int zoo_exit(Animal *me) {
         me->logger(me->environment, me->name, ERROR, "info", "solving %d equations", 4711);
         sleep_for(is(me, "slow for ever") ? 3600.0 : is(me, "slower") ? 0.75 : 0.15);
     }
-    return is(me, "strtok") ? read_table() : OK;
+    return is(me, "strtok") && !zoo_parse_table() ? ERROR : OK;
 }
 
 int zoo_step(Animal *me, double step_size, bool no_set_state) {
@@ -197,16 +182,12 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
 }
 
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
-    for (size_t i = 0; i < count; i++) {
-        values[i] = me->values[references[i]];
-    }
+    zoo_read(me->values, references, count, values);
     return OK;
 }
 
 int zoo_set(Animal *me, const unsigned *references, size_t count, const double *values) {
-    for (size_t i = 0; i < count; i++) {
-        me->values[references[i]] = values[i];
-    }
+    zoo_write(me->values, references, count, values);
     return OK;
 }
 

@@ -112,27 +112,12 @@ void zoo_free(Animal *me) {
     free(me);
 }
 
-/* As old readers of tables do it: not safe in threads. */
-static bool parse_table(void) {
-    int rows = 0;
-    char table[400] = "";
-
-    for (int i = 0; i < 40; i++) {
-        strcat(table, "12 34;");
-    }
-    for (char *row = strtok(table, ";"); row != NULL; row = strtok(NULL, ";")) {
-        rows++;
-        usleep(20);
-    }
-    return rows == 40;
-}
-
 static bool prepare(Animal *me) {
     char path[PATH_MAX + 20];
 
     find_scratch(me, path, sizeof path);
     if (is(me, "strtok")) {
-        return parse_table();
+        return zoo_parse_table();
     }
     if (is(me, "reads a table")) {
         path_of(me, "tables/offset.txt", path, sizeof path);
@@ -231,9 +216,7 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
 }
 
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
-    for (size_t i = 0; i < count; i++) {
-        values[i] = me->values[references[i]];
-    }
+    zoo_read(me->values, references, count, values);
     if (is(me, "no early reading") && !me->ready) {
         return ERROR;
     }

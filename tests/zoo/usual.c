@@ -1,8 +1,11 @@
 /* What models do who care about other things: weak functions, which those of a model replace. */
 
+#define _GNU_SOURCE
 #include "zoo.h"
 
 #include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
 
 #define USUAL __attribute__((weak))
 
@@ -56,4 +59,30 @@ USUAL int zoo_to_bytes(Animal *me, void *state, char *bytes, size_t size) {
 
 USUAL int zoo_from_bytes(Animal *me, const char *bytes, size_t size, void **state) {
     return ERROR;
+}
+
+bool zoo_parse_table(void) {
+    int rows = 0;
+    char table[400] = "";
+
+    for (int i = 0; i < 40; i++) {
+        strcat(table, "12 34;");
+    }
+    for (char *row = strtok(table, ";"); row != NULL; row = strtok(NULL, ";")) {
+        rows++;
+        usleep(20);
+    }
+    return rows == 40;
+}
+
+void zoo_read(const double *from, const unsigned *references, size_t count, double *to) {
+    for (size_t i = 0; i < count; i++) {
+        to[i] = from[references[i]];
+    }
+}
+
+void zoo_write(double *to, const unsigned *references, size_t count, const double *from) {
+    for (size_t i = 0; i < count; i++) {
+        to[references[i]] = from[i];
+    }
 }

@@ -151,8 +151,6 @@ int zoo_set(Animal *me, const unsigned *references, size_t count, const double *
 }
 
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
-    for (size_t i = 0; i < count; i++) {
-        values[i] = me->values[references[i]];
-    }
+    zoo_read(me->values, references, count, values);
     return me->steps > 0 && me->steps == (int)me->values[AT] ? call(me, "get") : OK;
 }

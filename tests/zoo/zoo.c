@@ -343,16 +343,12 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
 }
 
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
-    for (size_t i = 0; i < count; i++) {
-        values[i] = me->values[references[i]];
-    }
+    zoo_read(me->values, references, count, values);
     return zoo_call(me, GET);
 }
 
 int zoo_set(Animal *me, const unsigned *references, size_t count, const double *values) {
-    for (size_t i = 0; i < count; i++) {
-        me->values[references[i]] = values[i];
-    }
+    zoo_write(me->values, references, count, values);
     return me->stepping ? zoo_call(me, SET) : OK;
 }
 

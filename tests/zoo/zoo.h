@@ -2,7 +2,7 @@
 
    The models: zoo.c does wrong what its parameters say; quirks.c is useful but breaks one promise;
    demanding.c wants a licence or time; tires.c stops to begin anew; words.c says why it fails.
-   usual.c does what a model leaves out. */
+   usual.c does what a model leaves out, and what several do. */
 
 #include <stdbool.h>
 #include <stddef.h>
@@ -64,6 +64,11 @@ int zoo_free_state(void **state);
 int zoo_size_of_bytes(Animal *me, void *state, size_t *size);
 int zoo_to_bytes(Animal *me, void *state, char *bytes, size_t size);
 int zoo_from_bytes(Animal *me, const char *bytes, size_t size, void **state);
+
+/* For models to call. */
+void zoo_read(const double *from, const unsigned *references, size_t count, double *to);
+void zoo_write(double *to, const unsigned *references, size_t count, const double *from);
+bool zoo_parse_table(void); /* as the weather models of JModelica do it: not safe in threads */
 
 /* What the standard has besides; STUBS is a file with one line each. */
 #define STUB(name)                                                                                 \

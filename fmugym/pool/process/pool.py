@@ -282,6 +282,16 @@ class ProcessPool(SavingPool):
             self._crew.note_lost()
         return self.outputs, self.statuses
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """See ``Pool.write``."""
+        with self._lock:
+            self._require_present()
+            self._crew.run(
+                "setting parameters",
+                self._crew.supervisors,
+                lambda s: s.tell("write", variables, np.ascontiguousarray(values[:, s.block])),
+            )
+
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``; lost instances get empty states."""
         with self._lock:

@@ -280,6 +280,10 @@ class BlockWorker:
         self._pool.restore(self._snapshots[number], mask)
         self._publish()
 
+    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
+        """See ``Pool.write``."""
+        self._pool.write(variables, values)
+
     def bundle(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         return self._pool.serialize_states(indices)

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
@@ -130,6 +131,23 @@ class Engine(ABC):
     @abstractmethod
     def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
         """Let environments go on from columns; environment ``indices[i]`` from ``sources[i]``."""
+
+    @abstractmethod
+    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
+        """Let hooks read other values of parameters, arrays of shape (N,), in these episodes."""
+
+    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
+        """Do many steps in one call; nobody needs the episodes afterwards.
+
+        Args:
+            actions: Shape (horizon, N, ...), checked, of the type of the action space.
+
+        Returns:
+            Observations, rewards, terminated and truncated, each with the steps on the first axis;
+            see ``Rollout`` for what follows an end. None if the engine cannot do it, or if a step
+            has failed.
+        """
+        return None
 
     @abstractmethod
     def observe(self, indices: IndexArray) -> Any:

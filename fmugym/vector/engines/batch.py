@@ -31,7 +31,7 @@ from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.hooks import results
 from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
-from fmugym.vector.saving import columns_of, place_columns, require_fit, values_of
+from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.views import batched, column, take
 
@@ -299,24 +299,31 @@ class BatchEngine(Engine):
 
     def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
         """See ``Engine.place``."""
-        place_columns(self.env, columns, sources, indices)
+        whence = which_of(sources, len(columns["step_count"]))
+        where = which_of(indices, self._n)
+        place_columns(self.env, columns, whence, where)
         for name, values in (columns["parameters"] | columns["variables"]).items():
-            rows = np.moveaxis(values_of(values, sources), 0, -1)
-            self._row(name)[..., indices] = rows
+            place_column(self._row(name), values, whence, where)
         if isinstance(columns["streams"], np.ndarray):
-            seeds = np.array(columns["seeds"], object)[sources]
-            self._streams.put(indices, columns["streams"][sources], seeds)
-        self.ended[indices] = columns["ended"][sources]
+            seeds = np.array(columns["seeds"], object)[whence]
+            self._streams.put(indices, columns["streams"][whence], seeds)
+        self.ended[where] = columns["ended"][whence]
         self.any_ended = bool(np.count_nonzero(self.ended))
         self._longest = max(self._longest, int(self.env.step_count.max()))
-        self._note_foreign(indices, self._has_other_constants(columns["parameters"], indices))
+        self._note_foreign(indices, self._has_other_constants(columns["parameters"]))
 
-    def _has_other_constants(self, names: Iterable[str], indices: IndexArray) -> bool:
-        """Whether these parameters of environments are not all those of the plan."""
+    def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
+        """Whether parameters that are placed are not all those of the plan."""
         plan = self.env._plan
         known = plan.constant_parameters.items()
-        own = all((self._parameters[name][indices] == value).all() for name, value in known)
-        return not own or not set(names) <= set(plan.parameter_names)
+        own = all((np.asarray(columns.get(name, value)) == value).all() for name, value in known)
+        return not own or not columns.keys() <= set(plan.parameter_names)
+
+    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
+        """See ``Engine.show_parameters``."""
+        for name, numbers in values.items():
+            self._row(name)[:] = numbers
+        self._note_foreign(slice(None), True)
 
     def require_fit(self, columns: Columns) -> None:
         """See ``Engine.require_fit``."""
@@ -541,7 +548,7 @@ class BatchEngine(Engine):
         texts[faulty] = list(reasons.values())
         rates = fault_rates(self._pool.health())
         result.infos.update(coded({"fault": texts, "fault_rate": rates}, faulty))
-        result.rewards[faulty] = config.fault_reward
+        result.rewards[faulty] = results.rewards(env._fault_reward(), self._n)[faulty]
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"
 

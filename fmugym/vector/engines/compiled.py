@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -283,7 +283,8 @@ class CompiledEngine(BatchEngine):
         self.has_moved = True
         troubled = self._start(mask, seen, drawn)
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
-        infos = restricted(infos, mask) | _start_infos(self.env._plan, drawn, mask)
+        starts = _start_infos(self.env._plan, drawn, mask)
+        infos = restricted(infos, mask) | starts if infos else starts
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -312,6 +313,24 @@ class CompiledEngine(BatchEngine):
             last, started = self._new_arrays(), np.empty(self._n, _BOOL)
         self._spare = np.empty(self._drawn_shape), last, started
         return self._spare
+
+    @contextmanager
+    def single(self, index: int) -> Iterator[FMUEnv]:
+        """See ``Engine.single``."""
+        if self._prepared and not self.env._in_hooks:
+            self._find_done()
+        with super().single(index) as env:
+            yield env
+
+    def _find_done(self) -> None:
+        """Ask the hook on arrays for ``done``: few callers read it, so steps do not store it."""
+        env, env._in_hooks = self.env, True
+        try:
+            with np.errstate(all="ignore"):
+                done = results.flags("_is_done", env._is_done(), self._n)
+        finally:
+            env._in_hooks = False
+        env.done = (done | self._stopped(self._pool.statuses)) & (env.step_count > 0)
 
     def call(
         self,
@@ -347,8 +366,8 @@ class CompiledEngine(BatchEngine):
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
         if begun or resetting is not None:
             infos = self._with_starts(infos, resetting, drawn, last, started)
-        result = _make_result((observations, rewards, done, cut, infos))
-        return self._completed(result, resetting, started) if troubled or self._left else result
+        out = _make_result((observations, rewards, done, cut, infos))
+        return self._completed(out, troubled, resetting, started) if troubled or self._left else out
 
     def _checked_ahead(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
         """Check actions before Python draws or calls a hook: a refused step changes nothing."""
@@ -384,13 +403,44 @@ class CompiledEngine(BatchEngine):
         late = LateDict.of(self._infos_at_ends, drawn, last, started)
         return infos | late if infos else late
 
+    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
+        """See ``Engine.roll_out``."""
+        if not self._prepared or self._left:
+            return None
+        horizon = len(actions)
+        shape = horizon, self._n
+        judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
+        seen = self._arrays_of_steps(horizon)
+        self.has_moved = True
+        troubled = self._pool.roll_out(
+            np.ascontiguousarray(actions), seen, *judged, np.zeros(self._drawn_shape)
+        )
+        if troubled:
+            return None
+        return seen if self._divided is None else self._divided(seen)[0], *judged
+
+    def _arrays_of_steps(self, horizon: int) -> Any:
+        """Make the arrays of many steps, with a first axis for the steps."""
+        arrays = self._new_arrays()
+        if isinstance(arrays, tuple):
+            return tuple([np.empty((horizon, *array.shape), array.dtype) for array in arrays])
+        return np.empty((horizon, *arrays.shape), arrays.dtype)
+
     def _completed(
-        self, result: StepResult, resetting: MaskArray | None, started: MaskArray | None
+        self,
+        result: StepResult,
+        troubled: int,
+        resetting: MaskArray | None,
+        started: MaskArray | None,
     ) -> StepResult:
         """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
-        self._mend(result, resetting if started is None else started)
+            if started is not None:
+                self.env.done[started] = False
+        seen = result.rewards, result.observations
+        if troubled or any(not_finite(values) is not None for values in seen):
+            self._mend(result, resetting if started is None else started)
         return result
 
     def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -221,6 +222,12 @@ class PerEnvEngine(Engine):
             place_columns(self._envs[index], columns, source)
             self.ended[index] = columns["ended"][source]
         self.any_ended = bool(self.ended.any())
+
+    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
+        """See ``Engine.show_parameters``."""
+        for index, env in enumerate(self._envs):
+            own = {name: float(numbers[index]) for name, numbers in values.items()}
+            env.parameters = MappingProxyType({**env.parameters, **own})
 
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""

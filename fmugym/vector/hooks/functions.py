@@ -274,7 +274,7 @@ def _clip(a: Any, a_min: Any = None, a_max: Any = None, out: Any = None, **keywo
     elif high is None:
         result = np.maximum(symbols, low)
     else:
-        result = np._core.umath.clip(symbols, low, high)  # type: ignore[attr-defined]
+        result = np._core.umath.clip(symbols, low, high)  # type: ignore[attr-defined]  # no stub has it
     return result if out is None else _into(out, result)
 
 

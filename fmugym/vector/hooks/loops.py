@@ -6,9 +6,12 @@ bits. It hands these loops out to compilers. So a program calls them, and its re
 
 from __future__ import annotations
 
+import functools
+import platform
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.pool.extension import has_native_pool
 from fmugym.vector.hooks.program import UntraceableError
@@ -16,7 +19,7 @@ from fmugym.vector.hooks.program import UntraceableError
 if has_native_pool():
     from fmugym import _native
 
-__all__ = ["loop_of"]
+__all__ = ["loop_of", "squares_nearly_exactly"]
 
 _loops: dict[tuple[Any, tuple[Any, ...]], Any] = {}
 """The capsules by function and types. They stay alive with the process."""
@@ -43,3 +46,29 @@ def _resolved(ufunc: Any, types: tuple[np.dtype[Any], ...]) -> Any:
     if tuple(found) != types or not _native.is_free_loop(capsule):
         raise UntraceableError(f"numpy.{ufunc.__name__} needs the interpreter")
     return capsule
+
+
+@functools.cache
+def squares_nearly_exactly() -> bool:
+    """Whether ``numpy.float_power(x, 2.0)`` has an error of less than 0.55 units in the last place.
+
+    It is the C library's ``pow``. That of glibc has an error of at most 0.54 units since version
+    2.28 (``sysdeps/ieee754/dbl-64/e_pow.c``). A sample shows whether numpy calls it.
+    """
+    library, version = platform.libc_ver()
+    numbers = [int(part) for part in version.split(".") if part.isdigit()]
+    if library != "glibc" or numbers < [2, 28]:
+        return False
+    values = np.random.default_rng(0).uniform(-8.0, 8.0, 20_000)
+    return bool(_is_within(np.float_power(values, 2.0), values, 0.55))
+
+
+def _is_within(
+    powers: npt.NDArray[np.float64], values: npt.NDArray[np.float64], most: float
+) -> np.bool_:
+    """Whether powers differ from exact squares by at most so many units in the last place."""
+    shifted = values * 134217729.0
+    high = shifted - (shifted - values)
+    low, rounded = values - high, values * values
+    rest = ((high * high - rounded) + 2.0 * high * low) + low * low  # Dekker's product
+    return (np.abs((powers - rounded) - rest) <= most * np.spacing(rounded)).all()

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.vector.hooks.graph import Graph, Node
-from fmugym.vector.hooks.loops import loop_of
+from fmugym.vector.hooks.loops import loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import (
     CONSTANT,
     MOST_REGISTERS,
@@ -173,7 +173,16 @@ class _Compiler:
         types = (*(self._graph.nodes[operand].dtype for operand in node.operands), node.dtype)
         loop_of(ufunc, types)
         constant = tuple(self._graph.nodes[operand].kind == "constant" for operand in node.operands)
-        return "call", self._place(self._calls, (ufunc, types, constant))
+        call = self._place(self._calls, (ufunc, types, constant))
+        return "call_square" if self._is_square(node, ufunc, constant) else "call", call
+
+    def _is_square(self, node: Node, ufunc: np.ufunc, constant: tuple[bool, ...]) -> bool:
+        """Whether a call is a power of 2 of which most values need no call."""
+        if ufunc is not np.float_power or constant != (False, True):
+            return False
+        bits: Any = self._graph.nodes[node.operands[1]].what
+        is_two = node.dtype == np.float64 and bits == np.float64(2.0).tobytes()
+        return is_two and squares_nearly_exactly()
 
     def program(self, results: Sequence[int], seen: int) -> Program:
         """Place all values in registers."""
@@ -188,7 +197,7 @@ class _Compiler:
             code,
             self._constants_in(registers),
             np.array(self._slots, SLOT),
-            tuple(_call(*call) for call in self._calls),  # type: ignore[misc]
+            tuple(_call(*call) for call in self._calls),  # type: ignore[misc]  # mypy does not follow *call
             tuple(self._rows),
             tuple(self._graph.tables[key] for key in self._tables),
             max(registers.values(), default=-1) + 1,

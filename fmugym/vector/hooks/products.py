@@ -40,7 +40,7 @@ def contracted(arrays: Sequence[Any], labels: Sequence[Labels], wanted: Labels) 
     for part in aligned[1:]:
         product = product * part
     if not summed:
-        return product  # type: ignore[no-any-return]
+        return product  # type: ignore[no-any-return]  # numpy's stubs
     return _sum_of(graph, product, len(wanted))
 
 
@@ -66,7 +66,7 @@ def _sum_of(graph: Graph, product: Symbols, kept: int) -> Symbols:
     total: Any = product.like(terms[0])
     for term in terms[1:]:
         total = total + product.like(term)
-    return total  # type: ignore[no-any-return]
+    return total  # type: ignore[no-any-return]  # numpy's stubs
 
 
 def _others(name: str, count: int) -> Labels:
@@ -135,7 +135,7 @@ def _dot(a: Any, b: Any, out: Any = None) -> Symbols:
     _refuse({"out": out})
     first, second = _ndims(a, b)
     if first == 0 or second == 0:
-        return a * b  # type: ignore[no-any-return]
+        return a * b  # type: ignore[no-any-return]  # numpy's stubs
     of_a, of_b = _others("a", first - 1), _others("b", second - 1)
     before_last = second - 2 if second > 1 else 0
     named = (*of_b[:before_last], "k", *of_b[before_last:])
@@ -145,7 +145,7 @@ def _dot(a: Any, b: Any, out: Any = None) -> Symbols:
 def _inner(a: Any, b: Any) -> Symbols:
     first, second = _ndims(a, b)
     if first == 0 or second == 0:
-        return a * b  # type: ignore[no-any-return]
+        return a * b  # type: ignore[no-any-return]  # numpy's stubs
     of_a, of_b = _others("a", first - 1), _others("b", second - 1)
     return contracted((a, b), ((*of_a, "k"), (*of_b, "k")), (*of_a, *of_b))
 

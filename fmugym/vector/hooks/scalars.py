@@ -153,7 +153,7 @@ class Scalar(Unboxed):
 
     __float__ = __int__ = __index__ = __complex__ = __round__ = _item
     __floor__ = __ceil__ = __trunc__ = _item
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]  # not hashable
 
     def __neg__(self) -> Any:
         return self._unary(np.negative)

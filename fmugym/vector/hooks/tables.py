@@ -24,7 +24,16 @@ from fmugym.vector.hooks.symbols import (
     lift,
 )
 
-__all__ = ["FUNCTIONS", "Table", "is_table", "tables_in"]
+__all__ = [
+    "FUNCTIONS",
+    "Table",
+    "is_foreign",
+    "is_table",
+    "names_in",
+    "places_of",
+    "tables_in",
+    "unwrapped",
+]
 
 _MOST_VALUES: Final = 4096
 """The most elements of a table."""
@@ -120,7 +129,7 @@ def _flat_index(graph: Graph, keys: Sequence[Any], lengths: Sequence[int]) -> Sy
     flat: Any = offsets[0]
     for offset in offsets[1:]:
         flat = flat + offset
-    return flat  # type: ignore[no-any-return]
+    return flat  # type: ignore[no-any-return]  # numpy's stubs
 
 
 def _column(table: Symbols, column: npt.NDArray[Any], index: npt.NDArray[Any]) -> Any:
@@ -296,7 +305,7 @@ def tables_in(env: Any) -> Iterator[None]:
     a global name, as an attribute of a module or as a variable of a surrounding function.
     """
     functions = _functions_of(env)
-    places = [place for function in functions for place in _places_of(function)]
+    places = [place for function in functions for place in places_of(function)]
     held = [(place, name, place[name]) for place, name in places if is_table(place[name])]
     for place, name, value in held:
         place[name] = value.view(Table)
@@ -323,25 +332,26 @@ _OURS: Final = ("fmugym", "gymnasium", "numpy")
 
 def _functions_of(env: Any) -> list[FunctionType]:
     """The functions of a class, and those that they call by name, without those of packages."""
-    classes = [cls for cls in type(env).__mro__ if not _is_foreign(cls.__module__)]
+    classes = [cls for cls in type(env).__mro__ if not is_foreign(cls.__module__)]
     waiting = [value for cls in classes for value in vars(cls).values()]
     waiting += vars(env).values()
     found: dict[int, FunctionType] = {}
     while waiting:
-        function = _unwrapped(waiting.pop())
+        function = unwrapped(waiting.pop())
         known = not isinstance(function, FunctionType) or id(function) in found
-        if known or _is_foreign(function.__module__ or ""):
+        if known or is_foreign(function.__module__ or ""):
             continue
         found[id(function)] = function
-        waiting += [place[name] for place, name in _places_of(function)]
+        waiting += [place[name] for place, name in places_of(function)]
     return list(found.values())
 
 
-def _is_foreign(module: str) -> bool:
+def is_foreign(module: str) -> bool:
+    """Whether the functions of a module are no part of a user's task."""
     return module.partition(".")[0] in _OURS and not module.startswith("fmugym.envs")
 
 
-def _unwrapped(value: Any) -> Any:
+def unwrapped(value: Any) -> Any:
     """The function of a property, a static method and the like."""
     for name in ("fget", "__func__", "func", "__wrapped__"):
         inner = getattr(value, name, None) if not isinstance(value, FunctionType) else None
@@ -349,15 +359,13 @@ def _unwrapped(value: Any) -> Any:
     return value
 
 
-def _places_of(function: FunctionType) -> list[tuple[dict[str, Any], str]]:
+def places_of(function: FunctionType) -> list[tuple[dict[str, Any], str]]:
     """Where a function finds what is not local: dicts and names in them."""
-    names = set(_names_in(function.__code__))
+    names = set(names_in(function.__code__))
     spaces = [function.__globals__]
     modules = [function.__globals__.get(name) for name in names]
     spaces += [
-        vars(one)
-        for one in modules
-        if isinstance(one, ModuleType) and not _is_foreign(one.__name__)
+        vars(one) for one in modules if isinstance(one, ModuleType) and not is_foreign(one.__name__)
     ]
     places = [(space, name) for space in spaces for name in names if name in space]
     for cell in function.__closure__ or ():
@@ -368,8 +376,9 @@ def _places_of(function: FunctionType) -> list[tuple[dict[str, Any], str]]:
     return places
 
 
-def _names_in(code: CodeType) -> Iterator[str]:
+def names_in(code: CodeType) -> Iterator[str]:
+    """The names of globals and attributes that some code refers to."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _names_in(constant)
+            yield from names_in(constant)

@@ -34,7 +34,7 @@ from fmugym.vector.hooks.symbols import (
     same_for_all,
     spread,
 )
-from fmugym.vector.hooks.tables import is_table, tables_in
+from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
 __all__ = ["SeenArray", "TracedTask", "placed", "tables_of", "to_integer", "trace_hooks"]
 
@@ -153,7 +153,7 @@ class _Tracer:
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
         for name, table in self._tables.items():
-            vars(self._env)[name] = lift(self._graph, table)
+            vars(self._env)[name] = table.view(Table)
         for name, row in self._attributes.items():
             names = _names((), "attribute", name)
             vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)

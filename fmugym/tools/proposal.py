@@ -1,0 +1,178 @@
+"""A first version of a task file for an FMU, written from its model description.
+
+The names and texts come from a foreign file. They enter the TOML only as quoted texts, as numbers
+and in comments of one line.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.declared.declarations import is_reserved
+from fmugym.errors import ConfigError
+from fmugym.tools.overview import plain
+from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
+
+__all__ = ["Proposal"]
+
+_HEAD: Final = """\
+# A task for the FMU {file}. Decide what is marked with TODO, then try
+#   fmugym validate FILE       (what is wrong with this task?)
+#   fmugym simulate FILE       (what happens in an episode?)
+# Every key is described in docs/task-file.md.
+fmu = {path}
+time_step = {step}  # s{note}
+episode_length = {length}  # s
+reward = "0"  # TODO: what is there to learn? For example: "-abs({output} - 1)"
+# terminated = "abs({output}) > 10"  # TODO: does the task have an end?
+"""
+
+
+class Proposal:
+    """The task file for one FMU, with notes on what in it is a guess.
+
+    Args:
+        fmu: The FMU; nothing of it is executed.
+        folder: The folder of the file, from which the path of the FMU is relative; None for an
+            absolute path.
+
+    Raises:
+        ConfigError: If the FMU has nothing to observe or to act on.
+    """
+
+    def __init__(self, fmu: FMU, folder: Path | None = None) -> None:
+        self._fmu, self._folder = fmu, folder
+        self._skeleton = Skeleton(fmu)
+        if not self._actions:
+            raise ConfigError(
+                f"{fmu.path.name} has no numeric input or tunable parameter that an agent could "
+                "act on"
+            )
+
+    @cached_property
+    def _actions(self) -> list[Variable]:
+        """The inputs, or some tunable parameters if there are none."""
+        variables = self._fmu.description.variables.values()
+        tunable = [v for v in variables if v.numeric and v.settable_in_step]
+        return self._skeleton.inputs or tunable[:1]
+
+    @cached_property
+    def _aliases(self) -> dict[str, str]:
+        """An alias for each variable by its name in the FMU."""
+        aliases: dict[str, str] = {}
+        for variable in [*self._actions, *self._skeleton.outputs]:
+            if variable.name not in aliases:
+                aliases[variable.name] = _free_alias(variable.name, set(aliases.values()))
+        return aliases
+
+    def notes(self) -> Iterator[str]:
+        """What the user has to decide before the task is useful."""
+        yield 'the reward is "0": say what there is to learn'
+        for variable in filter(needs_bounds, self._actions):
+            yield f"the FMU gives no limits of input {variable.name!r}: the file has a guess"
+        if not self._skeleton.has_step_size:
+            yield "the FMU gives no step size that fits its default experiment; check 'time_step'"
+        for obstacle in self._fmu.obstacles:
+            yield f"the FMU does not run on this machine: {obstacle}"
+
+    def text(self) -> str:
+        """The TOML file, ASCII."""
+        skeleton = self._skeleton
+        head = _HEAD.format(
+            file=plain(self._fmu.path.name),
+            path=_quoted(self._path()),
+            step=repr(skeleton.time_step),
+            note="" if skeleton.has_step_size else "; TODO: the FMU gives none that fits",
+            length=repr(self._length()),
+            output=self._aliases[skeleton.outputs[0].name],
+        )
+        return "\n".join(
+            [head, *self._variables(), "", *self._agent(), "", *self._parameters(), ""]
+        )
+
+    def _path(self) -> str:
+        path = self._fmu.path
+        if self._folder is not None and path.is_relative_to(self._folder.absolute()):
+            return path.relative_to(self._folder.absolute()).as_posix()
+        return path.as_posix()
+
+    def _length(self) -> float:
+        return float(f"{self._skeleton.episode_steps * self._skeleton.time_step:.12g}")
+
+    def _variables(self) -> Iterator[str]:
+        yield "[variables]"
+        for variable in self._actions:
+            yield self._action(variable)
+        for variable in self._skeleton.outputs:
+            if self._aliases[variable.name] != variable.name:
+                name = _quoted(variable.name)
+                yield f"{self._aliases[variable.name]} = {{ name = {name} }}{remark(variable)}"
+
+    def _action(self, variable: Variable) -> str:
+        parts = []
+        if self._aliases[variable.name] != variable.name:
+            parts.append(f"name = {_quoted(variable.name)}")
+        if needs_bounds(variable):
+            low, high = guessed_bounds(variable)
+            parts.append(f"min = {low!r}, max = {high!r}")
+        todo = "  # TODO: the limits are a guess" if needs_bounds(variable) else ""
+        text = f"{{ {', '.join(parts)} }}" if parts else "{}"
+        return f"{self._aliases[variable.name]} = {text}{todo or remark(variable)}"
+
+    def _agent(self) -> Iterator[str]:
+        yield "[agent]"
+        yield from self._listing("actions", self._actions)
+        yield from self._listing("observations", self._skeleton.outputs)
+
+    def _listing(self, key: str, variables: list[Variable]) -> Iterator[str]:
+        yield f"{key} = ["
+        for variable in variables:
+            yield f'    "{self._aliases[variable.name]}",{remark(variable)}'
+        yield "]"
+
+    def _parameters(self) -> Iterator[str]:
+        """Parameters as comments: a task need not set any."""
+        yield "[parameters]"
+        yield "# Each of these may be set, or drawn anew in each episode, for example:"
+        yield '# name = { distribution = "uniform", low = 0.9, high = 1.1 }'
+        for variable in self._skeleton.parameters:
+            yield f"# {_key(variable.name)} = {_as_toml(literal(variable))}{remark(variable)}"
+
+
+def _free_alias(name: str, taken: set[str]) -> str:
+    """A name of letters, digits and _ that is not taken."""
+    alias = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "variable"
+    alias = f"v_{alias}" if alias[0].isdigit() or is_reserved(alias) else alias
+    free, number = alias, 2
+    while free in taken:
+        free, number = f"{alias}_{number}", number + 1
+    return free
+
+
+def _key(name: str) -> str:
+    """A key of TOML."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
+
+
+def _quoted(text: str) -> str:
+    """A basic string of TOML, ASCII; its escapes are those of JSON."""
+    parts = re.split(r"([\ud800-\udfff\U00010000-\U0010ffff\x7f])", text)
+    escaped = "".join(
+        f"\\U{ord(part):08x}" if index % 2 else json.dumps(part)[1:-1]
+        for index, part in enumerate(parts)
+    )
+    return f'"{escaped}"'
+
+
+def _as_toml(text: str) -> str:
+    """A literal of Python as one of TOML."""
+    value = {"True": "true", "False": "false"}.get(text, text)
+    return _quoted(ast.literal_eval(text)) if text[:1] in "\"'" else value

@@ -1,0 +1,59 @@
+"""What the command line can run: task files, ids, classes and FMUs."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+
+from fmugym.archive.fmu import FMU
+from fmugym.declared import Task, load
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown
+from fmugym.tools.proposal import Proposal
+
+__all__ = ["maker_of"]
+
+
+def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
+    """Find what a text names.
+
+    Args:
+        target: The path of a task file or an FMU, a registered id, or ``"module:Class"``. For an
+            FMU it is the task that ``fmugym new`` proposes.
+        scenario: A scenario of the task file; None for any episodes.
+
+    Returns:
+        A function that makes the environment.
+
+    Raises:
+        ConfigError: If there is no such thing, or the task has a mistake.
+        FMULoadError: If the FMU cannot be read.
+    """
+    path = Path(target)
+    if path.suffix.lower() == ".fmu":
+        return partial(load, Task.from_dict(tomllib.loads(Proposal(FMU(path)).text())))
+    if path.suffix.lower() == ".toml" or path.is_file():
+        return partial(load, Task.read(path), scenario=scenario)
+    if scenario is not None:
+        raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
+    module, separator, name = target.partition(":")
+    if separator and name.isidentifier() and "/" not in module:
+        return partial(load, Task.from_dict({"class": target}))
+    return partial(_registered, target)
+
+
+def _registered(env_id: str) -> FMUEnv:
+    try:
+        env = gymnasium.make(env_id).unwrapped
+    except gymnasium.error.Error as error:
+        raise ConfigError(
+            f"{shown(env_id)} is no task file, no class and no registered id: {error}"
+        ) from None
+    if not isinstance(env, FMUEnv):
+        env.close()
+        raise ConfigError(f"{shown(env_id)} is no environment of fmugym")
+    return env

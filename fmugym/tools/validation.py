@@ -1,0 +1,354 @@
+"""What is wrong with a task: checks of an environment, with cures.
+
+Unlike ``fmugym.testing``, which checks that a class keeps the contract of environments, these
+checks look for tasks that run but cannot be learned.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.distributions import is_distribution
+from fmugym.env import FMUEnv
+from fmugym.errors import FMUGymError
+from fmugym.tools.overview import plain
+from fmugym.vector import FMUVectorEnv
+
+__all__ = ["Finding", "Report", "validate"]
+
+_MOST_STEPS: Final = 200
+_SECONDS: Final = 5.0
+"""Real time after which an episode of a check is cut short."""
+
+_WIDE: Final = 100.0
+"""An observation that is larger by this factor than another one hides it from most networks."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of a check.
+
+    Attributes:
+        verdict: ``"ok"``, ``"warning"`` or ``"error"``.
+        check: What was checked.
+        text: What was found.
+        cure: What to do about it; empty if there is nothing to do.
+    """
+
+    verdict: str
+    check: str
+    text: str
+    cure: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The results of all checks.
+
+    Attributes:
+        findings: The results in the order of the checks.
+        costs: Seconds of real time by name: ``step`` and ``reset`` of one environment.
+        hooks: How a vector environment calls the hooks: ``compiled``, ``array`` or ``per_env``.
+        reset_method: How episodes begin.
+    """
+
+    findings: tuple[Finding, ...]
+    costs: Mapping[str, float]
+    hooks: str
+    reset_method: str
+
+    @property
+    def verdict(self) -> str:
+        """The worst verdict."""
+        found = {finding.verdict for finding in self.findings}
+        return next(one for one in ("error", "warning", "ok") if one in found or one == "ok")
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report in types that JSON has."""
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "findings": [asdict(finding) for finding in self.findings],
+            "costs": dict(self.costs),
+            "hooks": self.hooks,
+            "reset_method": self.reset_method,
+        }
+
+    def as_text(self) -> str:
+        """The report in lines of printable ASCII."""
+        lines = []
+        for one in self.findings:
+            lines.append(f"{one.verdict:8} {one.check}: {plain(one.text)}")
+            if one.cure:
+                lines.append(f"{'':8} cure: {plain(one.cure)}")
+        step, reset = (_duration(self.costs[name]) for name in ("step", "reset"))
+        lines.append(f"a step takes {step}, a reset {reset}; episodes begin by {self.reset_method}")
+        lines.append(f"hooks in a vector environment: {self.hooks}")
+        return "\n".join(lines)
+
+
+def _duration(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-6:.3g} us"
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """What an episode of a check gave; arrays have one row for each step, the reset first.
+
+    Attributes:
+        observations: Shape (n + 1, k).
+        rewards: Shape (n,).
+        fault: The reason of a fault; None if there was none.
+        reset_time, step_time: Seconds of real time of the reset, and of a step.
+    """
+
+    observations: np.ndarray[Any, np.dtype[np.float64]]
+    rewards: np.ndarray[Any, np.dtype[np.float64]]
+    fault: str | None
+    reset_time: float
+    step_time: float
+
+
+def validate(make_env: Callable[[], FMUEnv]) -> Report:
+    """Check a task by some short episodes.
+
+    Args:
+        make_env: A function that makes the environment.
+
+    Raises:
+        FMUGymError: If the environment cannot be made.
+    """
+    env = make_env()
+    try:
+        env.action_space.seed(0)
+        first = _play(env, env.action_space.sample)
+        findings = tuple(_findings(env, first))
+        costs = {"step": first.step_time, "reset": _play(env, None).reset_time}
+        return Report(findings, costs, _hooks(make_env), env.reset_method)
+    finally:
+        env.close()
+
+
+def _play(
+    env: FMUEnv, choose: Callable[[], Any] | None, options: Mapping[str, Any] | None = None
+) -> _Episode:
+    """Play an episode, or only its beginning."""
+    begin = time.perf_counter()
+    observation, _ = env.reset(seed=0, options=options)
+    after_reset = time.perf_counter()
+    observations: list[Any] = [_flat(observation)]
+    rewards: list[float] = []
+    fault = None
+    while choose is not None and len(rewards) < _MOST_STEPS:
+        observation, reward, terminated, truncated, info = env.step(choose())
+        observations.append(_flat(observation))
+        rewards.append(reward)
+        fault = info.get("fault")
+        if terminated or truncated or time.perf_counter() - after_reset > _SECONDS:
+            break
+    took = (time.perf_counter() - after_reset) / max(1, len(rewards))
+    arrays = np.array(observations), np.array(rewards, np.float64)
+    return _Episode(*arrays, fault, after_reset - begin, took)
+
+
+def _flat(observation: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if isinstance(observation, Mapping):
+        return np.concatenate([_flat(part) for part in observation.values()])
+    return np.asarray(observation, np.float64).reshape(-1)
+
+
+def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
+    yield _of_faults(first)
+    yield _of_repetition(env, first)
+    yield from _of_actions(env)
+    yield from _of_parameters(env)
+    yield _of_reward(first)
+    yield from _of_observations(env, first)
+    yield _of_length(env)
+
+
+def _of_faults(first: _Episode) -> Finding:
+    steps = len(first.rewards)
+    if first.fault is None:
+        return Finding("ok", "run", f"{steps} steps with random actions")
+    return Finding(
+        "error",
+        "run",
+        f"step {steps} of random actions failed: {first.fault}",
+        "narrow the limits of the actions, shorten the time step, or use more substeps",
+    )
+
+
+def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
+    env.action_space.seed(0)
+    again = _play(env, env.action_space.sample)
+    count = min(len(first.observations), len(again.observations))
+    if np.array_equal(first.observations[:count], again.observations[:count]):
+        return Finding("ok", "repetition", "the same seed gives the same episode")
+    return Finding(
+        "error",
+        "repetition",
+        "the same seed gives another episode",
+        "the FMU is not deterministic, or keeps something over a reset: try isolation = "
+        '"process" and reset_method = "process" under [config]',
+    )
+
+
+def _of_actions(env: FMUEnv) -> Iterator[Finding]:
+    """Compare episodes in which one action is at its lowest and its highest value."""
+    space = env.action_space
+    useless = []
+    for name, low, high in _extremes(space, env.config.model_input_names):
+        episodes = [_play(env, _always(value)) for value in (low, high)]
+        if not _differ(*episodes):
+            useless.append(name)
+    if useless:
+        yield Finding(
+            "warning",
+            "actions",
+            f"no effect on observations or reward: {', '.join(useless)}",
+            "leave them out, or observe what they change",
+        )
+    elif _is_simple(space):
+        yield Finding("ok", "actions", "each action has an effect")
+
+
+def _is_simple(space: spaces.Space[Any]) -> bool:
+    kinds = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+    return isinstance(space, kinds)
+
+
+def _extremes(space: Any, names: tuple[str, ...]) -> Iterator[tuple[str, Any, Any]]:
+    """For each element of an action, a name and actions that differ in this element only."""
+    if isinstance(space, spaces.Discrete):
+        yield "the action", space.start, space.start + space.n - 1
+        return
+    if not _is_simple(space):
+        return
+    if isinstance(space, spaces.Box):
+        low, high = space.low, space.high
+    else:
+        counts = np.asarray(space.nvec if isinstance(space, spaces.MultiDiscrete) else 2)
+        low = np.zeros(space.shape, space.dtype)
+        high = np.broadcast_to(counts - 1, space.shape).astype(space.dtype)
+    middle = ((low.astype(np.float64) + high) / 2).astype(space.dtype)
+    for index, place in enumerate(np.ndindex(low.shape)):
+        first, second = middle.copy(), middle.copy()
+        first[place], second[place] = low[place], high[place]
+        name = names[index] if len(names) == low.size else f"element {index}"
+        yield name, first, second
+
+
+def _always(action: Any) -> Callable[[], Any]:
+    return lambda: action
+
+
+def _differ(first: _Episode, second: _Episode) -> bool:
+    same = np.array_equal(first.observations, second.observations)
+    return not same or not np.array_equal(first.rewards, second.rewards)
+
+
+def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
+    """Compare episodes with two values of each parameter that is drawn."""
+    rng = np.random.default_rng(0)
+    useless = []
+    drawn = {n: v for n, v in env.config.model_parameters.items() if is_distribution(v)}
+    for name, distribution in drawn.items():
+        values = (
+            [distribution.sample(rng) for _ in range(2)] if hasattr(distribution, "sample") else []
+        )
+        options = [{"model_parameters": {name: value}} for value in values]
+        episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
+        if episodes and values[0] != values[1] and not _differ(*episodes):
+            useless.append(name)
+    if useless:
+        names = ", ".join(useless)
+        yield Finding(
+            "warning",
+            "parameters",
+            f"drawn without an effect: {names}",
+            "look for another parameter that the model uses, or leave them out",
+        )
+    elif drawn:
+        yield Finding("ok", "parameters", "each drawn parameter has an effect")
+
+
+def _middle(space: Any) -> Any:
+    for _, first, second in _extremes(space, ()):
+        both = np.asarray(first, np.float64) + np.asarray(second, np.float64)
+        middle = (both / 2).astype(space.dtype)
+        return int(middle) if isinstance(space, spaces.Discrete) else middle
+    return space.sample()
+
+
+def _of_reward(first: _Episode) -> Finding:
+    if len(np.unique(first.rewards)) > 1:
+        low, high = first.rewards.min(), first.rewards.max()
+        return Finding("ok", "reward", f"from {low:.4g} to {high:.4g} with random actions")
+    return Finding(
+        "warning",
+        "reward",
+        f"always {first.rewards[0]:g} with random actions",
+        "an agent learns from differences; that is fine only if episodes end early",
+    )
+
+
+def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
+    space, seen = env.observation_space, first.observations
+    if not isinstance(space, spaces.Box):
+        return
+    names = env.observation_names or tuple(f"element {i}" for i in range(seen.shape[1]))
+    low, high = space.low.reshape(-1), space.high.reshape(-1)
+    outside = ((seen < low) | (seen > high)).any(axis=0)
+    if outside.any():
+        listing = ", ".join(
+            f"{names[i]} ({seen[:, i].min():.4g} to {seen[:, i].max():.4g})"
+            for i in np.flatnonzero(outside)
+        )
+        yield Finding(
+            "warning", "observations", f"outside of their limits: {listing}", "widen min and max"
+        )
+    scales = np.abs(seen).max(axis=0)
+    if scales.max() > _WIDE * max(1.0, scales.min()):
+        largest = names[int(scales.argmax())]
+        yield Finding(
+            "warning",
+            "observations",
+            f"of very different sizes: {largest} reaches {scales.max():.4g}",
+            "give min and max and normalize = true under [agent], or another unit",
+        )
+    elif not outside.any():
+        yield Finding("ok", "observations", "within their limits, and of similar sizes")
+
+
+def _of_length(env: FMUEnv) -> Finding:
+    steps, config = env.config.max_episode_steps, env.config
+    if steps is not None or config.stop_time is not None:
+        what = f"at most {steps} steps" if steps is not None else f"until t = {config.stop_time} s"
+        return Finding("ok", "length", f"an episode takes {what}")
+    return Finding(
+        "warning",
+        "length",
+        "an episode has no limit of steps",
+        "give episode_length, unless every episode terminates",
+    )
+
+
+def _hooks(make_env: Callable[[], FMUEnv]) -> str:
+    for hooks in ("compiled", "array", "per_env"):
+        try:
+            envs = FMUVectorEnv(make_env, 1, hooks=hooks)
+        except FMUGymError:
+            continue
+        envs.close()
+        return hooks
+    return "none"

@@ -1,0 +1,242 @@
+"""Rollouts: what many candidates for the next actions would lead to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.checks import check_mapping
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.interface import checked_value
+from fmugym.vector.actions import checked_actions, is_array_space
+from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.infos import copy_rows
+
+__all__ = ["Candidates", "Rollout", "joined_rollouts", "roll_out_by_steps", "tunable_values"]
+
+
+class Rollout(NamedTuple):
+    """What n candidates have led to in up to ``horizon`` steps.
+
+    After the end of a candidate's episode its last observation is repeated, its rewards are 0, and
+    the flags are False.
+
+    Attributes:
+        observations: After each step, shape (n, horizon, ...), or a dict or tuple of such arrays.
+        rewards: Shape (n, horizon), float64.
+        terminated: Whether the step has ended the episode, shape (n, horizon).
+        truncated: Whether the step has cut it short, shape (n, horizon).
+        lengths: The steps that each candidate has done, shape (n,).
+    """
+
+    observations: Any
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    lengths: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, observations: Any, rewards: FloatArray, terminated: MaskArray, truncated: MaskArray
+    ) -> Rollout:
+        """Make it of arrays with steps on the first axis."""
+        ends = terminated | truncated
+        horizon = len(rewards)
+        first = ends.argmax(axis=0) + 1 if horizon else np.zeros(rewards.shape[1], np.int64)
+        lengths = np.where(ends.any(axis=0), first, horizon)
+        turned = _mapped(lambda arrays: np.swapaxes(arrays[0], 0, 1), [observations])
+        return cls(turned, rewards.T, terminated.T, truncated.T, lengths)
+
+
+def _mapped(function: Callable[[list[Any]], Any], trees: Sequence[Any]) -> Any:
+    """Apply a function to the arrays at the same place of several observations."""
+    first = trees[0]
+    if isinstance(first, dict):
+        return {name: _mapped(function, [tree[name] for tree in trees]) for name in first}
+    if isinstance(first, tuple):
+        return tuple(_mapped(function, list(parts)) for parts in zip(*trees, strict=True))
+    return function(list(trees))
+
+
+def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
+    """Put rollouts together, and keep the first candidates."""
+    if len(parts) == 1 and len(parts[0].rewards) == count:
+        return parts[0]
+    return Rollout._make(
+        _mapped(lambda arrays: np.concatenate(arrays)[:count], part)
+        for part in zip(*parts, strict=True)
+    )
+
+
+class Candidates:
+    """What n candidates do: given actions, or a policy.
+
+    Args:
+        count: n.
+        horizon: The number of steps.
+        num_envs: N.
+        given: The actions, shape (n, horizon, ...), or the policy.
+
+    Attributes:
+        rounds: Which candidates the environments play one after the other, arrays of shape (N,).
+            Environments that are left over play the last candidate, too.
+    """
+
+    parameters: Mapping[str, FloatArray] = MappingProxyType({})
+    """What the tunable parameters of each candidate are, arrays of shape (n,) by name."""
+
+    def __init__(self, count: int, horizon: int, num_envs: int, given: Any) -> None:
+        self.count, self.horizon, self._given = count, horizon, given
+        firsts = range(0, count, num_envs)
+        self.rounds = [np.minimum(np.arange(i, i + num_envs), count - 1) for i in firsts]
+
+    @classmethod
+    def of(cls, space: Any, num_envs: int, actions: Any, horizon: Any) -> Candidates:
+        """Check what a caller gave.
+
+        Raises:
+            ConfigError: If there are no candidates, the shape does not fit, or an action is not
+                possible.
+        """
+        if callable(actions):
+            return cls(num_envs, _checked_horizon(horizon), num_envs, actions)
+        array = _checked_array(space, actions)
+        if horizon not in (None, array.shape[1]):
+            raise ConfigError(f"the actions have {array.shape[1]} steps, but horizon = {horizon}")
+        return cls(len(array), array.shape[1], num_envs, array)
+
+    def actions(self, places: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
+        """The actions of a round, shape (horizon, N, ...); None for a policy."""
+        if callable(self._given):
+            return None
+        array: npt.NDArray[Any] = self._given
+        if len(places) != self.count:
+            array = array[places]
+        return np.ascontiguousarray(np.swapaxes(array, 0, 1))
+
+    def act(self, actions: npt.NDArray[Any] | None) -> Callable[[int, Any], Any]:
+        """The function that chooses the actions of a step."""
+        policy = self._given
+        if actions is None:
+            return lambda step, observations: policy(observations)
+        return lambda step, observations: actions[step]
+
+
+def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.NDArray[np.float64]]:
+    """Check the parameters of candidates.
+
+    Args:
+        env: Its FMU has the parameters.
+        parameters: An array of shape (n,), or one number for all, by name; None for none.
+        count: n.
+
+    Returns:
+        Arrays of shape (n,) by name.
+
+    Raises:
+        ConfigError: If a parameter is unknown or cannot be set between two steps, or its values do
+            not fit.
+    """
+    given = {} if parameters is None else check_mapping("'parameters'", parameters)
+    found = {}
+    for name, values in given.items():
+        variable = env.fmu.variable(name)
+        if (variable.causality, variable.variability) != ("parameter", "tunable"):
+            raise ConfigError(
+                f"{name!r} is a {variable.variability} {variable.causality}: an FMU lets only "
+                "tunable parameters be set between two steps. Let the candidates begin with "
+                "episodes of their own, whose resets have drawn it"
+            )
+        each = [values] * count if np.ndim(values) == 0 else values
+        if len(each) != count:
+            raise ConfigError(f"there are {len(each)} values of {name!r}, expected {count}")
+        found[name] = np.array([checked_value(variable, value) for value in each])
+    return found
+
+
+def _checked_array(space: Any, actions: Any) -> npt.NDArray[Any]:
+    """The actions as an array of shape (n, horizon, ...) and of the type of the space."""
+    if not is_array_space(space):
+        raise ConfigError(f"the actions of {space} make no array; give rollout a policy instead")
+    try:
+        array = np.asarray(actions)
+    except Exception:  # lists that make no array, and the user's own __array__
+        array = np.empty(0)
+    if array.ndim < 2 or array.shape[2:] != space.shape or not array.size:
+        raise ConfigError(
+            f"the actions have shape {array.shape}, expected (n, horizon"
+            f"{''.join(f', {length}' for length in space.shape)}) with at least one of each"
+        )
+    count = array.shape[0] * array.shape[1]
+    try:
+        checked = checked_actions(space, count, array.reshape(count, *space.shape))
+    except ConfigError as error:
+        raise _in_words_of_candidates(error, space, array) from None
+    with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
+        return checked.astype(space.dtype, copy=False).reshape(array.shape)
+
+
+def _in_words_of_candidates(error: ConfigError, space: Any, array: npt.NDArray[Any]) -> ConfigError:
+    for index, candidate in enumerate(array):
+        try:
+            checked_actions(space, len(candidate), candidate)
+        except ConfigError as own:
+            return ConfigError(f"candidate {index}: {own}".replace("environment", "step"))
+    return error
+
+
+def roll_out_by_steps(
+    engine: Engine, act: Callable[[int, Any], Any], horizon: int, observations: Any
+) -> Rollout:
+    """Roll out with one call of the engine for each step.
+
+    Args:
+        engine: Its episodes are at their present places.
+        act: Returns the actions of all environments, from the number of the step and the
+            observations before it.
+        horizon: The number of steps.
+        observations: The observations before the first step.
+    """
+    over = np.zeros(len(engine.ended), np.bool_)
+    results: list[StepResult] = []
+    for step in range(horizon):
+        starting = engine.ended.copy() if engine.any_ended else None
+        result = engine.step(act(step, observations), starting)
+        if over.any():
+            result = _without(result, observations, over)
+        over |= result.terminated | result.truncated
+        observations = result.observations
+        results.append(result)
+    return Rollout.of(
+        _mapped(np.stack, [result.observations for result in results]),
+        np.stack([result.rewards for result in results]),
+        np.stack([result.terminated for result in results]),
+        np.stack([result.truncated for result in results]),
+    )
+
+
+def _without(result: StepResult, before: Any, over: MaskArray) -> StepResult:
+    """Leave out the environments whose candidates have ended earlier."""
+    copy_rows(before, result.observations, over)
+    result.rewards[over] = 0.0
+    result.terminated[over] = result.truncated[over] = False
+    return result
+
+
+def _checked_horizon(horizon: Any) -> int:
+    """Check the number of steps of a policy.
+
+    Raises:
+        ConfigError: If it is no positive integer.
+    """
+    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        raise ConfigError(
+            f"a rollout of a policy needs a horizon, a positive integer, got {shown(horizon)}"
+        )
+    return int(horizon)

@@ -1,0 +1,208 @@
+"""The commands of the command line that write, check and run tasks."""
+
+import csv
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmu_tools import edited_fmu, probe_fmu
+
+import fmugym
+from fmugym.archive.bundled import BUNDLED
+from fmugym.tools.cli import main
+from fmugym.tools.validation import validate
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+class TestNew:
+    @pytest.mark.parametrize(("model", "version"), BUNDLED)
+    def test_what_it_writes_passes_validate(self, model, version, tmp_path, capsys):
+        path = tmp_path / "task.toml"
+        fmu = fmugym.bundled_fmu(model, version)
+        code, out, err = run(capsys, "new", fmu, "--output", path)
+        assert (code, out) == (0, "")
+        assert 'the reward is "0"' in err
+        code, out, err = run(capsys, "validate", path, "--json")
+        report = json.loads(out)
+        assert (code, report["verdict"], err) == (0, "warning", "")
+        bad = {finding["check"] for finding in report["findings"] if finding["verdict"] != "ok"}
+        assert "reward" in bad
+        assert bad <= {"reward", "observations"}  # sizes of temperatures and powers differ
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_types_of_every_kind(self, version, tmp_path, capsys):
+        fmu = probe_fmu(tmp_path, version)
+        code, out, _ = run(capsys, "new", fmu)
+        assert code == 0
+        env = fmugym.load(fmugym.Task.from_dict(tomllib.loads(out)))
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+
+    def test_names_that_are_no_names_of_python(self, tmp_path, capsys):
+        odd = {'name="tau"': 'name="a.b[1] &quot;x&quot;\\ \u00e4"', 'name="q"': 'name="time"'}
+        fmu = edited_fmu(fmugym.bundled_fmu("Pendulum"), tmp_path, odd)
+        code, out, _ = run(capsys, "new", fmu)
+        assert code == 0
+        assert out.isascii()
+        env = fmugym.load(tomllib.loads(out))
+        assert env.config.model_input_names == ('a.b[1] "x"\\ \u00e4',)
+        assert "time" in env.config.model_output_names
+        env.close()
+
+    def test_the_path_of_an_fmu_below_the_file_is_relative(self, tmp_path, capsys):
+        (tmp_path / "fmus").mkdir()
+        fmu = tmp_path / "fmus" / "Pendulum.fmu"
+        fmu.write_bytes(fmugym.bundled_fmu("Pendulum").read_bytes())
+        run(capsys, "new", fmu, "--output", tmp_path / "task.toml")
+        assert 'fmu = "fmus/Pendulum.fmu"' in (tmp_path / "task.toml").read_text()
+        fmugym.load(tmp_path / "task.toml").close()
+
+    def test_an_existing_file_stays(self, tmp_path, capsys):
+        path = tmp_path / "task.toml"
+        path.write_text("precious")
+        code, _, err = run(capsys, "new", fmugym.bundled_fmu("Pendulum"), "--output", path)
+        assert (code, path.read_text()) == (1, "precious")
+        assert "exists" in err
+
+
+TASK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.02,
+    "episode_length": "1s",
+    "variables": {"tau": {"min": -0.01, "max": 0.01}, "q": {"min": -20, "max": 20}},
+    "agent": {"actions": ["tau"], "observations": ["q"]},
+    "reward": "-abs(q - 1)",
+}
+
+DEFECTS = {
+    "useless action": (
+        {
+            "variables": {"idle": {"min": 0, "max": 1}} | TASK["variables"],
+            "agent": {"actions": ["tau", "idle"], "observations": ["q"]},
+        },
+        ("warning", "actions", "element 1"),
+    ),
+    "constant reward": ({"reward": 1}, ("warning", "reward", "always 1")),
+    "no limit": ({"episode_length": None}, ("warning", "length", "no limit")),
+    "outside": (
+        {"variables": {"tau": {}, "q": {"min": 0, "max": 1e-3}}},
+        ("warning", "observations", "q "),
+    ),
+    "sizes": (
+        {
+            "agent": {"actions": "tau", "observations": ["q", "big"]},
+            "expressions": {"big": "1e5 * q"},
+        },
+        ("warning", "observations", "big reaches"),
+    ),
+    "useless parameter": (
+        {"parameters": {"v_c": {"distribution": "uniform", "low": 0.1, "high": 0.2}, "c": 0}},
+        ("warning", "parameters", "v_c"),
+    ),
+    "fault": ({"reward": "1 / (step - 3)"}, ("error", "run", "step 3")),
+}
+
+
+class TestValidate:
+    @pytest.mark.parametrize(("change", "expected"), DEFECTS.values(), ids=DEFECTS)
+    def test_defects_are_found_and_cured(self, change, expected):
+        task = {key: value for key, value in (TASK | change).items() if value is not None}
+        report = validate(lambda: fmugym.load(task))
+        verdict, check, text = expected
+        (finding,) = [one for one in report.findings if one.verdict != "ok"]
+        assert (finding.verdict, finding.check) == (verdict, check)
+        assert text in finding.text
+        assert finding.cure
+        assert report.verdict == verdict
+
+    def test_a_sound_task(self):
+        report = validate(lambda: fmugym.load(TASK))
+        assert report.verdict == "ok"
+        assert report.hooks == "compiled"
+        assert 0 < report.costs["step"] < 1
+        assert 0 < report.costs["reset"] < 1
+
+    def test_an_error_gives_the_exit_code(self, tmp_path, capsys):
+        fmugym.Task.from_dict(TASK | {"reward": "1 / (step - 3)"}).write(tmp_path / "a.toml")
+        code, out, _ = run(capsys, "validate", tmp_path / "a.toml")
+        assert code == 1
+        assert "error    run: step 3" in out
+
+    def test_an_fmu_an_id_and_a_class(self, capsys):
+        targets = fmugym.bundled_fmu("CartPole"), "fmugym/CartPole-v0", "fmugym.envs:CartPoleEnv"
+        for target in targets:
+            code, out, _ = run(capsys, "validate", target)
+            assert code == 0
+            assert "hooks in a vector environment: compiled" in out
+
+    @pytest.mark.parametrize(
+        ("target", "fact"),
+        [("nothing", "'nothing'"), ("CartPole-v1", "fmugym"), ("math:pi", "3.14")],
+    )
+    def test_what_cannot_be_validated(self, target, fact, capsys):
+        code, out, err = run(capsys, "validate", target)
+        assert (code, out) == (1, "")
+        assert fact in err
+        assert err.count("\n") == 1
+
+
+class TestSimulate:
+    def test_random_episodes_are_repeatable(self, capsys):
+        task = EXAMPLES / "cart_pole.toml"
+        code, out, err = run(capsys, "simulate", task, "--episodes", "2", "--seed", "3", "--json")
+        assert (code, err) == (0, "")
+        episodes = json.loads(out)["episodes"]
+        assert [episode["seed"] for episode in episodes] == [3, 4]
+        assert episodes[0]["total_reward"] == episodes[0]["steps"] > 5
+        again = run(capsys, "simulate", task, "--episodes", "2", "--seed", "3", "--json")[1]
+        assert again == out
+
+    def test_a_table_of_all_steps(self, tmp_path, capsys):
+        fmugym.Task.from_dict(TASK | {"costs": {"effort": "abs(tau)"}}).write(tmp_path / "a.toml")
+        arguments = "--action", "0.01", "--output", tmp_path / "run.csv"
+        code, out, _ = run(capsys, "simulate", tmp_path / "a.toml", *arguments)
+        assert code == 0
+        assert "cost 0.5 in 50 steps (1 s), truncated" in out
+        with (tmp_path / "run.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert list(rows[0]) == ["seed", "time", "tau", "q", "costs.effort", "reward", "end"]
+        assert len(rows) == 51
+        assert rows[-1]["end"] == "truncated"
+        env = fmugym.load(tmp_path / "a.toml")
+        env.reset(seed=0)
+        for row in rows[1:]:
+            reward = env.step([np.float32(0.01)])[1]
+            assert (float(row["q"]), float(row["reward"])) == (env.out["q"], reward)
+        env.close()
+
+    @pytest.mark.parametrize("action", ["0.5", "0,0", "left", "nan"])
+    def test_actions_that_do_not_fit(self, action, tmp_path, capsys):
+        fmugym.Task.from_dict(TASK).write(tmp_path / "a.toml")
+        code, _, err = run(capsys, "simulate", tmp_path / "a.toml", "--action", action)
+        assert code == 1
+        assert repr(action) in err
+
+    def test_an_interruption_keeps_the_table(self, tmp_path, capsys, monkeypatch):
+        steps = iter(range(5))
+
+        def step(self, action):
+            if next(steps, None) is None:
+                raise KeyboardInterrupt
+            return original(self, action)
+
+        original = fmugym.FMUEnv.step
+        monkeypatch.setattr(fmugym.FMUEnv, "step", step)
+        arguments = "--output", tmp_path / "run.csv"
+        code, _, _ = run(capsys, "simulate", EXAMPLES / "pendulum.toml", *arguments)
+        assert code == 130
+        assert len((tmp_path / "run.csv").read_text().splitlines()) == 7

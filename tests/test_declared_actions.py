@@ -1,0 +1,194 @@
+"""Actions of declared tasks that are limited in time, and the reward of failed steps."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import FMUVectorEnv
+from fmugym.errors import ConfigError, TaskError
+
+DT = 0.1
+PLAIN = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": DT,
+    "agent": {"actions": ["u"], "observations": ["q"]},
+    "reward": "-u**2 - abs(q)",
+}
+KINDS = {
+    "delta": {"name": "tau", "min": -0.05, "max": 0.1, "delta": 0.04},
+    "rate": {"name": "tau", "min": -0.1, "max": 0.1, "rate": 0.5},
+    "rate of levels": {"name": "tau", "levels": [-0.1, 0, 0.1], "rate": 0.5, "unit": "N.m"},
+    "least times": {
+        "name": "tau",
+        "unit": "N.mm",
+        "levels": [0, 20],
+        "min_on": "0.3s",
+        "min_off": "0.25s",
+    },
+    "least times of a continuous action": {
+        "name": "tau",
+        "min": 0,
+        "max": 0.1,
+        "min_on": 0.3,
+        "min_off": 0.2,
+    },
+}
+
+
+def task(kind, **agent):
+    return PLAIN | {"variables": {"u": KINDS[kind]}, "agent": PLAIN["agent"] | agent}
+
+
+def played(env, actions):
+    """The inputs of an episode."""
+    env.reset(seed=0)
+    inputs = []
+    for action in actions:
+        env.step(action)
+        inputs.append(env.inputs[0])
+    env.close()
+    return inputs
+
+
+def test_an_action_may_be_a_change():
+    env = fmugym.load(task("delta"))
+    np.testing.assert_array_equal(env.action_space.high, np.float32([0.04]))
+    inputs = played(
+        env, [[0.03], [0.03], [-0.04], [-0.04], [-0.04], [0.04], [0.04], [0.04], [0.04]]
+    )
+    expected = [0.03, 0.06, 0.02, -0.02, -0.05, -0.01, 0.03, 0.07, 0.1]
+    assert inputs == pytest.approx(expected)
+
+
+def test_a_rescaled_change():
+    env = fmugym.load(task("delta", rescale=True))
+    np.testing.assert_array_equal(env.action_space.high, [1])
+    assert played(env, [[1.0], [-0.5]]) == pytest.approx([0.04, 0.02])
+
+
+@pytest.mark.parametrize("kind", ["rate", "rate of levels"])
+def test_an_action_follows_at_a_rate(kind):
+    wanted = [0.1, 0.1, -0.1, -0.1, -0.1, 0.0]
+    actions = [[u] for u in wanted] if kind == "rate" else [1 + round(u / 0.1) for u in wanted]
+    inputs = played(fmugym.load(task(kind)), actions)
+    assert inputs == pytest.approx([0.05, 0.1, 0.05, 0.0, -0.05, 0.0])
+
+
+def test_least_times_and_masks():
+    env = fmugym.load(task("least times"))
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    is_on, since, kept = False, 10**9, 0
+    for action in rng.integers(2, size=200).tolist():
+        is_free = since >= 3  # 0.25 s take three steps, too
+        masks = env.action_masks()
+        assert masks.tolist() == [not is_on or is_free, is_on or is_free]
+        kept += (action == 1) != is_on and not is_free
+        now_on = (action == 1) if is_free else is_on
+        since = since + 1 if now_on == is_on else 1
+        is_on = now_on
+        env.step(action)
+        assert env.inputs[0] == pytest.approx(0.02 if is_on else 0.0)
+    assert kept > 30
+    env.close()
+
+
+def test_a_continuous_action_may_change_while_it_is_on():
+    wanted = [0.05, 0.0, 0.06, 0.0, 0.0, 0.04, 0.04]
+    inputs = played(fmugym.load(task("least times of a continuous action")), [[u] for u in wanted])
+    assert inputs == pytest.approx([0.05, 0.05, 0.06, 0.0, 0.0, 0.04, 0.04], rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_many_environments_equal_single_ones_to_the_last_bit(kind, hooks):
+    make = partial(fmugym.load, task(kind, history={"of": "u", "length": "0.2s"}))
+    envs, singles = FMUVectorEnv(make, 3, hooks=hooks), [make() for _ in range(3)]
+    if hooks == "compiled":
+        assert envs._engine._task.left == {}
+    observations, _ = envs.reset(seed=2)
+    for i, env in enumerate(singles):
+        np.testing.assert_array_equal(env.reset(seed=2 + i)[0], observations[i])
+    envs.action_space.seed(1)
+    for _ in range(25):
+        actions = envs.action_space.sample()
+        observations, rewards, *_ = envs.step(actions)
+        for i, env in enumerate(singles):
+            seen, reward, *_ = env.step(actions[i])
+            np.testing.assert_array_equal(seen, observations[i])
+            assert reward == rewards[i]
+        if "levels" in KINDS[kind]:
+            masks = [env.action_masks() for env in singles]
+            np.testing.assert_array_equal(envs.call("action_masks"), masks)
+    for env in (envs, *singles):
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("variable", "fact"),
+    [
+        ({"name": "tau", "levels": [0, 1], "delta": 1}, "'delta'"),
+        ({"name": "tau", "delta": -1}, "positive.*-1"),
+        ({"name": "tau", "min_on": "5 parsec"}, "parsec"),
+        ({"min": 0, "max": 1, "rate": 1}, "'u' is no input"),
+        ({"name": "tau", "rate": 1e-3, "min": 0, "max": "oops"}, "'oops'"),
+    ],
+)
+def test_mistakes_are_placed(variable, fact):
+    with pytest.raises(TaskError, match=rf"^variables\.u.*{fact}"):
+        fmugym.load(PLAIN | {"variables": {"u": variable}})
+
+
+def test_observations_have_no_rate():
+    variables = {"u": {"name": "tau"}, "q": {"rate": 1}}
+    with pytest.raises(TaskError, match=r"variables\.q.*observed"):
+        fmugym.load(PLAIN | {"variables": variables})
+
+
+def test_masks_need_levels():
+    env = fmugym.load(task("rate"))
+    with pytest.raises(ConfigError, match="levels"):
+        env.action_masks()
+    env.close()
+
+
+FAILING = PLAIN | {
+    "variables": {"u": {"name": "tau"}},
+    "parameters": {"q_0": {"distribution": "uniform", "low": -1, "high": 1}},
+    "terminated": "abs(q) > 100",
+}
+REWARDS = {
+    "the worst step": ("-q**2 - done + 0 / (step - 6)", lambda rewards: min(rewards)),
+    "positive rewards": ("1 + q**2 + 0 / (step - 6)", lambda rewards: 0.0),
+    "the file": ("-q**2 + 0 / (step - 6)", lambda rewards: -7.0),
+}
+
+
+@pytest.mark.parametrize("kind", REWARDS)
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_a_failed_step_costs_no_less_than(kind, hooks, mode):
+    reward, expected = REWARDS[kind]
+    own = {"config": {"fault_reward": -7}} if kind == "the file" else {}
+    make = partial(fmugym.load, FAILING | {"reward": reward} | own)
+    envs, single = FMUVectorEnv(make, 2, hooks=hooks, autoreset_mode=mode), make()
+    envs.reset(seed=0)
+    single.reset(seed=0)
+    for _ in range(2):
+        seen = []
+        for step in range(1, 7):
+            action = np.full((2, 1), 0.1 * (-1) ** step, np.float32)
+            _, rewards, _, _, infos = envs.step(action)
+            _, alone, *_, info = single.step(action[0])
+            assert alone == rewards[0]
+            seen.append(alone)
+        assert "fault" in info
+        assert "fault" in infos or "fault" in infos["final_info"]
+        assert seen[-1] == expected(seen[:-1])
+        single.reset()
+        if mode == "next_step":
+            envs.step(action)
+    envs.close()
+    single.close()
