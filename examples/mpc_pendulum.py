@@ -117,7 +117,7 @@ def plot(found: Run) -> Figure:
         angle.plot(later, np.degrees(found.ahead[index]).T, color="tab:orange", alpha=0.1, lw=0.7)
     angle.plot(seconds, np.degrees(found.angles), color="tab:blue", lw=2)
     angle.set(ylabel="angle from upright [degrees]", xlim=(0, seconds[-1]))
-    angle.set_title("The pendulum (blue) and the best futures that it tried, every 0.5 s (orange)")
+    angle.set_title("The pendulum (blue), and the best futures tried every 0.5 s (orange)")
     torque.step(seconds, found.torques, where="post")
     torque.set(ylabel="torque [N m]", xlabel="time [s]", xlim=(0, seconds[-1]))
     clock.hist(1e3 * found.seconds, bins=40, color="0.5")

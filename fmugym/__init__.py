@@ -29,9 +29,11 @@ if TYPE_CHECKING:
     )
     from fmugym.fmi.status import Status
     from fmugym.pool import Backend, Paced
+    from fmugym.recording import Recorder, Recording, replay
     from fmugym.task.snapshot import Snapshot
     from fmugym.tools.linearization import LinearModel, linearize
     from fmugym.vector import FMUVectorEnv
+    from fmugym.vector.sensitivities import derivatives
 
 __all__ = [
     "FMU",
@@ -53,6 +55,8 @@ __all__ = [
     "LogUniform",
     "Normal",
     "Paced",
+    "Recorder",
+    "Recording",
     "SimulationError",
     "Snapshot",
     "Status",
@@ -61,10 +65,12 @@ __all__ = [
     "TaskError",
     "Uniform",
     "bundled_fmu",
+    "derivatives",
     "envs",
     "linearize",
     "load",
     "register",
+    "replay",
 ]
 
 _MODULES = {
@@ -81,9 +87,11 @@ _MODULES = {
     ],
     "fmi.status": ["Status"],
     "pool": ["Backend", "Paced"],
+    "recording": ["Recorder", "Recording", "replay"],
     "task.snapshot": ["Snapshot"],
     "tools.linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
+    "vector.sensitivities": ["derivatives"],
 }
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),

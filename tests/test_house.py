@@ -20,7 +20,7 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification"},
-    {"registration", "single", "testing", "sb3", "declared"},
+    {"registration", "recording", "single", "testing", "sb3", "declared"},
     {"envs", "tools"},
     {"baselines"},
     {"__init__", "__main__", "clock"},

@@ -519,3 +519,30 @@ def test_environments_that_do_not_exist(env):
 def test_seeds_that_do_not_fit(seed):
     with pytest.raises(ConfigError, match="seed"):
         make_sb3_env(CartPoleEnv, 2, seed=seed)
+
+
+def test_a_task_file_gives_what_the_class_gives():
+    config = str(EXAMPLE.parent / "cart_pole.toml")
+    ours = make_sb3_env("fmugym/FMU-v0", 3, seed=1, config=config)
+    twin = make_sb3_env("fmugym/CartPole-v0", 3, seed=1)
+    np.testing.assert_array_equal(ours.reset(), twin.reset())
+    for _ in range(60):
+        actions = np.random.default_rng(0).integers(2, size=3)
+        first, second = ours.step(actions), twin.step(actions)
+        for one, other in zip(first[:3], second[:3], strict=True):
+            np.testing.assert_array_equal(one, other)
+    ours.close()
+    twin.close()
+
+
+def test_ppo_learns_the_same_on_a_task_file_as_on_the_class():
+    weights = []
+    config = str(EXAMPLE.parent / "cart_pole.toml")
+    for env_id, arguments in (("FMU-v0", {"config": config}), ("CartPole-v0", {})):
+        venv = make_sb3_env(f"fmugym/{env_id}", 4, seed=3, **arguments)
+        model = sb3.PPO("MlpPolicy", venv, n_steps=64, batch_size=64, seed=3, device="cpu")
+        model.learn(512)
+        weights.append([tensor.numpy() for tensor in model.policy.state_dict().values()])
+        venv.close()
+    for one, other in zip(*weights, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -8,6 +8,8 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -17,7 +19,7 @@ from fmugym.checks import check_option, check_path
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.variables import number
-from fmugym.errors import shown, unknown_name
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
@@ -140,37 +142,54 @@ def _rows_of_file(entry: Entry) -> tuple[FloatArray, FloatArray]:
     rows, column = _read_csv(entry.child("file")), entry.required("column")
     if column.text() not in rows:
         raise column.error(unknown_name("column", column.value, rows))
-    values = np.array([_cell(column, i, text) for i, text in enumerate(rows[column.value])])
+    values = _numbers(column, rows[column.value])
     if entry.child("step").value is not None:
         return _even_times(entry.child("step"), len(values)), values
     return _times(entry, rows), values
 
 
-def _read_csv(file: Entry) -> dict[str, list[str]]:
-    """The cells of each column. A semicolon separates cells where the first line has one."""
+def _numbers(entry: Entry, cells: Sequence[str]) -> FloatArray:
+    try:
+        numbers = np.array(cells, np.float64)
+    except ValueError:
+        numbers = np.full(len(cells), np.nan)
+    if not np.isfinite(numbers).all():
+        numbers = np.array([_cell(entry, i, text) for i, text in enumerate(cells)])
+    return numbers
+
+
+def _read_csv(file: Entry) -> Mapping[str, Sequence[str]]:
+    """The cells of each column. Environments of one task read a file once."""
     path = check_path("file", file.text())
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        status = path.stat()
+        with file.placing():
+            return _columns(path, status.st_mtime_ns, status.st_size)
     except OSError as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
+
+
+@lru_cache(maxsize=16)
+def _columns(path: Path, changed: int, size: int) -> Mapping[str, Sequence[str]]:
+    """Read a file. A semicolon separates cells where the first line has one."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        raise file.error(f"{shown(str(path))} is not encoded in UTF-8") from None
+        raise ConfigError(f"{shown(str(path))} is not encoded in UTF-8") from None
     delimiter = ";" if lines and ";" in lines[0] else ","
     header, *rows = [row for row in csv.reader(lines, delimiter=delimiter) if row] or [[]]
     for number_of_row, row in enumerate(rows, 2):
         if len(row) != len(header):
-            raise file.error(
+            raise ConfigError(
                 f"row {number_of_row} of {path.name} has {len(row)} cells, expected {len(header)}"
             )
     if not rows:
-        raise file.error(f"{path.name} has no rows below its header")
-    return {
-        name.strip(): list(cells)
-        for name, cells in zip(header, zip(*rows, strict=True), strict=True)
-    }
+        raise ConfigError(f"{path.name} has no rows below its header")
+    names = [name.strip() for name in header]
+    return dict(zip(names, zip(*rows, strict=True), strict=True))
 
 
-def _times(entry: Entry, rows: Mapping[str, list[str]]) -> FloatArray:
+def _times(entry: Entry, rows: Mapping[str, Sequence[str]]) -> FloatArray:
     """The times of the rows: seconds, or dates, which count from the beginning of their year."""
     name = entry.child("time")
     if name.value is not None and name.text() not in rows:
@@ -188,7 +207,7 @@ def _times(entry: Entry, rows: Mapping[str, list[str]]) -> FloatArray:
 
 def _seconds(entry: Entry, cells: Sequence[str]) -> FloatArray:
     if _is_number(cells[0]):
-        return np.array([_cell(entry, i, text) for i, text in enumerate(cells)])
+        return _numbers(entry, cells)
     dates = [_date(entry, i, text.strip()) for i, text in enumerate(cells)]
     start = dates[0].replace(month=1, day=1, hour=0, minute=0, second=0, microsecond=0)
     try:

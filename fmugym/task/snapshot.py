@@ -25,6 +25,7 @@ __all__ = [
     "Scope",
     "Snapshot",
     "checked_snapshot",
+    "require_scope",
     "scope_of",
     "stacked",
     "taken",
@@ -135,12 +136,7 @@ class Snapshot:
         Raises:
             ConfigError: If the snapshot is of another FMU or of another config.
         """
-        for name, text in self._scope.items():
-            if scope.get(name) != text:
-                raise ConfigError(
-                    f"the snapshot is of environments with another {name}: {shown(text)}, expected "
-                    f"{shown(scope.get(name))}"
-                )
+        require_scope(self._scope, scope, "snapshot")
         return self._columns
 
     @property
@@ -224,6 +220,20 @@ def _content(column: Any) -> Any:
 
 
 # What must be the same
+
+
+def require_scope(own: Scope, wanted: Scope, what: str) -> None:
+    """Compare the scope of a snapshot or the like with that of an environment.
+
+    Raises:
+        ConfigError: If they differ; the text names the first difference.
+    """
+    for name, text in own.items():
+        if wanted.get(name) != text:
+            raise ConfigError(
+                f"the {what} is of environments with another {name}: {shown(text)}, expected "
+                f"{shown(wanted.get(name))}"
+            )
 
 
 def scope_of(env: Constructed) -> Scope:

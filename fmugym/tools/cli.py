@@ -7,12 +7,17 @@
     fmugym validate task.toml|model.fmu|ID|module:Class [--json]
     fmugym simulate task.toml|ID|module:Class [--action random|NUMBERS] [--scenario NAME]
         [--seed N] [--episodes N] [--steps N] [--output run.csv] [--json]
+    fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
+        [--episodes N] [--no-normalize] [KEY=VALUE ...]
+    fmugym evaluate TASK [--agent FOLDER ...] [--action NUMBERS ...] [--scenario NAME]
+        [--episodes N] [--seed N] [--steps N] [--json]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
 
-Only ``validate`` and ``simulate`` execute the FMU. Output is printable ASCII. The exit code is 0; 1
-if something cannot be used (one line on the error stream says why) or ``validate`` finds an error;
-2 if the arguments are wrong; 130 after Ctrl-C, which keeps the lines of a table until then.
+``validate``, ``simulate``, ``train`` and ``evaluate`` execute the FMU, the others do not. Output is
+printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the error stream
+says why) or ``validate`` finds an error; 2 if the arguments are wrong; 130 after Ctrl-C, which
+keeps the lines of a table and the best agent until then.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -51,21 +56,25 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final, TextIO
 
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_count, check_seed
+from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.tools.evaluation import evaluate, table
 from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.proposal import Proposal
-from fmugym.tools.simulation import action_of, simulate
+from fmugym.tools.simulation import Policy, action_of, simulate
 from fmugym.tools.skeleton import Skeleton
 from fmugym.tools.stand_in import build_stand_in
-from fmugym.tools.targets import maker_of
+from fmugym.tools.targets import maker_of, scenarios_of
+from fmugym.tools.training import Plan, agent_policy, arguments_of, train
 from fmugym.tools.validation import validate
 
 __all__ = ["main"]
@@ -111,6 +120,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_new(commands)
     _add_validate(commands)
     _add_simulate(commands)
+    _add_train(commands)
+    _add_evaluate(commands)
     _add_skeleton(commands)
     _add_stand_in(commands)
     return parser
@@ -162,6 +173,41 @@ def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     command.add_argument("--episodes", type=int, default=1, help="default 1")
     command.add_argument("--steps", type=int, default=10_000, help="at most, in each episode")
     command.add_argument("--output", type=Path, metavar="FILE", help="a new CSV file of all steps")
+    command.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "train an agent with Stable-Baselines3, and keep the best one"
+    command = commands.add_parser("train", help=text, description=text.capitalize() + ".")
+    command.set_defaults(run=_train)
+    command.add_argument("task", metavar="TASK", help=_TASK)
+    command.add_argument(
+        "arguments", nargs="*", metavar="KEY=VALUE", help="arguments of the algorithm"
+    )
+    command.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="a new one")
+    command.add_argument("--algorithm", default="PPO", help="PPO (default), A2C, SAC, TD3, DQN ...")
+    command.add_argument("--steps", type=int, default=100_000, help="default 100000")
+    command.add_argument("--envs", type=int, default=8, help="that step together; default 8")
+    command.add_argument("--seed", type=int, default=0, help="default 0")
+    command.add_argument("--episodes", type=int, default=5, help="of an evaluation; default 5")
+    command.add_argument(
+        "--no-normalize", action="store_true", help="without running normalization"
+    )
+
+
+def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "let agents, random and constant actions play the same episodes"
+    command = commands.add_parser("evaluate", help=text, description=text.capitalize() + ".")
+    command.set_defaults(run=_evaluate)
+    command.add_argument("task", metavar="TASK", help=_TASK)
+    command.add_argument(
+        "--agent", type=Path, action="append", default=[], metavar="FOLDER", help="of train"
+    )
+    command.add_argument("--action", action="append", default=[], help="a constant action")
+    command.add_argument("--scenario", help="a scenario of the task file")
+    command.add_argument("--episodes", type=int, default=10, help="default 10")
+    command.add_argument("--seed", type=int, default=1_000_000, help="of the first episode")
+    command.add_argument("--steps", type=int, default=10_000, help="at most, in each episode")
     command.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -237,6 +283,45 @@ def _simulate(arguments: argparse.Namespace) -> None:
     if arguments.json:
         episodes = [summary.as_dict() for summary in summaries]
         print(json.dumps({"schema": 1, "task": arguments.task, "episodes": episodes}, indent=2))
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    check_seed(arguments.seed)
+    for name in ("steps", "envs", "episodes"):
+        check_count(f"--{name}", getattr(arguments, name))
+    names = scenarios_of(arguments.task)
+    held_out = {name: maker_of(arguments.task, name) for name in names}
+    plan = Plan(
+        maker_of(arguments.task),
+        held_out or {"held-out seeds": maker_of(arguments.task)},
+        arguments.output,
+        arguments.algorithm,
+        arguments.steps,
+        arguments.envs,
+        arguments.seed,
+        arguments.episodes,
+        normalize=not arguments.no_normalize,
+        arguments=arguments_of(arguments.arguments),
+    )
+    print(table(train(plan, lambda line: print(line, file=sys.stderr))))
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    check_seed(arguments.seed)
+    for name in ("steps", "episodes"):
+        check_count(f"--{name}", getattr(arguments, name))
+    policies: dict[str, Callable[[FMUEnv], Policy]] = {}
+    for text in ("random", *arguments.action):
+        policies[text if text == "random" else f"action {text}"] = partial(action_of, text=text)
+    policies |= {str(folder): agent_policy(folder) for folder in arguments.agent}
+    make_env = maker_of(arguments.task, arguments.scenario)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+    scores = evaluate(make_env, policies, seeds, arguments.steps)
+    if arguments.json:
+        facts = {"schema": 1, "task": arguments.task, "scores": [one.as_dict() for one in scores]}
+        print(json.dumps(facts, indent=2))
+    else:
+        print(table(scores))
 
 
 def _new_table(path: Path) -> TextIO:

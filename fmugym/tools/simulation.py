@@ -137,6 +137,8 @@ def _values(env: FMUEnv, info: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """The inputs, outputs, variables of the task, terms of the reward and costs by name."""
     yield from zip(env.config.model_input_names, env.inputs, strict=True)
     yield from env.out.items()
-    yield from ((n, v) for n, v in env.variables.items() if np.ndim(v) == 0)
+    for name, value in env.variables.items():
+        if np.ndim(value) == 0 and name.isidentifier():  # others are the task's own bookkeeping
+            yield name, value
     for group in ("reward_terms", "costs"):
         yield from ((f"{group}.{name}", value) for name, value in info.get(group, {}).items())

@@ -15,7 +15,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.proposal import Proposal
 
-__all__ = ["maker_of"]
+__all__ = ["maker_of", "scenarios_of"]
 
 
 def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
@@ -44,6 +44,14 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
     if separator and name.isidentifier() and "/" not in module:
         return partial(load, Task.from_dict({"class": target}))
     return partial(_registered, target)
+
+
+def scenarios_of(target: str) -> list[str]:
+    """The names of the scenarios of a task file; none for anything else."""
+    path = Path(target)
+    if path.suffix.lower() == ".fmu" or not path.is_file():
+        return []
+    return list(Task.read(path).document.get("scenarios", {}))
 
 
 def _registered(env_id: str) -> FMUEnv:

@@ -1,0 +1,312 @@
+"""Recordings of episodes as small files, which can be replayed to the last bit.
+
+::
+
+    recorder = fmugym.Recorder(env)
+    recorder.reset(seed=1)
+    ...                                    # steps as ever
+    recorder.recording.save("episode.npz")
+
+    report = fmugym.replay(fmugym.Recording.load("episode.npz"), env)
+    print(report)                          # equal, or the first difference
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces.utils import flatten, unflatten
+from gymnasium.utils.seeding import np_random
+
+from fmugym.checks import check_seed
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.task.generators import row_of, state_of
+from fmugym.task.snapshot import require_scope
+
+_multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
+
+__all__ = ["Recorder", "Recording", "Report", "replay", "surroundings"]
+
+_VERSION: Final = 1
+
+
+def surroundings() -> dict[str, str]:
+    """What the last bits of results may depend on, by name."""
+    features: dict[str, bool] = getattr(_multiarray_umath, "__cpu_features__", {})
+    return {
+        "fmugym": version("fmugym-toolbox"),
+        "numpy": np.__version__,
+        "system": f"{platform.system()} {platform.machine()}",
+        "C library": " ".join(platform.libc_ver()),
+        "processor features": " ".join(sorted(name for name, on in features.items() if on)),
+    }
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode.
+
+    Attributes:
+        scope: The FMU (by its content) and the config.
+        surroundings: See ``surroundings``.
+        seed: The seed of the reset; None if it went on with the generator.
+        stream: The random generator just before the draws; six integers of 64 bits.
+        options: The options of the reset, as JSON.
+        drawn: The values that were drawn or overridden, by name.
+        actions: The action of each step, shape (steps, ...).
+        observations: The first observation and that of each step, flat, shape (steps + 1, ...).
+        rewards: Shape (steps,).
+        terminated: Shape (steps,).
+        truncated: Shape (steps,).
+    """
+
+    scope: dict[str, str]
+    surroundings: dict[str, str]
+    seed: int | None
+    stream: tuple[int, ...]
+    options: str
+    drawn: dict[str, float]
+    actions: npt.NDArray[Any]
+    observations: npt.NDArray[Any]
+    rewards: npt.NDArray[np.float64]
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the recording to a file, in the format ``npz`` of numpy."""
+        fields = {name: getattr(self, name) for name in _ARRAYS}
+        header = {name: getattr(self, name) for name in _FACTS}
+        text = json.dumps({"version": _VERSION, **header}).encode()
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, header=np.frombuffer(text, np.uint8), **fields)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Recording:
+        """Read a recording.
+
+        Raises:
+            ConfigError: If the file is none, or of another version of the format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                header = json.loads(file["header"].tobytes())
+                arrays = {name: file[name] for name in _ARRAYS}
+            if header.pop("version") != _VERSION:
+                raise ValueError("it is of another version of the format")
+            header["stream"] = tuple(header["stream"])
+            return cls(**{name: header[name] for name in _FACTS}, **arrays)
+        except Exception as error:  # a damaged file may raise anything
+            raise ConfigError(
+                f"{shown(str(path))} is no recording of an episode: {error}"
+            ) from None
+
+
+_FACTS: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
+_ARRAYS: Final = ("actions", "observations", "rewards", "terminated", "truncated")
+
+
+class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Records the present episode of an environment.
+
+    Args:
+        env: An ``FMUEnv``, or wrappers around one; what comes out of them is recorded.
+
+    Raises:
+        ConfigError: If there is no ``FMUEnv`` inside.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._inner = _inner(env)
+        self._start: dict[str, Any] | None = None
+        self._rows: list[tuple[Any, ...]] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, and its recording; see ``FMUEnv.reset``.
+
+        Raises:
+            ConfigError: As ``FMUEnv.reset``, and if the options cannot be written as JSON.
+        """
+        text, seed = _as_json(options), check_seed(seed)
+        self._start = None
+        if seed is not None:
+            self._inner._np_random, self._inner._np_random_seed = np_random(seed)
+        stream = _stream_of(self._inner)
+        observation, info = self.env.reset(options=options)
+        first = _flat(self.env.observation_space, observation)
+        self._start = {"seed": seed, "stream": stream, "options": text, "first": first}
+        self._start["drawn"] = {name: float(value) for name, value in info["drawn"].items()}
+        self._rows = []
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Do a step, and record it; see ``FMUEnv.step``."""
+        flat = np.array(_flat(self.env.action_space, action))
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        seen = _flat(self.env.observation_space, observation)
+        self._rows.append((flat, seen, float(reward), bool(terminated), bool(truncated)))
+        return observation, reward, terminated, truncated, info
+
+    @property
+    def recording(self) -> Recording:
+        """The present episode until now.
+
+        Raises:
+            SimulationError: Before the first reset.
+        """
+        if self._start is None:
+            raise SimulationError("there is no recording before the first reset")
+        start = self._start
+        actions, seen, rewards, *ends = zip(*self._rows, strict=True) if self._rows else [()] * 5
+        return Recording(
+            scope=self._inner._scope,
+            surroundings=surroundings(),
+            **{name: start[name] for name in ("seed", "stream", "options", "drawn")},
+            actions=np.array(actions),
+            observations=np.array([start["first"], *seen]),
+            rewards=np.array(rewards, np.float64),
+            terminated=np.array(ends[0], np.bool_),
+            truncated=np.array(ends[1], np.bool_),
+        )
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a replay has shown.
+
+    Attributes:
+        steps: How many steps were replayed.
+        difference: The first difference; "" if all is equal to the last bit.
+        surroundings: What was otherwise when the episode was recorded, by name: then and now.
+    """
+
+    steps: int
+    difference: str = ""
+    surroundings: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether all is equal to the last bit."""
+        return not self.difference
+
+    def __str__(self) -> str:
+        told = self.difference or "all is equal to the last bit"
+        others = "; ".join(
+            f"{name} was {then!r}, is {now!r}" for name, (then, now) in self.surroundings.items()
+        )
+        return f"{self.steps} steps were replayed: {told}{f' ({others})' if others else ''}"
+
+
+def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
+    """Play a recorded episode again, and compare it to the last bit.
+
+    Args:
+        recording: The episode.
+        env: An environment with the same FMU and config, and the same wrappers.
+
+    Raises:
+        ConfigError: If the FMU or the config is another one.
+    """
+    inner, now = _inner(env), surroundings()
+    require_scope(recording.scope, inner._scope, "recording")
+    then = recording.surroundings
+    others = {n: (then.get(n, ""), now[n]) for n in now if then.get(n) != now[n]}
+    generator = np.random.Generator(np.random.PCG64())
+    generator.bit_generator.state = state_of(list(recording.stream))
+    inner.np_random = generator
+    observation, info = env.reset(options=json.loads(recording.options))
+    drawn = {name: float(value) for name, value in info["drawn"].items()}
+    found = _difference_of_starts(recording, drawn, _flat(env.observation_space, observation))
+    steps = 0
+    while not found and steps < len(recording):
+        found = _difference_of_step(recording, env, steps)
+        steps += 1
+    return Report(steps, found, others)
+
+
+def _difference_of_starts(
+    recording: Recording, drawn: Mapping[str, float], observation: npt.NDArray[Any]
+) -> str:
+    for name, value in recording.drawn.items():
+        if drawn.get(name) != value:
+            return f"the reset has drawn {name} = {drawn.get(name)}, recorded was {value}"
+    return _difference("the first observation", observation, recording.observations[0])
+
+
+def _difference_of_step(recording: Recording, env: gymnasium.Env[Any, Any], step: int) -> str:
+    action = _unflat(env.action_space, recording.actions[step])
+    observation, reward, terminated, truncated, _ = env.step(action)
+    seen, when = _flat(env.observation_space, observation), f"step {step + 1}: the "
+    return (
+        _difference(f"{when}observation", seen, recording.observations[step + 1])
+        or _difference(f"{when}reward", np.float64(reward), recording.rewards[step])
+        or _difference(f"{when}flag terminated", terminated, recording.terminated[step])
+        or _difference(f"{when}flag truncated", truncated, recording.truncated[step])
+    )
+
+
+def _difference(what: str, found: Any, recorded: Any) -> str:
+    found, recorded = np.asarray(found), np.asarray(recorded)
+    if found.shape != recorded.shape:
+        return f"{what} has shape {found.shape}, recorded was {recorded.shape}"
+    if found.astype(recorded.dtype).tobytes() == recorded.tobytes():
+        return ""
+    place = np.flatnonzero(np.ravel(found != recorded))[:1]
+    index = int(place[0]) if len(place) else 0
+    values = np.ravel(found)[index], np.ravel(recorded)[index]
+    where = f"[{index}]" if found.ndim else ""
+    return f"{what}{where} is {values[0]!r}, recorded was {values[1]!r}"
+
+
+def _inner(env: Any) -> FMUEnv:
+    inner = getattr(env, "unwrapped", None)
+    if not isinstance(inner, FMUEnv):
+        raise ConfigError(f"episodes of an FMUEnv can be recorded, got {shown(env)}")
+    return inner
+
+
+def _stream_of(env: FMUEnv) -> tuple[int, ...]:
+    state: Any = env.np_random.bit_generator.state
+    if state["bit_generator"] != "PCG64":
+        raise ConfigError(
+            f"the environment has a generator {state['bit_generator']!r}; reset it with a seed"
+        )
+    return tuple(row_of(state))
+
+
+def _as_json(options: Any) -> str:
+    try:
+        return json.dumps(options)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"the options of reset cannot be recorded: {error}") from None
+
+
+def _flat(space: gymnasium.Space[Any], value: Any) -> npt.NDArray[Any]:
+    """An element of a space as an array of its own type."""
+    if isinstance(value, Mapping | tuple):
+        return np.asarray(flatten(space, value))
+    return np.array(value)
+
+
+def _unflat(space: gymnasium.Space[Any], values: npt.NDArray[Any]) -> Any:
+    composed = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
+    if composed:
+        return unflatten(space, values)
+    return values[()] if values.ndim == 0 else values

@@ -1,0 +1,186 @@
+"""Training and evaluation from the command line."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.tools.cli import main
+from fmugym.tools.evaluation import confidence
+from fmugym.tools.training import arguments_of
+
+CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
+SCENARIOS = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "1s",
+    "variables": {"tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["q", "q_dot", "goal"]},
+    "data": {"goal": {"values": [0, 1, 2], "step": "1d"}},
+    "reward": "-abs(q - goal)",
+    "costs": {"effort": "abs(tau)"},
+    "clock": {"from": "01-01", "to": "01-03", "step": "1h", "exclude": "scenarios"},
+    "scenarios": {
+        "early": {"start": "01-01 12:00", "length": "0.5s"},
+        "late": {"start": "01-02 12:00", "length": "0.5s"},
+    },
+}
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+class TestEvaluate:
+    def test_controllers_play_the_same_episodes(self, capsys):
+        arguments = "--action", "0", "--action", "1", "--episodes", "4", "--json"
+        code, out, _ = run(capsys, "evaluate", CART_POLE, *arguments)
+        scores = json.loads(out)["scores"]
+        assert code == 0
+        assert [score["name"] for score in scores] == ["random", "action 0", "action 1"]
+        env = fmugym.load(CART_POLE)
+        lengths = []
+        for seed in range(1_000_000, 1_000_004):
+            env.reset(seed=seed)
+            steps = 1
+            while not env.step(1)[2]:
+                steps += 1
+            lengths.append(steps)
+        env.close()
+        assert scores[2]["rewards"] == scores[2]["steps"] == lengths
+        assert scores[2]["mean_reward"] == np.mean(lengths)
+        low, high = scores[2]["interval_95"]
+        assert low < np.mean(lengths) < high
+        assert scores[2]["ends"] == {"terminated": 4}
+
+    def test_a_table_with_costs_and_a_scenario(self, tmp_path, capsys):
+        fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
+        arguments = "--scenario", "late", "--action", "0.1", "--episodes", "2"
+        code, out, _ = run(capsys, "evaluate", tmp_path / "a.toml", *arguments)
+        assert code == 0
+        header, random, constant = (line.split() for line in out.splitlines())
+        assert header[:4] == ["reward", "+-", "cost", "steps"]
+        assert random[0] == "random"
+        assert constant[:2] == ["action", "0.1"]
+        assert float(constant[4]) == pytest.approx(1.0)
+        assert constant[5:8] == ["10", "2", "truncated"]
+
+    @pytest.mark.parametrize(
+        ("arguments", "fact"),
+        [
+            (["--agent", "/nowhere"], "'/nowhere'"),
+            (["--action", "7"], "'7'"),
+            (["--episodes", "0"], "--episodes"),
+            (["--scenario", "peak"], "peak"),
+        ],
+    )
+    def test_mistakes(self, arguments, fact, capsys):
+        code, out, err = run(capsys, "evaluate", CART_POLE, *arguments)
+        assert (code, out) == (1, "")
+        assert fact in err
+
+
+def test_the_interval_is_students():
+    stats = pytest.importorskip("scipy.stats", reason="needs scipy: the extra test")
+    for count in (2, 3, 4, 5, 10, 100):
+        values = np.random.default_rng(count).normal(size=count)
+        error = values.std(ddof=1) / np.sqrt(count)
+        expected = stats.t.ppf(0.975, count - 1) * error
+        assert confidence(values) == pytest.approx(expected, rel=0.01)
+    assert confidence([1.0]) is None
+
+
+def test_arguments_of_an_algorithm():
+    texts = ["gamma=0.9", "n_steps=64", "policy=MlpPolicy", "policy_kwargs={net_arch=[8]}", "a=b=c"]
+    assert arguments_of(texts) == {
+        "gamma": 0.9,
+        "n_steps": 64,
+        "policy": "MlpPolicy",
+        "policy_kwargs": {"net_arch": [8]},
+        "a": "b=c",
+    }
+    with pytest.raises(ConfigError, match="'gamma'"):
+        arguments_of(["gamma"])
+
+
+def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fmugym.sb3", None)
+    code, out, err = run(capsys, "train", CART_POLE, "--output", tmp_path / "agent")
+    assert (code, out) == (1, "")
+    assert "pip install 'fmugym-toolbox[sb3]'" in err
+    assert not (tmp_path / "agent").exists()
+
+
+class TestTrain:
+    @pytest.fixture(autouse=True)
+    def sb3(self):
+        pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3")
+
+    def test_an_agent_learns_is_kept_and_evaluated(self, tmp_path, capsys):
+        folder = tmp_path / "agent"
+        options = "--steps", "6000", "--episodes", "3", "--output", folder
+        arguments = "n_steps=128", "batch_size=256"
+        code, out, err = run(capsys, "train", CART_POLE, *arguments, *options)
+        assert code == 0
+        assert "6144 steps: reward" in err
+        assert "held-out seeds" in out
+        rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
+        assert len(rows) > 5
+        best = max(float(row["reward"]) for row in rows)
+        assert json.loads((folder / "agent.json").read_text())["reward"] == best > 100
+        names = "--agent", folder, "--episodes", "3", "--json"
+        code, out, _ = run(capsys, "evaluate", CART_POLE, *names)
+        random, agent = json.loads(out)["scores"]
+        assert code == 0
+        assert agent["mean_reward"] == best > 2 * random["mean_reward"]
+        code, _, err = run(capsys, "train", CART_POLE, *options)
+        assert code == 1
+        assert "exists" in err
+
+    def test_scenarios_are_the_evaluation(self, tmp_path, capsys):
+        fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
+        arguments = "learning_starts=10", "train_freq=20"
+        options = "--steps", "100", "--envs", "2", "--episodes", "1", "--algorithm", "SAC"
+        output = "--output", tmp_path / "agent"
+        code, out, _ = run(capsys, "train", tmp_path / "a.toml", *arguments, *options, *output)
+        assert code == 0
+        assert [line.split()[0] for line in out.splitlines()[1:]] == ["early", "late"]
+        text = (tmp_path / "agent" / "evaluations.csv").read_text()
+        rows = list(csv.DictReader(text.splitlines()))
+        assert {"early", "late"} < rows[0].keys()
+
+    def test_an_interruption_keeps_the_best_agent(self, tmp_path, capsys, monkeypatch):
+        def train(self):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("stable_baselines3.PPO.train", train)
+        folder = tmp_path / "agent"
+        options = "--output", folder, "--episodes", "1", "--envs", "2"
+        code, *_ = run(capsys, "train", CART_POLE, "n_steps=16", "batch_size=32", *options)
+        assert code == 130
+        assert (folder / "model.zip").exists()
+        code, out, _ = run(capsys, "evaluate", CART_POLE, "--agent", folder, "--episodes", "1")
+        assert (code, str(folder) in out) == (0, True)
+
+    @pytest.mark.parametrize(
+        ("arguments", "fact"),
+        [
+            (["--algorithm", "PPOO"], "'PPO'"),
+            (["n_step=3"], "n_step"),
+            (["n_steps"], "'n_steps'"),
+            (["--steps", "0"], "--steps"),
+        ],
+    )
+    def test_mistakes(self, arguments, fact, tmp_path, capsys):
+        options = "--output", tmp_path / "agent"
+        code, _, err = run(capsys, "train", CART_POLE, *arguments, *options)
+        assert code == 1
+        assert fact in err
+        assert not (tmp_path / "agent").exists()

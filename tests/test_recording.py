@@ -1,0 +1,154 @@
+"""Recordings of episodes, and replays that are equal or name the first difference."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from test_snapshots import Track
+
+import fmugym
+from fmugym import ConfigError, Recorder, Recording, SimulationError
+from fmugym.envs import CartPoleEnv
+
+
+class Named(Track):
+    """Observations and actions that are dicts."""
+
+    def _get_action_space(self):
+        return gymnasium.spaces.Dict({"tau": gymnasium.spaces.Box(-0.01, 0.01, (1,), np.float32)})
+
+    def _get_inputs(self):
+        return self.action["tau"]
+
+    def _get_observation_space(self):
+        return gymnasium.spaces.Dict({"q": gymnasium.spaces.Box(-np.inf, np.inf, (), np.float64)})
+
+    def _get_observation(self):
+        return {"q": np.float64(self.out["q"])}
+
+
+def record(env, steps=8, **arguments):
+    recorder = Recorder(env)
+    recorder.reset(**arguments)
+    env.action_space.seed(0)
+    for _ in range(steps):
+        if any(recorder.step(env.action_space.sample())[2:4]):
+            break
+    return recorder
+
+
+@pytest.mark.parametrize("make", [Track, CartPoleEnv, Named], ids=lambda cls: cls.__name__)
+@pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
+def test_a_file_is_replayed_to_the_last_bit(make, version, tmp_path):
+    with make(fmi_version=version) as env:
+        recording = record(env, seed=5).recording
+    recording.save(tmp_path / "episode.npz")
+    loaded = Recording.load(tmp_path / "episode.npz")
+    assert len(loaded) == len(recording) == 8
+    assert loaded.seed == 5
+    assert loaded.drawn == recording.drawn
+    with make(fmi_version=version, backend="python") as env:
+        report = fmugym.replay(loaded, env)
+    assert report.is_equal
+    assert str(report) == "8 steps were replayed: all is equal to the last bit"
+    assert (tmp_path / "episode.npz").stat().st_size < 20_000
+
+
+def test_a_later_episode_and_its_options():
+    with Track() as env:
+        env.reset(seed=1)
+        recorder = record(env, options={"model_parameters": {"m": 0.055}})
+    assert recorder.recording.seed is None
+    assert recorder.recording.drawn["m"] == 0.055
+    with Track() as env:
+        assert fmugym.replay(recorder.recording, env).is_equal
+
+
+def test_a_recorded_episode_is_that_without_a_recorder():
+    with Track() as env, Track() as plain:
+        recording = record(env, seed=3).recording
+        observation, info = plain.reset(seed=3)
+        assert observation.tolist() == recording.observations[0].tolist()
+        assert info["drawn"] == recording.drawn
+        assert plain.step(recording.actions[0])[1] == recording.rewards[0]
+
+
+def test_wrappers_are_part_of_it():
+    env = gymnasium.make("fmugym/CartPole-v0", max_episode_steps=4)
+    recording = record(env, seed=0).recording
+    assert recording.truncated.tolist() == [False, False, False, True]
+    assert fmugym.replay(recording, env).is_equal
+    report = fmugym.replay(recording, env.unwrapped)
+    assert report.difference == "step 4: the flag truncated is np.False_, recorded was np.True_"
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"drawn": {"m": 1.0}}, "drawn m = "),
+        ({"observations": 0}, "the first observation[0] is"),
+        ({"observations": 3}, "step 3: the observation[0] is"),
+        ({"rewards": 2}, "step 3: the reward is"),
+        ({"terminated": 1}, "step 2: the flag terminated"),
+    ],
+)
+def test_the_first_difference_is_named(changes, difference):
+    with Track() as env:
+        recording = record(env, seed=0).recording
+        for name, change in changes.items():
+            value = change
+            if name != "drawn":
+                value = getattr(recording, name).copy()
+                value[change] = ~value[change] if value.dtype == bool else value[change] + 1e-6
+            recording = replace(recording, **{name: value})
+        report = fmugym.replay(recording, env)
+    assert difference in report.difference
+    assert not report.is_equal
+
+
+def test_other_surroundings_are_told():
+    with Track() as env:
+        recording = record(env, seed=0).recording
+        others = {**recording.surroundings, "numpy": "1.0"}
+        report = fmugym.replay(replace(recording, surroundings=others), env)
+    assert report.surroundings == {"numpy": ("1.0", np.__version__)}
+    assert f"numpy was '1.0', is '{np.__version__}'" in str(report)
+
+
+class TestRefusals:
+    def test_of_another_config(self):
+        with Track() as env, Track(time_step=0.01) as other:
+            recording = record(env, seed=0).recording
+            with pytest.raises(ConfigError, match="time_step"):
+                fmugym.replay(recording, other)
+
+    def test_of_other_environments(self):
+        with pytest.raises(ConfigError, match="FMUEnv"):
+            Recorder(gymnasium.make("CartPole-v1"))
+
+    def test_before_the_first_reset(self):
+        with Track() as env, pytest.raises(SimulationError, match="before the first reset"):
+            _ = Recorder(env).recording
+
+    def test_of_options_that_are_no_json(self):
+        with Track() as env, pytest.raises(ConfigError, match="cannot be recorded"):
+            Recorder(env).reset(options={"model_parameters": {"m": fmugym.Uniform(0.1, 0.2)}})
+
+    @pytest.mark.parametrize("content", [b"", b"text", None])
+    def test_of_other_files(self, tmp_path, content):
+        path = tmp_path / "episode.npz"
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(ConfigError, match="no recording"):
+            Recording.load(path)
+
+    def test_of_another_format(self, tmp_path, monkeypatch):
+        with Track() as env:
+            recording = record(env, seed=0).recording
+        monkeypatch.setattr("fmugym.recording._VERSION", 2)
+        recording.save(tmp_path / "episode.npz")
+        monkeypatch.undo()
+        with pytest.raises(ConfigError, match="another version"):
+            Recording.load(tmp_path / "episode.npz")
