@@ -57,19 +57,20 @@ class SwingUp(fmugym.FMI2CSEnv):
 class PathIntegral:
     """The controller: how many sequences of torques it tries in a decision, and how long ones."""
 
-    spread = 1.5  # the standard deviation of the torques that it tries, in N m
     temperature = 1.0  # how much worse than the best a sequence may be and still count
 
-    def __init__(self, candidates: int = 2048, horizon: int = 30, seed: int = 0) -> None:
-        self.envs = fmugym.FMUVectorEnv(SwingUp, candidates, hooks="compiled")
+    def __init__(self, candidates: int = 2048, horizon: int = 30, model: Any = SwingUp) -> None:
+        self.envs = fmugym.FMUVectorEnv(model, candidates, hooks="compiled")
+        self._limit = self.envs.single_action_space.high[0]
         self._plan = np.zeros((horizon, 1))
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(0)
 
     def decide(self, snapshot: fmugym.Snapshot) -> tuple[npt.NDArray[np.float32], Array]:
         """Return the next torque, and the angles that the 30 best candidates lead to."""
-        noise = self._rng.normal(0, self.spread, (self.envs.num_envs, *self._plan.shape))
+        shape = (self.envs.num_envs, *self._plan.shape)
+        noise = self._rng.normal(0, 0.75 * self._limit, shape)
         noise[0] = 0.0  # the plan itself is a candidate
-        tried = np.clip(self._plan + noise, -TORQUE, TORQUE).astype(np.float32)
+        tried = np.clip(self._plan + noise, -self._limit, self._limit).astype(np.float32)
         found = self.envs.rollout(snapshot, tried)
         returns = found.rewards.sum(axis=1)
         weights = np.exp((returns - returns.max()) / self.temperature)

@@ -1,4 +1,4 @@
-"""The example mpc_pendulum.py: it swings the pendulum up and holds it."""
+"""The examples mpc_pendulum.py and mpc_cell.py: they swing the pendulum up and hold it."""
 
 import importlib
 import subprocess
@@ -37,6 +37,14 @@ def test_without_thinking_it_does_not(example):
             assert np.cos(env.out["theta"]) < 0.8
 
 
+def test_a_cell_of_the_lab_is_held(example):
+    cell = importlib.import_module("mpc_cell")
+    angles, torques = cell.run(seed=3, steps=200, candidates=300)
+    assert abs(angles[0]) < 0.1
+    assert np.degrees(np.abs(np.abs(angles[-100:]) - np.pi)).max() < 15.0
+    assert np.abs(torques).max() <= np.float32(cell.TORQUE)
+
+
 def test_the_program_draws(tmp_path):
     picture = tmp_path / "mpc.png"
     options = ["--candidates", "64", "--steps", "20", "--output", str(picture)]
@@ -49,5 +57,6 @@ def test_the_program_draws(tmp_path):
         assert len(set(image.convert("L").resize((70, 60)).getdata())) > 10
 
 
-def test_it_is_short():
-    assert len((EXAMPLES / "mpc_pendulum.py").read_text().splitlines()) < 150
+@pytest.mark.parametrize("name", ["mpc_pendulum.py", "mpc_cell.py"])
+def test_it_is_short(name):
+    assert len((EXAMPLES / name).read_text().splitlines()) < 150

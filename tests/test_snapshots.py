@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from demanding_tools import DemandingEnv, make_fmu
 from fmu_tools import PlainEnv, probe_config
+from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Snapshot
@@ -485,6 +486,35 @@ class TestForeign:
             assert [other.step(a)[0].tolist() for a in actions] == [
                 env.step(a)[0].tolist() for a in actions
             ]
+
+
+class TestZoo:
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    @pytest.mark.parametrize("isolation", ["none", "process"])
+    def test_goes_on_as_the_original(self, tmp_path, version, isolation):
+        with ZooEnv(zoo_fmu(tmp_path, version), isolation=isolation) as env:
+            env.reset(seed=0)
+            for action in ACTIONS[:4]:
+                env.step(action)
+            snapshot = env.save_state()
+            expected = [env.step(action)[:4] for action in ACTIONS]
+            env.restore_state(snapshot)
+            assert [env.step(action)[:4] for action in ACTIONS] == expected
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_goes_on_after_the_death_of_its_process(self, tmp_path, version):
+        values = parameters("segv", at=3)
+        config = {"isolation": "process", "model_parameters": values}
+        with ZooEnv(zoo_fmu(tmp_path, version), **config) as env:
+            env.reset(seed=0)
+            env.step(ACTIONS[0])
+            snapshot = env.save_state()
+            expected = env.step(ACTIONS[1])[:4]
+            assert env.step(ACTIONS[2])[3]
+            env.restore_state(snapshot)
+            assert env.step(ACTIONS[1])[:4] == expected
+            assert env.step(ACTIONS[2])[3]
+            assert env.health["deaths"] == 2
 
 
 def test_records_have_a_limit_and_say_so(halfway, monkeypatch):

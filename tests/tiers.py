@@ -104,6 +104,7 @@ SLOW_TESTS = (
     "test_slow_models.py::TestProgress::test_is_not",
     "test_slow_models.py::TestTime::test_of_a_trial",
     "test_rollouts.py::TestValues::test_of_many_candidates",
+    "test_examples_mpc.py::test_a_cell",
     "test_examples_mpc.py::test_the_program_draws",
     "test_snapshots.py::TestForeign",
     "test_snapshots.py::TestSingle::test_goes_on_in_another_process",

@@ -67,6 +67,54 @@ def _take(table: Any, index: Any) -> Any:
     return np.take(table, index)  # looked up in each call: it is replaced while hooks are traced
 
 
+_STEP: Final = np.uint64(0x9E3779B97F4A7C15)
+_FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND: Final = np.uint64(0x94D049BB133111EB)
+"""The constants of SplitMix64: Steele, Lea and Flood, "Fast Splittable Pseudorandom Number
+Generators" (2014)."""
+
+_FRACTION: Final = 2.0**-53
+
+
+def _mixed(word: Any) -> Any:
+    """Mix 64 bits as SplitMix64 does; products are taken modulo 2**64."""
+    word = (word ^ (word >> np.uint64(30))) * _FIRST
+    word = (word ^ (word >> np.uint64(27))) * _SECOND
+    return word ^ (word >> np.uint64(31))
+
+
+def _word(key: Any, count: Any, channel: int) -> Any:
+    """64 random bits that are a function of the arguments; see ``_noise``."""
+    episode = _mixed(np.asarray(key).astype(np.uint64) + _STEP)
+    return _mixed(episode + np.asarray(count).astype(np.uint64) * _STEP + np.uint64(channel))
+
+
+def _fraction(word: Any) -> Any:
+    """A number from 0 to 1, without 1, of 64 bits."""
+    return (word >> np.uint64(11)) * _FRACTION
+
+
+def _chance(key: Any, count: Any, channel: int) -> Any:
+    """A number of the uniform distribution from 0 to 1; see ``_noise``."""
+    return _fraction(_mixed(_word(key, count, channel) + _STEP))
+
+
+def _noise(key: Any, count: Any, channel: int) -> Any:
+    """A number of the standard normal distribution, by the method of Box and Muller.
+
+    It is a function of its arguments, and so needs no generator.
+
+    Args:
+        key: A whole number below 2**53 for each episode.
+        count: A whole number, such as that of the step.
+        channel: The number of the sensor.
+    """
+    word = _word(key, count, channel)
+    first = _fraction(_mixed(word + _STEP)) + _FRACTION  # the logarithm of 0 is not finite
+    second = _fraction(_mixed(word + _STEP + _STEP))
+    return np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
+
+
 def _minimum(*values: Any) -> Any:
     return reduce(np.minimum, values)
 
@@ -83,6 +131,8 @@ OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "float64": _float64,
     "take": _take,
     "interp": np.interp,
+    "noise": _noise,
+    "chance": _chance,
 }
 """What the code of expressions calls for operators and for values that it looks up."""
 

@@ -3,17 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
-from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.naming import NOISE, Moment, Naming
 from fmugym.declared.quantities import duration
+from fmugym.declared.variables import number
 from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["History", "Seen", "histories", "normalized", "observed_values", "remember"]
+__all__ = [
+    "History",
+    "NoiseKey",
+    "Seen",
+    "has_errors",
+    "histories",
+    "normalized",
+    "observed_values",
+    "remember",
+]
+
+
+_CHANNELS_OF_FORECASTS: Final = 10_000
+
+
+@dataclass(frozen=True)
+class NoiseKey:
+    """The distribution of the keys of noise.
+
+    Args:
+        draws: Whether to draw a number. If not, the key follows from the state of the generator,
+            which stays as it is: noise then changes no other draw. That needs other draws, for the
+            generator to move on from episode to episode.
+    """
+
+    draws: bool
+
+    def sample(self, rng: np.random.Generator) -> float:
+        """Return a whole number below 2**52."""
+        if self.draws:
+            return float(rng.integers(2**52))
+        state = repr(rng.bit_generator.state["state"]).encode()
+        return float(int.from_bytes(blake2b(state, digest_size=8).digest(), "little") >> 12)
 
 
 class Seen(NamedTuple):
@@ -65,19 +100,32 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
         ConfigError: If a name has no value before the step.
     """
     entry = declared.root.child("agent").child("history")
-    kept = []
-    for name in declared.remembered:
-        if name in declared.series:
-            continue
-        present, codes = naming.code_of(name, Moment.SEEN), naming.kept(name)
-        if present is None or codes is None:
-            raise entry.error(
-                f"there is no history of {name!r}: it is kept for variables of the FMU, actions, "
-                "data and schedules"
-            )
-        length = _count(entry.required("length"), time_step)
-        kept.append(History(name, f"history of {name}", length, *codes, present.text))
-    return kept
+    length = _count(entry.required("length"), time_step) if declared.remembered else 0
+    lengths = dict.fromkeys(declared.remembered, length)
+    for _, name in declared.observed:
+        delay = _delay(declared, name, time_step)
+        if delay or name in lengths:
+            lengths[name] = lengths.get(name, 0) + delay
+    of_variables = {name: n for name, n in lengths.items() if name not in declared.series}
+    return [_history(entry, naming, name, count) for name, count in of_variables.items()]
+
+
+def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
+    present, codes = naming.code_of(name, Moment.SEEN), naming.kept(name)
+    if present is None or codes is None:
+        raise entry.error(
+            f"there is no history of {name!r}: it is kept for variables of the FMU, actions, "
+            "data and schedules"
+        )
+    return History(name, f"history of {name}", length, *codes, present.text)
+
+
+def _delay(declared: Declarations, name: str, time_step: float) -> int:
+    """By how many steps the agent observes a name late."""
+    record = declared.records.get(name) if declared.is_output(name) else None
+    if record is None or not record.delay:
+        return 0
+    return _count(record.entry.child("delay"), time_step)
 
 
 def observed_values(
@@ -88,20 +136,67 @@ def observed_values(
     Raises:
         ConfigError: If one is a constant, or there is no forecast or history of it.
     """
-    present = list(_present(declared, naming))
+    _check_sensors(declared)
+    past = _Past(declared, naming, kept, time_step)
     return [
-        *present,
+        *_present(declared, past),
         *_forecasts(declared, naming, time_step),
-        *_past(declared, naming, kept, time_step),
+        *_remembered(declared, past, time_step),
     ]
 
 
-def _present(declared: Declarations, naming: Naming) -> Iterator[Seen]:
+def _check_sensors(declared: Declarations) -> None:
+    """Refuse a sensor of what the agent does not observe: it would do nothing."""
+    seen = {name for _, name in declared.observed} | set(declared.remembered)
+    for record in declared.records.declared():
+        if record.is_measured and record.alias not in seen:
+            raise record.entry.error(
+                f"'noise', 'quantum' and 'delay' are for what the agent observes, and "
+                f"{record.alias!r} is not in its observations"
+            )
+
+
+class _Past:
+    """Gives values now and some steps ago, as the agent measures them."""
+
+    def __init__(
+        self, declared: Declarations, naming: Naming, kept: list[History], time_step: float
+    ) -> None:
+        self._declared, self._naming, self._time_step = declared, naming, time_step
+        self._histories = {history.name: history for history in kept}
+
+    def measured(self, entry: Entry, name: str, ago: int) -> str:
+        """Code for what the agent measured some steps ago."""
+        delay = _delay(self._declared, name, self._time_step)
+        code = self._true(entry, name, ago + delay)
+        record = self._declared.records.get(name) if self._declared.is_output(name) else None
+        if record is None:
+            return code
+        if record.noise:
+            channel = self._naming.outputs.index(name)
+            count = f"(env.step_count - {ago})"
+            noise = f"noise(env.variables[{NOISE!r}], {count}, {channel})"
+            code = f"({code} + {record.noise!r} * {noise})"
+        if record.quantum:
+            code = f"({record.quantum!r} * fn_round(({code} / {record.quantum!r})))"
+        return code
+
+    def _true(self, entry: Entry, name: str, ago: int) -> str:
+        if ago == 0:
+            code = self._naming.code_of(name, Moment.SEEN)
+            if code is None or code.value is not None:
+                raise entry.error(f"{name!r} is a constant, which an agent need not observe")
+            return code.number.text
+        if name in self._histories:
+            history = self._histories[name]
+            past = f"env.variables[{history.variable!r}][{ago - 1}]"
+            return f"where(env.step_count == 0, {history.first}, {past})"
+        return self._naming.forecast(entry, name, -ago * self._time_step)
+
+
+def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
     for entry, name in declared.observed:
-        code = naming.code_of(name, Moment.SEEN)
-        if code is None or code.value is not None:
-            raise entry.error(f"{name!r} is a constant, which an agent need not observe")
-        yield Seen(entry, name, code.number.text, *declared.limits_of(name))
+        yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
 
 
 def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
@@ -109,33 +204,49 @@ def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iter
     if section.value is None:
         return
     for entry in [section] if isinstance(section.value, Mapping) else section.elements():
-        table = entry.table(("of", "horizon", "step"))
+        table = entry.table(("of", "horizon", "step", "error"))
         step = table["step"].check(duration) if "step" in table else time_step
         count = _count(entry.required("horizon"), step)
-        names = entry.required("of")
-        for one in [names] if isinstance(names.value, str) else names.elements():
+        error = number(table["error"]) if "error" in table else 0.0
+        for channel, one in enumerate(_named(entry), _CHANNELS_OF_FORECASTS):
             name = one.text()
             for index in range(1, count + 1):
-                code = naming.forecast(one, name, index * step)
-                place = f"[+{index * step:g} s]"
-                yield Seen(one, name, code, *declared.limits_of(name), place)
+                ahead = index * step
+                code = naming.forecast(one, name, ahead)
+                if error:
+                    size = error * np.sqrt(index / count)
+                    code = _with_error(code, float(size), round(ahead / time_step), channel)
+                yield Seen(one, name, code, *declared.limits_of(name), f"[+{ahead:g} s]")
 
 
-def _past(
-    declared: Declarations, naming: Naming, kept: list[History], time_step: float
-) -> Iterator[Seen]:
+def _named(entry: Entry) -> list[Entry]:
+    names = entry.required("of")
+    return [names] if isinstance(names.value, str) else names.elements()
+
+
+def _with_error(code: str, size: float, ahead: int, channel: int) -> str:
+    """Code for a forecast with an error that belongs to the time that it is made for.
+
+    Forecasts of one time err in the same direction, and less and less as the time comes near.
+    """
+    count = f"(env.step_count + {ahead})"
+    return f"({code} + {size!r} * noise(env.variables[{NOISE!r}], {count}, {channel}))"
+
+
+def has_errors(declared: Declarations) -> bool:
+    """Whether a forecast has errors."""
+    value = declared.root.child("agent").child("forecast").value
+    parts = [value] if isinstance(value, Mapping) else value or []
+    return any(isinstance(part, Mapping) and bool(part.get("error")) for part in parts)
+
+
+def _remembered(declared: Declarations, past: _Past, time_step: float) -> Iterator[Seen]:
     entry = declared.root.child("agent").child("history")
-    of_variables = {history.name: history for history in kept}
     for name in declared.remembered:
         limits = declared.limits_of(name)
-        for index in range(_count(entry.required("length"), time_step)):
-            if name in of_variables:
-                history = of_variables[name]
-                past = f"env.variables[{history.variable!r}][{index}]"
-                code = f"where(env.step_count == 0, {history.first}, {past})"
-            else:
-                code = naming.forecast(entry, name, -(index + 1) * time_step)
-            yield Seen(entry, name, code, *limits, f"[-{(index + 1) * time_step:g} s]")
+        for ago in range(1, 1 + _count(entry.required("length"), time_step)):
+            code = past.measured(entry, name, ago)
+            yield Seen(entry, name, code, *limits, f"[-{ago * time_step:g} s]")
 
 
 def _count(entry: Entry, step: float) -> int:

@@ -15,8 +15,15 @@ from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
-from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
-from fmugym.declared.observing import histories, normalized, observed_values, remember
+from fmugym.declared.naming import CLOCK, NOISE, Moment, Naming, switch_names
+from fmugym.declared.observing import (
+    NoiseKey,
+    has_errors,
+    histories,
+    normalized,
+    observed_values,
+    remember,
+)
 from fmugym.declared.quantities import duration
 from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
@@ -110,7 +117,18 @@ class Plan:
             state, since = switch_names(record)
             switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
-        return remembered | self._clock() | histories | switches | worst
+        variables = remembered | self._clock() | histories | switches | worst
+        return variables | self._noise(variables)
+
+    def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
+        """The key of noise, which is drawn last."""
+        records = [self._declared.records[name] for name in self._naming.outputs]
+        is_noisy = any(record.noise for record in records) or has_errors(self._declared)
+        if not is_noisy and not self._declared.steps:
+            return {}
+        parameters = [value for _, value in self._declared.parameters.values()]
+        draws = any(map(is_distribution, [*parameters, *variables.values()]))
+        return {NOISE: NoiseKey(draws=not draws)}
 
     def _clock(self) -> dict[str, Any]:
         """When episodes begin, if the task has a clock of its own."""

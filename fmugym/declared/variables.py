@@ -31,12 +31,14 @@ __all__ = [
 
 VARIABLE_KEYS: Final = (
     *("name", "unit", "min", "max", "levels", "delta", "rate", "min_on", "min_off", "sample"),
-    "description",
+    *("noise", "quantum", "delay", "description"),
 )
 """The keys of a variable."""
 
 
 _OF_ACTUATOR: Final = ("delta", "rate", "min_on", "min_off")
+_OF_SENSOR: Final = ("noise", "quantum", "delay")
+_DURATIONS: Final = ("min_on", "min_off", "delay")
 
 
 def number(entry: Entry) -> float:
@@ -67,6 +69,9 @@ class Record:
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
             value itself.
         rate: The largest change in a second; infinite for no limit.
+        noise: The standard deviation of what the agent observes.
+        quantum: The agent observes multiples of it; 0 for the value itself.
+        delay: By how many seconds the agent observes it late.
         min_on, min_off: How many seconds an action stays other than 0, and stays 0, at least.
     """
 
@@ -83,6 +88,14 @@ class Record:
     rate: float = math.inf
     min_on: float = 0.0
     min_off: float = 0.0
+    noise: float = 0.0
+    quantum: float = 0.0
+    delay: float = 0.0
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the agent observes another value than the true one."""
+        return bool(self.noise or self.quantum or self.delay)
 
     @property
     def is_direct(self) -> bool:
@@ -127,6 +140,10 @@ class Records:
         section = root.child("variables")
         declared = {} if section.value is None else section.items()
         self._records = {alias: self._declared(entry) for alias, entry in declared.items()}
+
+    def declared(self) -> list[Record]:
+        """The variables that the task declares or has used."""
+        return list(self._records.values())
 
     def names(self) -> list[str]:
         """The aliases, and the names of the FMU's variables."""
@@ -186,8 +203,11 @@ class Records:
         Raises:
             ConfigError: If it cannot.
         """
-        if record.sample != "last":
-            raise record.entry.error("'sample' is for variables that are read from the FMU")
+        if record.sample != "last" or record.is_measured:
+            raise record.entry.error(
+                "'sample', 'noise', 'quantum' and 'delay' are for variables that are read from the "
+                "FMU"
+            )
         if record.variable is not None:
             with entry.placing():
                 input_variable(self._description, record.fmu_name)
@@ -221,7 +241,7 @@ class Records:
             conversion = conversion_between(own, wanted, self._description.units)
         limited = None if sample == "integral" else variable
         low, high = _limits(entry, limited, conversion)
-        levels, limits = _levels(entry), _limits_of_actuator(entry)
+        levels, limits = _levels(entry), _of_device(entry)
         return Record(
             alias, entry, variable, wanted, conversion, low, high, levels, sample, **limits
         )
@@ -249,14 +269,14 @@ def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[floa
     return low, high
 
 
-def _limits_of_actuator(entry: Entry) -> dict[str, float]:
-    """How fast an action may change."""
-    given = {key: entry.child(key) for key in _OF_ACTUATOR}
+def _of_device(entry: Entry) -> dict[str, float]:
+    """How fast an action may change, and how well a variable is measured."""
+    given = {key: entry.child(key) for key in _OF_ACTUATOR + _OF_SENSOR}
     limits: dict[str, float] = {}
     for key, one in given.items():
         if one.value is None:
             continue
-        limits[key] = one.check(duration) if key in ("min_on", "min_off") else number(one)
+        limits[key] = one.check(duration) if key in _DURATIONS else number(one)
         if not limits[key] > 0:
             raise one.error(f"{key} must be positive, got {limits[key]:g}")
     if "delta" in limits and "levels" in (entry.value or {}):
@@ -298,7 +318,8 @@ def inverted(conversion: Conversion, text: str) -> str:
 
 def is_plain(record: Record) -> bool:
     """Whether the values of the task are those of the FMU."""
-    return record.conversion == IDENTITY and not record.levels and record.is_direct
+    is_same = record.conversion == IDENTITY and not record.levels
+    return is_same and record.is_direct and not record.is_measured
 
 
 def number_or_distribution(entry: Entry) -> Any:

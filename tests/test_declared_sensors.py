@@ -1,0 +1,231 @@
+"""Noise, quantization and delay of what agents observe in declared tasks."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import FMUVectorEnv
+from fmugym.errors import TaskError
+
+DT = 0.05
+DRAWN = {"q_0": {"distribution": "uniform", "low": -1, "high": 1}}
+
+
+def task(parameters=DRAWN, history=None, **sensor):
+    agent = {"actions": ["tau"], "observations": ["angle", "q_dot"]}
+    return {
+        "fmu": {"bundled": "Pendulum"},
+        "time_step": DT,
+        "episode_length": "1s",
+        "variables": {"angle": {"name": "q", "unit": "deg"} | sensor},
+        "parameters": parameters,
+        "agent": agent if history is None else agent | {"history": history},
+        "reward": "angle",
+    }
+
+
+def episode(env, seed=None, steps=20):
+    """The observed and the true angles in degrees."""
+    seen, info = env.reset(seed=seed)
+    observed, true = [seen[0]], [np.rad2deg(env.state[0])]
+    for _ in range(steps):
+        seen, reward, *_ = env.step([0.01])
+        assert reward == pytest.approx(np.rad2deg(env.state[0]), rel=1e-12)
+        observed.append(seen[0])
+        true.append(reward)
+    return np.array(observed, np.float64), np.array(true), info
+
+
+def test_noise_is_normal_and_differs_in_steps_and_episodes():
+    env = fmugym.load(task(noise=3.0))
+    differences = []
+    for index in range(60):
+        observed, true, _ = episode(env, seed=1 if index == 0 else None)
+        differences.append(observed - true)
+    env.close()
+    noise = np.array(differences) / 3.0
+    assert noise.shape == (60, 21)
+    assert abs(noise.mean()) < 4 / np.sqrt(noise.size)
+    assert noise.std() == pytest.approx(1.0, abs=0.08)
+    assert np.mean(np.abs(noise) < 1) == pytest.approx(0.683, abs=0.05)
+    for first, second in ((noise[:, 1:], noise[:, :-1]), (noise[1:], noise[:-1])):
+        assert abs(np.mean(first * second)) < 0.12
+
+
+def test_noise_changes_no_draw():
+    noisy, calm = fmugym.load(task(noise=3.0)), fmugym.load(task())
+    for seed in (5, None, None):
+        drawn = noisy.reset(seed=seed)[1]["drawn"]
+        assert drawn.pop("noise key") >= 0
+        assert drawn == calm.reset(seed=seed)[1]["drawn"]
+    noisy.close()
+    calm.close()
+
+
+def test_noise_without_other_draws_differs_from_episode_to_episode():
+    env = fmugym.load(task(parameters={}, noise=1.0))
+    first, again, same = episode(env, 1)[0], episode(env)[0], episode(env, 1)[0]
+    assert not np.any(first == again)
+    np.testing.assert_array_equal(first, same)
+    env.close()
+
+
+def test_values_are_multiples_of_the_quantum():
+    env = fmugym.load(task(quantum=5.0))
+    observed, true, _ = episode(env, 0)
+    np.testing.assert_allclose(observed, 5.0 * np.round(true / 5.0), rtol=1e-6)
+    env.close()
+
+
+def test_values_come_late():
+    env = fmugym.load(task(delay="0.15s"))
+    observed, true, _ = episode(env, 0)
+    np.testing.assert_allclose(observed, [true[0]] * 3 + list(true[:-3]), rtol=1e-6)
+    env.close()
+
+
+def test_a_history_holds_what_was_measured():
+    history = {"of": "angle", "length": "0.1s"}
+    env = fmugym.load(task(noise=2.0, delay="0.1s", quantum=0.5, history=history))
+    seen = [env.reset(seed=3)[0]]
+    seen += [env.step([0.01])[0] for _ in range(10)]
+    for now, before, earlier in zip(seen[2:], seen[1:], seen, strict=False):
+        assert now[2:].tolist() == [before[0], earlier[0]]
+    env.close()
+
+
+SENSORS = {
+    "noise": {"noise": 2.0},
+    "all": {"noise": 2.0, "quantum": 0.1, "delay": "0.1s"},
+}
+
+
+@pytest.mark.parametrize("parameters", [DRAWN, {}], ids=["drawn", "constant"])
+@pytest.mark.parametrize("sensors", SENSORS)
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_many_environments_equal_single_ones(parameters, sensors, hooks, mode):
+    history = {"of": ["angle", "tau"], "length": "0.1s"}
+    make = partial(fmugym.load, task(parameters, history, **SENSORS[sensors]))
+    envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
+    if hooks == "compiled":
+        assert envs._engine._task.left == {}
+    observations, infos = envs.reset(seed=2)
+    for i in range(3):
+        singles.append(make())
+        seen, info = singles[i].reset(seed=2 + i)
+        np.testing.assert_array_equal(seen, observations[i])
+        assert info["drawn"]["noise key"] == infos["drawn"]["noise key"][i]
+    assert len(set(infos["drawn"]["noise key"])) == 3
+    envs.action_space.seed(1)
+    ended = False
+    for _ in range(50):
+        actions = envs.action_space.sample()
+        observations, *_ = envs.step(actions)
+        results = []
+        for i, env in enumerate(singles):
+            if ended and mode == "next_step":
+                results.append((env.reset()[0], False))
+                continue
+            seen, _, _, cut, _ = env.step(actions[i])
+            results.append((env.reset()[0] if cut and mode == "same_step" else seen, cut))
+        np.testing.assert_array_equal(observations, [seen for seen, _ in results])
+        ended = results[0][1]
+    for env in (envs, *singles):
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("variables", "fact"),
+    [
+        ({"angle": {"name": "q", "delay": "0.07s"}}, r"0\.07 s.*0\.05"),
+        ({"angle": {"name": "q", "noise": 0}}, "positive"),
+        ({"angle": {"name": "q"}, "tau": {"noise": 1}}, "read from the FMU"),
+        ({"angle": {"name": "q"}, "theta": {"noise": 1}}, "'theta' is not in its observations"),
+    ],
+)
+def test_mistakes_are_placed(variables, fact):
+    with pytest.raises(TaskError, match=rf"^variables\..*{fact}"):
+        fmugym.load(task() | {"variables": variables})
+
+
+RANDOM = task() | {
+    "setpoints": {"goal": {"steps": {"low": -2, "high": 3, "every": "0.2s"}}},
+    "data": {"load": {"values": [0, 10, 5], "step": "0.5s"}},
+    "agent": {
+        "actions": ["tau"],
+        "observations": ["angle", "goal"],
+        "forecast": [
+            {"of": "load", "horizon": "0.4s", "step": "0.1s", "error": 2.0},
+            {"of": "goal", "horizon": "0.2s", "step": "0.2s"},
+        ],
+    },
+    "reward": "goal",
+}
+
+
+def test_random_steps_hold_and_are_foreseen():
+    env = fmugym.load(RANDOM)
+    values, last_foreseen = [], None
+    for seed in range(20):
+        observation = env.reset(seed=seed)[0]
+        for step in range(20):
+            goal, foreseen = observation[1], observation[-1]
+            observation, reward, *_ = env.step([0.0])
+            assert np.float32(reward) == goal
+            if step % 4 != 3:
+                assert observation[1] == goal
+            else:
+                assert observation[1] == last_foreseen != goal
+            if step % 4 == 0:
+                last_foreseen = foreseen
+                values.append(goal)
+    env.close()
+    assert -2 <= min(values) < -1.5
+    assert 2.5 < max(values) < 3
+    assert np.mean(values) == pytest.approx(0.5, abs=0.5)
+
+
+def test_errors_of_forecasts_belong_to_times_and_fall():
+    env = fmugym.load(RANDOM)
+    errors = []
+    for seed in range(40):
+        rows = [env.reset(seed=seed)[0]]
+        rows += [env.step([0.0])[0] for _ in range(12)]
+        times = DT * np.arange(13)[:, None] + 0.1 * np.arange(1, 5)
+        true = np.interp(times % 1.5, [0, 0.5, 1, 1.5], [0, 10, 5, 0])
+        errors.append(np.array(rows)[:, 2:6] - true)
+    env.close()
+    spread = np.std(errors, axis=(0, 1))
+    np.testing.assert_allclose(spread, 2.0 * np.sqrt([0.25, 0.5, 0.75, 1.0]), rtol=0.15)
+    later, sooner = np.array(errors)[:, :-2, 1], np.array(errors)[:, 2:, 0]  # of the same time
+    np.testing.assert_allclose(later / np.sqrt(2), sooner, atol=1e-5)
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_random_steps_of_many_environments(hooks):
+    make = partial(fmugym.load, RANDOM)
+    envs, singles = FMUVectorEnv(make, 2, hooks=hooks), [make(), make()]
+    observations, _ = envs.reset(seed=9)
+    expected = [env.reset(seed=9 + i)[0] for i, env in enumerate(singles)]
+    np.testing.assert_array_equal(observations, expected)
+    for _ in range(19):
+        observations, rewards, *_ = envs.step(np.zeros((2, 1), np.float32))
+        results = [env.step([0.0]) for env in singles]
+        np.testing.assert_array_equal(observations, [result[0] for result in results])
+        np.testing.assert_array_equal(rewards, [result[1] for result in results])
+    for env in (envs, *singles):
+        env.close()
+
+
+def test_an_argument_that_does_not_exist():
+    with pytest.raises(TypeError, match="'render_mode'"):
+        fmugym.load(RANDOM, render_mod="human")
+
+
+def test_steps_between_two_steps():
+    setpoints = {"goal": {"steps": {"low": 0, "high": 1, "every": "0.07s"}}}
+    with pytest.raises(TaskError, match=r"^setpoints\.goal: .*0\.07 s"):
+        fmugym.load(RANDOM | {"setpoints": setpoints})
