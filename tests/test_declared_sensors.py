@@ -149,3 +149,83 @@ def test_many_environments_equal_single_ones(parameters, sensors, hooks, mode):
 def test_mistakes_are_placed(variables, fact):
     with pytest.raises(TaskError, match=rf"^variables\..*{fact}"):
         fmugym.load(task() | {"variables": variables})
+
+
+RANDOM = task() | {
+    "setpoints": {"goal": {"steps": {"low": -2, "high": 3, "every": "0.2s"}}},
+    "data": {"load": {"values": [0, 10, 5], "step": "0.5s"}},
+    "agent": {
+        "actions": ["tau"],
+        "observations": ["angle", "goal"],
+        "forecast": [
+            {"of": "load", "horizon": "0.4s", "step": "0.1s", "error": 2.0},
+            {"of": "goal", "horizon": "0.2s", "step": "0.2s"},
+        ],
+    },
+    "reward": "goal",
+}
+
+
+def test_random_steps_hold_and_are_foreseen():
+    env = fmugym.load(RANDOM)
+    values, last_foreseen = [], None
+    for seed in range(20):
+        observation = env.reset(seed=seed)[0]
+        for step in range(20):
+            goal, foreseen = observation[1], observation[-1]
+            observation, reward, *_ = env.step([0.0])
+            assert np.float32(reward) == goal
+            if step % 4 != 3:
+                assert observation[1] == goal
+            else:
+                assert observation[1] == last_foreseen != goal
+            if step % 4 == 0:
+                last_foreseen = foreseen
+                values.append(goal)
+    env.close()
+    assert -2 <= min(values) < -1.5
+    assert 2.5 < max(values) < 3
+    assert np.mean(values) == pytest.approx(0.5, abs=0.5)
+
+
+def test_errors_of_forecasts_belong_to_times_and_fall():
+    env = fmugym.load(RANDOM)
+    errors = []
+    for seed in range(40):
+        rows = [env.reset(seed=seed)[0]]
+        rows += [env.step([0.0])[0] for _ in range(12)]
+        times = DT * np.arange(13)[:, None] + 0.1 * np.arange(1, 5)
+        true = np.interp(times % 1.5, [0, 0.5, 1, 1.5], [0, 10, 5, 0])
+        errors.append(np.array(rows)[:, 2:6] - true)
+    env.close()
+    spread = np.std(errors, axis=(0, 1))
+    np.testing.assert_allclose(spread, 2.0 * np.sqrt([0.25, 0.5, 0.75, 1.0]), rtol=0.15)
+    later, sooner = np.array(errors)[:, :-2, 1], np.array(errors)[:, 2:, 0]  # of the same time
+    np.testing.assert_allclose(later / np.sqrt(2), sooner, atol=1e-5)
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_random_steps_of_many_environments(hooks):
+    make = partial(fmugym.load, RANDOM)
+    envs, singles = FMUVectorEnv(make, 2, hooks=hooks), [make(), make()]
+    observations, _ = envs.reset(seed=9)
+    expected = [env.reset(seed=9 + i)[0] for i, env in enumerate(singles)]
+    np.testing.assert_array_equal(observations, expected)
+    for _ in range(19):
+        observations, rewards, *_ = envs.step(np.zeros((2, 1), np.float32))
+        results = [env.step([0.0]) for env in singles]
+        np.testing.assert_array_equal(observations, [result[0] for result in results])
+        np.testing.assert_array_equal(rewards, [result[1] for result in results])
+    for env in (envs, *singles):
+        env.close()
+
+
+def test_an_argument_that_does_not_exist():
+    with pytest.raises(TypeError, match="'render_mode'"):
+        fmugym.load(RANDOM, render_mod="human")
+
+
+def test_steps_between_two_steps():
+    setpoints = {"goal": {"steps": {"low": 0, "high": 1, "every": "0.07s"}}}
+    with pytest.raises(TaskError, match=r"^setpoints\.goal: .*0\.07 s"):
+        fmugym.load(RANDOM | {"setpoints": setpoints})

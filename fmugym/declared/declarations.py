@@ -85,6 +85,23 @@ class Derived:
     limits: Limits
 
 
+@dataclass(frozen=True)
+class Steps:
+    """A set point that jumps to a new random value now and then.
+
+    Attributes:
+        entry: Where it stands.
+        limits: The values lie between these.
+        every: Seconds from one value to the next.
+        channel: Its number, from which its values follow.
+    """
+
+    entry: Entry
+    limits: Limits
+    every: float
+    channel: int
+
+
 @dataclass
 class Declarations:
     """What a task declares.
@@ -96,6 +113,7 @@ class Declarations:
             the unit of the FMU.
         memory, derived: What the task remembers and names, by name.
         series: Data and schedules by name.
+        steps: Set points that jump, by name.
         actions: The variables that the agent writes.
         inputs: Inputs that expressions write, by alias.
         observed: The names that the agent sees, and where they stand.
@@ -109,6 +127,7 @@ class Declarations:
     memory: dict[str, Memory] = field(init=False)
     derived: dict[str, Derived] = field(init=False)
     series: dict[str, Series] = field(init=False)
+    steps: dict[str, Steps] = field(init=False)
     actions: list[Record] = field(init=False)
     inputs: dict[str, tuple[Record, Expression]] = field(init=False)
     observed: list[tuple[Entry, str]] = field(init=False)
@@ -128,6 +147,7 @@ class Declarations:
         declared.memory = {e.name: _memory(e) for e in _section(root, "memory")}
         declared.derived = {e.name: _derived(e) for e in _section(root, "expressions")}
         declared.series = {e.name: read_data(e) for e in _section(root, "data")}
+        declared.steps = {}
         for entry in _section(root, "setpoints"):
             declared._add_setpoint(entry)
         declared.parameters = dict(declared._read_parameters())
@@ -144,7 +164,7 @@ class Declarations:
     @property
     def own_names(self) -> list[str]:
         """The names that are not those of variables."""
-        return [*self.memory, *self.derived, *self.series]
+        return [*self.memory, *self.derived, *self.series, *self.steps]
 
     @property
     def has_reward_terms(self) -> bool:
@@ -195,6 +215,8 @@ class Declarations:
         """The limits of something that the agent observes."""
         if name in self.series:
             return self.series[name].low, self.series[name].high
+        if name in self.steps:
+            return self.steps[name].limits
         if name in self.memory:
             return self.memory[name].limits
         if name in self.derived:
@@ -230,6 +252,8 @@ class Declarations:
             self.memory[entry.name] = Memory(entry, start, None, _limits_of(entry))
         elif kinds[0] == "schedule":
             self.series[entry.name] = read_schedule(entry.child("schedule"))
+        elif kinds[0] == "steps":
+            self.steps[entry.name] = _steps(entry, len(self.steps))
         else:
             self._add_curve(entry, kinds[0])
 
@@ -307,7 +331,7 @@ class Declarations:
             yield entry, name
 
 
-SETPOINTS: Final = ("value", "schedule", "ramp", "sine")
+SETPOINTS: Final = ("value", "schedule", "steps", "ramp", "sine")
 """The kinds of set points."""
 
 _CURVES: Final[Mapping[str, tuple[str, dict[str, float | None]]]] = {
@@ -323,6 +347,19 @@ _CURVES: Final[Mapping[str, tuple[str, dict[str, float | None]]]] = {
 """Formulas of set points that follow a curve, and the defaults of their numbers."""
 
 _TIMES_OF_CURVES: Final = ("begin", "duration", "period")
+
+
+_CHANNELS_OF_STEPS: Final = 20_000
+
+
+def _steps(entry: Entry, number_of_steps: int) -> Steps:
+    table = entry.child("steps")
+    table.table(("low", "high", "every"))
+    limits = number(table.required("low")), number(table.required("high"))
+    every = table.required("every").check(duration)
+    if not limits[0] < limits[1]:
+        raise table.error(f"low must be below high, got {limits[0]:g} and {limits[1]:g}")
+    return Steps(entry, limits, every, _CHANNELS_OF_STEPS + number_of_steps)
 
 
 def _of_curve(entry: Entry) -> Any:

@@ -6,7 +6,7 @@ import logging
 from functools import lru_cache
 from pathlib import Path
 from types import MethodType
-from typing import Any
+from typing import Any, Final, Never
 
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.description import ModelDescription
@@ -15,9 +15,12 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.plan import Plan
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 
 __all__ = ["TaskEnv", "fmu_path"]
+
+
+_ARGUMENTS: Final = ("config", "log_level", "render_mode", "backend", "isolation", "scenario")
 
 
 class TaskEnv(FMUEnv):
@@ -51,7 +54,10 @@ class TaskEnv(FMUEnv):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
+        **unknown: Never,
     ) -> None:
+        for name in unknown:
+            raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
         self.task = Task.of(config)
         path = fmu_path(self.task)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy

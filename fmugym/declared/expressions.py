@@ -58,7 +58,9 @@ _NAMESPACE: Final[dict[str, Any]] = {
 """What the code of expressions may call."""
 
 
-_MAY_WARN: Final = re.compile(r"\b(inf\b|noise|divide|remainder|power|fn_(?!abs|min|max|clip))")
+_MAY_WARN: Final = re.compile(
+    r"\b(inf\b|noise|chance|divide|remainder|power|fn_(?!abs|min|max|clip))"
+)
 """Calls for which numpy may warn of what is not finite; it takes time to keep it quiet."""
 
 

@@ -83,6 +83,22 @@ def _mixed(word: Any) -> Any:
     return word ^ (word >> np.uint64(31))
 
 
+def _word(key: Any, count: Any, channel: int) -> Any:
+    """64 random bits that are a function of the arguments; see ``_noise``."""
+    episode = _mixed(np.asarray(key).astype(np.uint64) + _STEP)
+    return _mixed(episode + np.asarray(count).astype(np.uint64) * _STEP + np.uint64(channel))
+
+
+def _fraction(word: Any) -> Any:
+    """A number from 0 to 1, without 1, of 64 bits."""
+    return (word >> np.uint64(11)) * _FRACTION
+
+
+def _chance(key: Any, count: Any, channel: int) -> Any:
+    """A number of the uniform distribution from 0 to 1; see ``_noise``."""
+    return _fraction(_mixed(_word(key, count, channel) + _STEP))
+
+
 def _noise(key: Any, count: Any, channel: int) -> Any:
     """A number of the standard normal distribution, by the method of Box and Muller.
 
@@ -90,13 +106,12 @@ def _noise(key: Any, count: Any, channel: int) -> Any:
 
     Args:
         key: A whole number below 2**53 for each episode.
-        count: The number of the step.
+        count: A whole number, such as that of the step.
         channel: The number of the sensor.
     """
-    episode = _mixed(np.asarray(key).astype(np.uint64) + _STEP)
-    word = _mixed(episode + np.asarray(count).astype(np.uint64) * _STEP + np.uint64(channel))
-    first = ((_mixed(word + _STEP) >> np.uint64(11)) + np.uint64(1)) * _FRACTION
-    second = (_mixed(word + _STEP + _STEP) >> np.uint64(11)) * _FRACTION
+    word = _word(key, count, channel)
+    first = _fraction(_mixed(word + _STEP)) + _FRACTION  # the logarithm of 0 is not finite
+    second = _fraction(_mixed(word + _STEP + _STEP))
     return np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
 
 
@@ -117,6 +132,7 @@ OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "take": _take,
     "interp": np.interp,
     "noise": _noise,
+    "chance": _chance,
 }
 """What the code of expressions calls for operators and for values that it looks up."""
 

@@ -13,8 +13,9 @@ from fmugym.declared.declarations import BUILT_IN, Declarations
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Code, Expression, Names, code_of_number
 from fmugym.declared.variables import Record, converted
+from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["CLOCK", "Moment", "Naming", "switch_names"]
+__all__ = ["CLOCK", "NOISE", "Moment", "Naming", "switch_names"]
 
 
 class Moment(Enum):
@@ -27,6 +28,12 @@ class Moment(Enum):
     SEEN = "when the agent observes, between two steps"
     FORECAST = "at a later time, which only functions of time know"
 
+
+_OVER: Final = (Moment.AFTER, Moment.JUDGED, Moment.UPDATED)
+"""The moments in which a value that holds for a while is that of the step that has just ended."""
+
+NOISE: Final = "noise key"
+"""The episode variable from which the noise and the random steps of an episode follow."""
 
 CLOCK: Final = "clock"
 """The episode variable with the time of data at the beginning of an episode."""
@@ -119,6 +126,8 @@ class Naming:
             return self._code_of_memory(name, moment)
         if name in declared.series:
             return Code(self._code_of_series(name, moment))
+        if name in declared.steps:
+            return Code(self._code_of_steps(name, moment))
         if name in declared.derived:
             return self._code_of_derived(name, moment)
         record = declared.records.get(name)
@@ -154,13 +163,26 @@ class Naming:
         """The value now. One that holds for a while is, after a step, that of the step."""
         series, shift = self._declared.series[name], self._ahead
         if series.is_stepped:
-            is_over = moment in (Moment.AFTER, Moment.JUDGED, Moment.UPDATED)
-            shift += (_JUST - 1.0 if is_over else _JUST) * self._time_step
+            shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
         now, shift = self._clock(), shift - series.start
         place = f"remainder(({now} + {shift!r}), {series.period!r})"
         self.constants[f"times_{name}"] = series.times
         self.constants[f"values_{name}"] = series.values
         return f"interp({place}, times_{name}, values_{name})"
+
+    def _code_of_steps(self, name: str, moment: Moment) -> str:
+        """The random value now; after a step, that of the step."""
+        steps = self._declared.steps[name]
+        count = whole_number_of_steps(steps.every, self._time_step)
+        if not count:
+            raise steps.entry.error(
+                f"{steps.every:g} s is no multiple of the time step of {self._time_step:g} s"
+            )
+        shift = round(self._ahead / self._time_step) - (moment in _OVER)
+        place = f"fn_floor((fn_max((env.step_count + {float(shift)!r}), 0.0) / {float(count)!r}))"
+        chance = f"chance(env.variables[{NOISE!r}], {place}, {steps.channel})"
+        low, high = steps.limits
+        return f"({low!r} + {high - low!r} * {chance})"
 
     def _built_in(self, name: str, moment: Moment) -> Code | None:
         match name:

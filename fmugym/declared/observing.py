@@ -11,15 +11,16 @@ import numpy as np
 
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
-from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.naming import NOISE, Moment, Naming
 from fmugym.declared.quantities import duration
+from fmugym.declared.variables import number
 from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = [
-    "NOISE",
     "History",
     "NoiseKey",
     "Seen",
+    "has_errors",
     "histories",
     "normalized",
     "observed_values",
@@ -27,8 +28,7 @@ __all__ = [
 ]
 
 
-NOISE: Final = "noise key"
-"""The episode variable from which the noise of an episode follows."""
+_CHANNELS_OF_FORECASTS: Final = 10_000
 
 
 @dataclass(frozen=True)
@@ -204,16 +204,40 @@ def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iter
     if section.value is None:
         return
     for entry in [section] if isinstance(section.value, Mapping) else section.elements():
-        table = entry.table(("of", "horizon", "step"))
+        table = entry.table(("of", "horizon", "step", "error"))
         step = table["step"].check(duration) if "step" in table else time_step
         count = _count(entry.required("horizon"), step)
-        names = entry.required("of")
-        for one in [names] if isinstance(names.value, str) else names.elements():
+        error = number(table["error"]) if "error" in table else 0.0
+        for channel, one in enumerate(_named(entry), _CHANNELS_OF_FORECASTS):
             name = one.text()
             for index in range(1, count + 1):
-                code = naming.forecast(one, name, index * step)
-                place = f"[+{index * step:g} s]"
-                yield Seen(one, name, code, *declared.limits_of(name), place)
+                ahead = index * step
+                code = naming.forecast(one, name, ahead)
+                if error:
+                    size = error * np.sqrt(index / count)
+                    code = _with_error(code, float(size), round(ahead / time_step), channel)
+                yield Seen(one, name, code, *declared.limits_of(name), f"[+{ahead:g} s]")
+
+
+def _named(entry: Entry) -> list[Entry]:
+    names = entry.required("of")
+    return [names] if isinstance(names.value, str) else names.elements()
+
+
+def _with_error(code: str, size: float, ahead: int, channel: int) -> str:
+    """Code for a forecast with an error that belongs to the time that it is made for.
+
+    Forecasts of one time err in the same direction, and less and less as the time comes near.
+    """
+    count = f"(env.step_count + {ahead})"
+    return f"({code} + {size!r} * noise(env.variables[{NOISE!r}], {count}, {channel}))"
+
+
+def has_errors(declared: Declarations) -> bool:
+    """Whether a forecast has errors."""
+    value = declared.root.child("agent").child("forecast").value
+    parts = [value] if isinstance(value, Mapping) else value or []
+    return any(isinstance(part, Mapping) and bool(part.get("error")) for part in parts)
 
 
 def _remembered(declared: Declarations, past: _Past, time_step: float) -> Iterator[Seen]:

@@ -15,10 +15,10 @@ from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
-from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
+from fmugym.declared.naming import CLOCK, NOISE, Moment, Naming, switch_names
 from fmugym.declared.observing import (
-    NOISE,
     NoiseKey,
+    has_errors,
     histories,
     normalized,
     observed_values,
@@ -123,7 +123,8 @@ class Plan:
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
         """The key of noise, which is drawn last."""
         records = [self._declared.records[name] for name in self._naming.outputs]
-        if not any(record.noise for record in records):
+        is_noisy = any(record.noise for record in records) or has_errors(self._declared)
+        if not is_noisy and not self._declared.steps:
             return {}
         parameters = [value for _, value in self._declared.parameters.values()]
         draws = any(map(is_distribution, [*parameters, *variables.values()]))

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.distributions import is_distribution
+from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.tools.overview import plain
@@ -259,27 +259,25 @@ def _differ(first: _Episode, second: _Episode) -> bool:
 
 def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
     """Compare episodes with two values of each parameter that is drawn."""
-    rng = np.random.default_rng(0)
-    useless = []
     drawn = {n: v for n, v in env.config.model_parameters.items() if is_distribution(v)}
-    for name, distribution in drawn.items():
-        values = (
-            [distribution.sample(rng) for _ in range(2)] if hasattr(distribution, "sample") else []
-        )
-        options = [{"model_parameters": {name: value}} for value in values]
-        episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
-        if episodes and values[0] != values[1] and not _differ(*episodes):
-            useless.append(name)
+    useless = [name for name, value in drawn.items() if not _has_effect(env, name, value)]
     if useless:
-        names = ", ".join(useless)
         yield Finding(
             "warning",
             "parameters",
-            f"drawn without an effect: {names}",
+            f"drawn without an effect: {', '.join(useless)}",
             "look for another parameter that the model uses, or leave them out",
         )
     elif drawn:
         yield Finding("ok", "parameters", "each drawn parameter has an effect")
+
+
+def _has_effect(env: FMUEnv, name: str, distribution: Any) -> bool:
+    rng = np.random.default_rng(0)
+    values = [draw(distribution, rng) for _ in range(2)]
+    options = [{"model_parameters": {name: value}} for value in values]
+    episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
+    return values[0] == values[1] or _differ(*episodes)
 
 
 def _middle(space: Any) -> Any:
@@ -307,8 +305,13 @@ def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     if not isinstance(space, spaces.Box):
         return
     names = env.observation_names or tuple(f"element {i}" for i in range(seen.shape[1]))
-    low, high = space.low.reshape(-1), space.high.reshape(-1)
-    outside = ((seen < low) | (seen > high)).any(axis=0)
+    findings = [*_of_limits(space, names, seen), *_of_sizes(names, seen)]
+    fine = Finding("ok", "observations", "within their limits, and of similar sizes")
+    yield from findings or [fine]
+
+
+def _of_limits(space: spaces.Box, names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
+    outside = ((seen < space.low.reshape(-1)) | (seen > space.high.reshape(-1))).any(axis=0)
     if outside.any():
         listing = ", ".join(
             f"{names[i]} ({seen[:, i].min():.4g} to {seen[:, i].max():.4g})"
@@ -317,17 +320,18 @@ def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
         yield Finding(
             "warning", "observations", f"outside of their limits: {listing}", "widen min and max"
         )
-    scales = np.abs(seen).max(axis=0)
-    if scales.max() > _WIDE * max(1.0, scales.min()):
-        largest = names[int(scales.argmax())]
+
+
+def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
+    sizes = np.abs(seen).max(axis=0)
+    if sizes.max() > _WIDE * max(1.0, sizes.min()):
+        largest = names[int(sizes.argmax())]
         yield Finding(
             "warning",
             "observations",
-            f"of very different sizes: {largest} reaches {scales.max():.4g}",
+            f"of very different sizes: {largest} reaches {sizes.max():.4g}",
             "give min and max and normalize = true under [agent], or another unit",
         )
-    elif not outside.any():
-        yield Finding("ok", "observations", "within their limits, and of similar sizes")
 
 
 def _of_length(env: FMUEnv) -> Finding:
