@@ -21,6 +21,7 @@ _BUNDLED: dict[str, dict[str, Any]] = {
     "Pendulum": {"max_episode_steps": 200},
     "ModelicaCartPole": {"max_episode_steps": 200},
     "CloudPendulum": {"max_episode_steps": 500},
+    "House": {},  # its task says how long an episode is
 }
 """Specs of the environments of ``fmugym.envs``, by name."""
 

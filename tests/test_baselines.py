@@ -208,7 +208,8 @@ class TestFeedforward:
         assert controller.act(np.zeros(2)) == pytest.approx(0.3)
 
     def test_constant_and_random(self, house):
-        assert Constant([0.25]).bind(house).act(np.zeros(2)) == pytest.approx(0.25)
+        for action in ([0.25], [0.3], 0.3):
+            assert Constant(action).bind(house).act(np.zeros(2)) == pytest.approx(action)
         samples = [Random(seed).bind(house).act(np.zeros(2)).item() for seed in (1, 1, 2)]
         assert samples[0] == samples[1] != samples[2]
         for action in ([1, 2], [1.5], "full"):

@@ -1,14 +1,18 @@
-"""The bundled house against balances written in another form, scipy and closed forms."""
+"""The bundled house against other forms of its balances, its year, and its environment."""
 
 import csv
 import math
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from scipy.integrate import solve_ivp
 
 import fmugym
+from fmugym.baselines import PID, Hysteresis
+from fmugym.envs.house import HOUSE_TASK, HouseEnv
 
 VERSIONS = ["2.0", "3.0"]
 OUTPUTS = ["T_m", "T_w", "E", "T_air", "T_op", "P", "Q_hp", "Q_em", "COP"]
@@ -214,3 +218,97 @@ def test_beam_and_wall(year):
     low = year.Sun(height=0.5, on_south=math.sqrt(0.75))
     beam = (ground - diffuse) * math.sqrt(3)
     assert year.irradiance_on_south(low, 0.0) == pytest.approx(beam + 0.5 * diffuse + 0.1 * ground)
+
+
+class TestEnvironment:
+    def test_is_declared_in_at_most_forty_lines(self):
+        lines = HOUSE_TASK.read_text().splitlines()
+        assert len(lines) <= 40
+        assert max(map(len, lines)) <= 140
+
+    def test_keeps_the_contract_of_gymnasium(self):
+        env = gym.make("fmugym/House-v0")
+        check_env(env.unwrapped, skip_render_check=True)
+        env.close()
+
+    @pytest.mark.parametrize("scenario", [None, "frost", "spring"])
+    def test_observations_stay_in_their_space(self, scenario):
+        env = gym.make("fmugym/House-v0", scenario=scenario)
+        rng = np.random.default_rng(3)
+        observation, _ = env.reset(seed=3)
+        ended = False
+        while not ended:
+            assert env.observation_space.contains(observation)
+            action = np.array([rng.random() * (observation[0] < 22)], np.float32)
+            observation, _, terminated, ended, _ = env.step(action)
+            assert not terminated
+        env.close()
+
+    def test_the_reward_is_money(self):
+        """Electricity at the price of the hour, and 0.50 EUR for each hour and kelvin too cold."""
+        metered = {"extends": str(HOUSE_TASK), "costs": {"energy": "E"}}
+        with fmugym.load(metered, scenario="frost") as env:
+            place = env.observation_names.index
+            observation, _ = env.reset(seed=0)
+            total = bill = meter = 0.0
+            for number in range(200):
+                price, before = observation[place("price")], meter
+                load = np.array([1.0 if number > 100 else 0.0], np.float32)
+                observation, reward, _, _, info = env.step(load)
+                meter = info["costs"]["energy"]
+                hour = (number + 1) % 96 / 4  # in the step that ends then, 22:00 is still day
+                least = 21 if 6 < hour <= 22 else 19
+                cold = max(least - observation[place("T")], 0)
+                hot = max(observation[place("T")] - 24, 0)
+                total += reward
+                bill -= price * (meter - before) / 3.6e6 + 0.5 * (cold + hot) / 4
+            assert total == pytest.approx(bill, rel=1e-3)
+            assert total < -20
+
+    def test_training_leaves_the_scenarios_out(self):
+        with HouseEnv() as env:
+            days = set()
+            for seed in range(60):
+                env.reset(seed=seed)
+                days.add(round(env.variables["clock"] / 86400) if "clock" in env.variables else -1)
+        assert len(days) > 25
+
+    def test_many_houses_are_compiled_and_equal_single_ones(self):
+        envs = fmugym.FMUVectorEnv(HouseEnv, 3, hooks="compiled")
+        rng = np.random.default_rng(0)
+        actions = rng.random((40, 3, 1)).astype(np.float32)
+        together = [envs.reset(seed=5)[0], *(envs.step(row)[0] for row in actions)]
+        envs.close()
+        for index in range(3):
+            with HouseEnv() as env:
+                alone = [env.reset(seed=5 + index)[0]]
+                alone += [env.step(row[index])[0] for row in actions]
+            assert np.array_equal(np.array(together)[:, index], np.array(alone))
+
+    def test_a_better_controller_costs_less(self):
+        """On weeks that training leaves out: no heating, a thermostat, a PI controller."""
+        costs = {}
+        controllers = {
+            "none": PID("T", 0.0, kp=1.0),
+            "thermostat": Hysteresis("T", 21.0, band=0.3),
+            "PI": PID("T", 21.0, kp=0.5, ti=4 * 3600.0),
+        }
+        for scenario in ("autumn", "frost", "spring"):
+            with HouseEnv(scenario) as env:
+                for name, controller in controllers.items():
+                    costs[name] = cost_of_a_week(env, controller.bind(env))
+            assert costs["none"] > 1.5 * costs["thermostat"], scenario
+            assert costs["thermostat"] > 1.03 * costs["PI"], scenario
+
+    def test_an_unknown_scenario(self):
+        with pytest.raises(fmugym.ConfigError, match=r"'forst'.*'frost'"):
+            HouseEnv("forst")
+
+
+def cost_of_a_week(env, controller):
+    observation, info = env.reset(seed=0)
+    cost = 0.0
+    for _ in range(672):
+        observation, reward, _, _, info = env.step(controller.act(observation, info))
+        cost -= reward
+    return cost

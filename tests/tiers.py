@@ -9,6 +9,7 @@ SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
     "test_examples",
+    "test_examples_house",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",

@@ -31,9 +31,10 @@ class Constant(Controller):
     def _prepare(self) -> None:
         try:
             taken = self._as_actions(self._decide(np.empty((1, 0))))[0]
+            is_element = np.allclose(taken, self.action)  # but for its rounding to float32
         except (TypeError, ValueError):  # of another shape, or no numbers
-            taken = None
-        if not np.array_equal(taken, self.action):
+            is_element = False
+        if not is_element:
             raise ConfigError(f"the action {shown(self.action)} is not in {shown(self.space)}")
 
     def _decide(self, rows: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from fmugym.envs.cart_pole import CartPoleEnv
 from fmugym.envs.cloud_pendulum import CloudPendulumEnv
+from fmugym.envs.house import HouseEnv
 from fmugym.envs.modelica_cart_pole import (
     DymolaCSCartPoleEnv,
     JModelicaCSCartPoleEnv,
@@ -13,6 +14,7 @@ __all__ = [
     "CartPoleEnv",
     "CloudPendulumEnv",
     "DymolaCSCartPoleEnv",
+    "HouseEnv",
     "JModelicaCSCartPoleEnv",
     "ModelicaCartPoleEnv",
     "PendulumEnv",

@@ -1,0 +1,48 @@
+"""A house with a heat pump, declared in a task file."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from fmugym.declared import Task, TaskEnv
+
+__all__ = ["HOUSE_TASK", "HouseEnv"]
+
+HOUSE_TASK = Path(__file__).with_name("house.toml")
+"""The task file: copy it to change the house, the comfort or the prices."""
+
+
+class HouseEnv(TaskEnv):
+    """Heat a house cheaply while the price of electricity changes by the hour.
+
+    The plant is the bundled FMU of a house with an air-source heat pump and underfloor heating
+    (``resources/House/README.md``). The action is the part load of the heat pump, from 0 to 1;
+    below 0.2 it is off. An agent observes temperatures, set point, weather and price, and forecasts
+    of twelve hours. The reward of a step of 15 min is minus the cost of the electricity in EUR, and
+    minus 0.50 EUR for each hour and kelvin below the set point or above 24 degC. An episode is a
+    week of the heating season of a synthetic year.
+
+    Args:
+        scenario: "autumn", "frost" or "spring": two weeks that training leaves out. By default an
+            episode begins on a day that is drawn from the others.
+        log_level: As for ``TaskEnv``.
+        render_mode: As for ``TaskEnv``.
+        options: More arguments of ``TaskEnv``.
+
+    Raises:
+        ConfigError: If the scenario is unknown.
+    """
+
+    def __init__(
+        self,
+        scenario: str | None = None,
+        log_level: int = logging.WARNING,
+        *,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        task = Task.read(HOUSE_TASK)
+        task = task if scenario is None else task.in_scenario(scenario)
+        super().__init__(task, log_level, render_mode=render_mode, **options)
