@@ -20,7 +20,9 @@ from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 __all__ = ["TaskEnv", "fmu_path"]
 
 
-_ARGUMENTS: Final = ("config", "log_level", "render_mode", "backend", "isolation", "scenario")
+_ARGUMENTS: Final = (
+    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "scenario"),
+)
 
 
 class TaskEnv(FMUEnv):
@@ -35,6 +37,7 @@ class TaskEnv(FMUEnv):
         render_mode: As for ``FMUEnv``.
         backend: As for ``FMUEnv``.
         isolation: As for ``FMUEnv``.
+        hooks: As for ``FMUEnv``.
 
     Attributes:
         task: The task.
@@ -54,6 +57,7 @@ class TaskEnv(FMUEnv):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
+        hooks: str = "auto",
         **unknown: Never,
     ) -> None:
         for name in unknown:
@@ -75,6 +79,7 @@ class TaskEnv(FMUEnv):
                 render_mode=render_mode,
                 backend=backend,
                 isolation=isolation,
+                hooks=hooks,
             )
 
     @property

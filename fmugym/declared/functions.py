@@ -44,8 +44,9 @@ def _remainder(first: Any, second: Any) -> Any:
 
 def _where(condition: Any, first: Any, second: Any) -> Any:
     if isinstance(condition, bool | np.bool_):
-        return first if condition else second
-    return np.where(condition, first, second)
+        return np.float64(first if condition else second)  # the type that numpy.where gives
+    chosen = np.where(condition, first, second)
+    return chosen if chosen.ndim else chosen[()]  # a number if all are numbers
 
 
 def _clip(value: Any, low: Any, high: Any) -> Any:
