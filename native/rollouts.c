@@ -19,14 +19,14 @@ static size_t action_bytes(const Play *play) {
 static void begin_at_first_step(Position *p, const Task *task) {
     const size_t seen = task->call->turn->play->judgement.number_of_seen;
 
-    p->task = *task;
     p->call = *task->call;
     p->turn = *task->call->turn;
     memcpy(p->seen, p->turn.seen, seen * sizeof *p->seen);
     p->turn.seen = p->seen;
     p->call.turn = &p->turn;
-    p->task.call = &p->call;
-    p->task.operation = STEP; /* nothing starts an episode */
+    p->task = (Task){.pool = task->pool,
+                     .call = &p->call,
+                     .operation = STEP}; /* nothing starts an episode */
 }
 
 static void go_to_next_step(Position *p) {

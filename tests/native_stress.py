@@ -27,6 +27,7 @@ import numpy as np
 
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
+from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
@@ -140,7 +141,7 @@ class Subject:
         self.start = tuple(map(fmu.variable, start))
         self.values = np.ones((len(start), self.n))
         self.outputs = tuple(map(fmu.variable, outputs))
-        self.snapshot = None
+        self.snapshot = self.bundled = None
         self.reset()
 
     def mask(self):
@@ -212,6 +213,40 @@ class Subject:
         if self.snapshot is not None:
             self.pool.restore(self.snapshot, self.mask())
 
+    def bundle(self):
+        """Serialize the states of some, as far as the FMU can."""
+        indices = np.flatnonzero(self.mask())
+        with contextlib.suppress(ValueError):
+            data, ends, steps = self.pool.serialize_states(indices)
+            outputs = np.zeros((len(self.outputs), len(indices)))
+            self.bundled = Bundle(outputs, steps, data, ends)
+            counts["bundled"] += 1
+
+    def unbundle(self):
+        """Restore them in others."""
+        bundled = self.bundled  # another thread may replace it
+        if bundled is not None and len(bundled):
+            indices = self.rng.permutation(self.n)[: int(self.rng.integers(1, self.n + 1))]
+            sources = self.rng.integers(len(bundled), size=len(indices))
+            self.pool.deserialize_states(bundled, sources, indices)
+
+    def record(self):
+        self.pool.record_of(int(self.rng.integers(self.n)))
+
+    def write(self):
+        self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))
+
+    def roll_out(self):
+        horizon = int(self.rng.integers(1, 6))
+        shape = horizon, self.n
+        flags = np.empty(shape, np.bool_), np.empty(shape, np.bool_)
+        observations = np.empty((*shape, len(self.outputs)), np.float32)
+        actions = self.rng.integers(0, 2, shape)
+        with contextlib.suppress(ValueError):  # there may be nothing prepared
+            drawn = np.zeros((1, self.n))
+            self.pool.roll_out(actions, observations, np.empty(shape), *flags, drawn)
+            counts["rolled out"] += 1
+
     def forget(self):
         self.snapshot = None
 
@@ -250,6 +285,7 @@ ACTIONS = (
         "health",
     ),
     *("recycle", "costs", "close"),
+    *("bundle", "unbundle", "unbundle", "record", "write", "roll_out", "roll_out"),
 )
 
 

@@ -459,6 +459,15 @@ class TestForeign:
                 assert [other.step(a)[0].tolist() for a in ACTIONS] == expected
             env.close()
 
+    def test_without_a_spare_instance_nothing_is_tried(self, tmp_path, tried):
+        path = make_fmu(tmp_path, "quick")
+        with DemandingEnv(path, max_instances=1) as env:
+            env.reset(seed=0)
+            assert env.save_state().method is SaveMethod.REPLAY
+        with DemandingEnv(path, max_instances=2) as env:
+            env.reset(seed=0)
+            assert env.save_state().method is SaveMethod.STATE
+
     def test_of_pythonfmu(self, tmp_path, tried):
         builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
         path = builder.FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path)

@@ -117,17 +117,18 @@ class PoolOpening:
             "call_timeout": self.config.call_timeout,
             "reset_method": self.config.reset_method,
             "starts": self.plan.starts(),
-            "rehearse": self._may_rehearse(num_instances),
+            "rehearse": self.config.rehearsals and self._has_spare(num_instances),
+            "spare": self._has_spare(num_instances),
         }
         options = own | options
         if self.backend is not None:
             options["backend"] = self.backend
         return make_pool(self.fmu, self.spec, num_instances, self.log, **options)
 
-    def _may_rehearse(self, num_instances: int) -> bool:
-        """Whether there may be a spare instance."""
+    def _has_spare(self, num_instances: int) -> bool:
+        """Whether there may be one more instance."""
         most = self.config.max_instances
-        return self.config.rehearsals and (most is None or num_instances < most)
+        return most is None or num_instances < most
 
     def _check_max_instances(self, wanted: int) -> None:
         most = self.config.max_instances

@@ -62,6 +62,7 @@ def make_pool(
     workers: int | None = None,
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
     rehearse: bool = False,
+    spare: bool = True,
 ) -> Pool:
     """Make the fastest pool that gives correct values.
 
@@ -86,6 +87,7 @@ def make_pool(
         call_timeout: See ``ProcessPool``; calls in this process have no time limit.
         rehearse: Whether a spare instance plays episodes again now and then, to see whether they
             begin anew. It takes one more seat of a licence.
+        spare: Whether there may be one more instance, in a trial of saved states.
 
     Raises:
         ConfigError: If the backend, the isolation or the reset method is unknown.
@@ -117,7 +119,7 @@ def make_pool(
         if verdict.blind_start:
             log.warning(_BLIND, fmu.path.name)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
-            trust = _Trust.of(fmu, actual, starts, completed)
+            trust = _Trust.of(fmu, actual, starts, completed, spare=spare)
             pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
         pool.trust_states_if(trust.do_states_work)
         if rehearse and reset_method is None:
@@ -217,14 +219,17 @@ class _Trust:
     do_states_work: Callable[[], bool]
 
     @classmethod
-    def of(cls, fmu: FMU, spec: PoolSpec, starts: Starts | None, plan: _Plan) -> _Trust:
-        """Look up what earlier trials have shown."""
+    def of(
+        cls, fmu: FMU, spec: PoolSpec, starts: Starts | None, plan: _Plan, *, spare: bool
+    ) -> _Trust:
+        """Look up what earlier trials have shown; without a spare instance there is no other."""
         candidate, tried = Candidate.of(fmu), _tried(spec)
         if not offers_states(fmu.description, replace(spec, reset_method=plan.method)):
             return cls(spec, bool)
         known: bool | None = is_bundled(fmu.path)
         if not known:
             known = False if candidate.exempt else known_to_work(candidate, tried, starts)
+            known = False if known is None and not spare else known
         if known is not None:
             return cls(replace(spec, records=not known), partial(bool, known))
         ask = partial(do_states_work, candidate, tried, starts)
