@@ -28,6 +28,9 @@ __all__ = [
 ]
 
 
+_MOST_VALUES: Final = 2000
+"""A history or a forecast has at most so many values of a name."""
+
 _CHANNELS_OF_FORECASTS: Final = 10_000
 
 
@@ -254,6 +257,8 @@ def _count(entry: Entry, step: float) -> int:
     count = whole_number_of_steps(length, step) if step > 0 else 0
     if not count:
         raise entry.error(f"{length:g} s is no multiple of the step of {step:g} s")
+    if count > _MOST_VALUES:
+        raise entry.error(f"{length:g} s are {count} steps of {step:g} s, at most {_MOST_VALUES}")
     return count
 
 

@@ -118,6 +118,8 @@ def read_data(entry: Entry) -> Series:
     if ("file" in table) == ("values" in table):
         raise entry.error("give either 'file' and 'column', or 'values' and 'step'")
     times, values = _rows_of_list(entry) if "values" in table else _rows_of_file(entry)
+    if not len(times):
+        raise entry.error("expected at least one value")
     spacing = times[-1] - times[-2] if len(times) > 1 else _DAY
     given = table.get("period")
     period = times[-1] - times[0] + spacing if given is None else given.check(duration)

@@ -134,5 +134,8 @@ class PoolSpec:
 
 def whole_number_of_steps(duration: float, time_step: float) -> int | None:
     """The number of steps in a duration, or None if it is not a whole number."""
-    count = round(duration / time_step)
+    quotient = duration / time_step
+    if not math.isfinite(quotient):
+        return None
+    count = round(quotient)
     return count if math.isclose(count * time_step, duration, abs_tol=1e-9) else None
