@@ -25,7 +25,7 @@ from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode
 from fmugym.task.interface import output_variable
 from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
-from fmugym.task.saving import columns_of, place_columns
+from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
 from fmugym.task.waiting import Waiting
@@ -475,6 +475,7 @@ class FMUEnv(Constructed):
         if not self._was_reset:
             self._prepare_hooks()  # as in ``reset``
             self._prepare_player(pool)
+        require_saving(pool)
         self._keep_readings()
         self._ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)

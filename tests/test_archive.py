@@ -11,7 +11,7 @@ import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_fmu, write_fmu
 
 from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, bundled_fmu
-from fmugym.archive import safe_zip
+from fmugym.archive import safe_zip, temporary
 
 
 @pytest.fixture
@@ -31,6 +31,48 @@ def refused(path, match, **limits):
     with pytest.raises(FMULoadError, match=match) as caught:
         FMU(path, limits=ArchiveLimits(**limits)).extract()
     assert pathlib.Path(path).name in str(caught.value)
+
+
+class TestInterruptedRemoval:
+    """A signal may arrive at any moment; the fixture above finds what is left."""
+
+    def interrupt(self, monkeypatch, name):
+        """Let a function of the module raise in its first call."""
+        usual, calls = getattr(temporary, name), []
+
+        def raising(*arguments):
+            calls.append(1)
+            if len(calls) == 1:
+                raise KeyboardInterrupt
+            return usual(*arguments)
+
+        monkeypatch.setattr(temporary, name, raising)
+
+    def test_before_the_first_file_has_gone(self, fmu_path, monkeypatch):
+        fmu = FMU(fmu_path)
+        fmu.extract()
+        self.interrupt(monkeypatch, "_leave")
+        with pytest.raises(KeyboardInterrupt):
+            fmu.close()
+
+    def test_before_it_has_begun(self, fmu_path, monkeypatch, temp_root):
+        fmu = FMU(fmu_path)
+        with monkeypatch.context() as patched:
+            self.interrupt(patched, "_is_own")
+            fmu.extract()
+            with pytest.raises(KeyboardInterrupt):
+                fmu.close()
+        assert len(list(temp_root.iterdir())) == 1
+        fmu.close()
+
+    def test_at_the_end_of_the_interpreter(self, fmu_path, monkeypatch, temp_root):
+        fmu = FMU(fmu_path)
+        folder = fmu.extract()
+        monkeypatch.setattr(temporary, "_is_own", lambda owner: False)
+        del fmu
+        gc.collect()
+        assert folder.exists()
+        temporary.remove_rest()
 
 
 class TestGoodArchives:

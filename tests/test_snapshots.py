@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import foreign_tank
+import gymnasium
 import numpy as np
 import pytest
 from demanding_tools import DemandingEnv, make_fmu
@@ -161,6 +162,20 @@ class TestSingle:
         twin = copy.deepcopy(env)
         assert twin.save_state() == env.save_state()
         assert play(twin) == play(env)
+        twin.close()
+
+    def test_deep_copies_of_wrapped_environments_are_in_the_same_episode(self):
+        env = gymnasium.make("fmugym/Pendulum-v0", max_episode_steps=9)
+        env.reset(seed=0)
+        for action in ACTIONS[:5]:
+            env.step(action)
+        twin = copy.deepcopy(env)
+        for action in ACTIONS[5:9]:
+            first, second = env.step(action), twin.step(action)
+            assert first[0].tolist() == second[0].tolist()
+            assert first[1:4] == second[1:4]
+        assert second[3]
+        env.close()
         twin.close()
 
     def test_deep_copies_before_the_first_reset_are_new(self):
@@ -378,7 +393,7 @@ class TestRefusals:
             other.reset(seed=0)
             with other, pytest.raises(ConfigError, match=name):
                 other.restore_state(snapshot)
-        with Track(isolation="process", on_fault="raise") as other:
+        with Track(on_fault="raise", leak_limit=None) as other:  # no state depends on these
             other.restore_state(snapshot)
 
     def test_of_what_is_no_snapshot_or_of_several(self, halfway):
@@ -420,6 +435,11 @@ class TestRefusals:
             env.reset(seed=0)
             with pytest.raises(SimulationError, match="no states that could be saved"):
                 env.save_state()
+            with Track() as model:
+                model.reset(seed=0)
+                with pytest.raises(SimulationError, match="no states that could be restored"):
+                    env.restore_state(model.save_state())
+            env.step(ACTIONS[0])  # the episode goes on
 
     def test_some_of_a_vector_that_was_never_reset(self, halfway):
         envs = vector_of(Track)

@@ -319,8 +319,11 @@ class FMU(LoadableFMU):
     def close(self) -> None:
         """Remove the temporary folder; more than one call is fine."""
         self._folder = None
-        if self._remove_folder is not None:
-            self._remove_folder()
+        finalizer = self._remove_folder
+        if finalizer is not None and (alive := finalizer.peek()) is not None:
+            _, remove, arguments, _ = alive
+            remove(*arguments)
+            finalizer.detach()  # not before: a signal may have interrupted the removal
 
 
 def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:

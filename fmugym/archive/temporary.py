@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import os
@@ -15,7 +16,7 @@ from typing import Final
 
 from fmugym.errors import FMULoadError
 
-__all__ = ["folder_name", "make_folder", "remove_folder", "sweep"]
+__all__ = ["folder_name", "make_folder", "remove_folder", "remove_rest", "sweep"]
 
 _made_in: Final[dict[Path, str]] = {}
 """The working directory at the time when each folder was made."""
@@ -59,20 +60,38 @@ def remove_folder(folder: Path, owner: int) -> None:
 
     If an FMU has made it the working directory, the one from before is restored.
     """
-    if os.getpid() != owner:
+    if not _is_own(owner):
         return
-    _leave(folder, _made_in.pop(folder, tempfile.gettempdir()))
     try:
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
     except BaseException:  # such as KeyboardInterrupt: nobody comes back for the rest
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
         raise
+
+
+def _is_own(owner: int) -> bool:
+    return os.getpid() == owner
+
+
+def _remove(folder: Path) -> None:
+    _leave(folder, _made_in.get(folder, tempfile.gettempdir()))
+    shutil.rmtree(folder, ignore_errors=True)
+    _made_in.pop(folder, None)
 
 
 def _leave(folder: Path, directory: str) -> None:
     with contextlib.suppress(OSError):
         if Path.cwd().is_relative_to(folder.resolve()):
             os.chdir(directory)
+
+
+@atexit.register
+def remove_rest() -> None:
+    """Remove the folders of this process that a signal at the wrong moment has left."""
+    for folder in list(_made_in):
+        name = _NAME.fullmatch(folder.name)
+        if name and int(name["pid"]) == os.getpid():
+            _remove(folder)
 
 
 @functools.cache

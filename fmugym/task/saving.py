@@ -8,13 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.pool import Pool
 from fmugym.task.construction import Constructed
 from fmugym.task.generators import row_of, state_of
 from fmugym.task.plain import changed, plain_attributes
 from fmugym.task.snapshot import Columns
 
-__all__ = ["columns_of", "native_value", "place_columns"]
+__all__ = ["columns_of", "native_value", "place_columns", "require_saving"]
+
+
+def require_saving(pool: Pool) -> None:
+    """Refuse to restore anything in a real system, whose episode goes on.
+
+    Raises:
+        SimulationError: If the pool has no states.
+    """
+    if pool.save_method is None:
+        raise SimulationError("a real system has no states that could be restored")
 
 
 def columns_of(env: Constructed) -> Columns:

@@ -20,6 +20,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.interface import checked_value
+from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.vector.arguments import (
     UnknownAttributeError,
@@ -409,6 +410,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._is_ready and len(indices) < self.num_envs:
             raise ConfigError("before a reset of all, a snapshot must be restored in all")
         self._engine.require_fit(columns)
+        require_saving(self._pool)
         self._is_ready = False
         self._restore(snapshot.bundle, sources, indices)
         self._engine.place(columns, sources, indices)
