@@ -166,6 +166,11 @@ class Plan:
 
     def _times(self) -> dict[str, Any]:
         times: dict[str, Any] = {"time_step": self._time_step}
+        start = self._root.child("start_time")
+        if isinstance(start.value, Mapping | list):
+            raise start.error(
+                "start_time is one time; 'clock' takes lists, seasons and what is drawn"
+            )
         for key in ("warm_up", "start_time"):
             if self._root.child(key).value is not None:
                 times[key] = self._root.child(key).check(duration)
