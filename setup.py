@@ -30,7 +30,10 @@ native = Extension(
     define_macros=[("Py_LIMITED_API", "0x030B0000")],
     extra_compile_args=["/std:c11", "/fp:precise"]
     if WINDOWS
-    else ["-std=gnu11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"],
+    else [
+        *("-std=gnu11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"),
+        "-Werror=implicit-function-declaration",  # it would fail when it is loaded, without a word
+    ],
     libraries=[] if WINDOWS else ["m", "pthread", "dl"],
     py_limited_api=True,
     optional=not REQUIRED,

@@ -3,9 +3,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "failures.h"
 #include "instances.h"
 #include "records.h"
-#include "schedule.h"
+#include "steps.h"
 
 static const size_t SPARES_LIMIT = (size_t)64 << 20; /* bytes of states kept for reuse, in all */
 
@@ -132,13 +133,4 @@ Status instance_unbundle(Pool *pool, Instance *me, const States *states, size_t 
     }
     instance_count_from(me, states->steps[number]);
     return status;
-}
-
-size_t pool_unbundle(Pool *pool, const States *states, size_t count) {
-    const Call call = {.turn = NULL};
-    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .states = states};
-
-    pool->no_return = false;
-    task.listed = true;
-    return schedule_run(&task, count);
 }

@@ -9,6 +9,7 @@
 #include "inside.h"
 #include "instances.h"
 #include "records.h"
+#include "snapshots.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */
 static bool make_room_for_starts(Pool *pool, const Access *start) {
@@ -193,4 +194,25 @@ void pool_recycle(Pool *pool) {
     for (size_t i = 0; i < pool->settings.count; i++) {
         pool->instances[i].due = true;
     }
+}
+
+size_t pool_unbundle(Pool *pool, const States *states, size_t count) {
+    const Call call = {.turn = NULL};
+    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .states = states};
+
+    pool->no_return = false;
+    task.listed = true;
+    return schedule_run(&task, count);
+}
+
+bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled) {
+    const Call call = {.mask = mask};
+    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .snapshot = snapshot};
+
+    if (!snapshots_fit(pool, snapshot, mask)) {
+        return false;
+    }
+    task.listed = true;
+    *troubled = schedule_run(&task, schedule_choose(pool, mask));
+    return true;
 }

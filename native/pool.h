@@ -209,6 +209,10 @@ typedef struct {
     ptrdiff_t stride;
 } Mask;
 
+static inline bool is_in(Mask mask, size_t index) {
+    return mask.data != NULL && mask.data[(ptrdiff_t)index * mask.stride] != 0;
+}
+
 /* What to do in a call. Fields that the call does not need may be zero. */
 typedef struct {
     Matrix inputs; /* inputs of this step, or of the last one */

@@ -8,10 +8,6 @@
 
 enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
 
-static inline bool is_in(Mask mask, size_t index) {
-    return mask.data != NULL && mask.data[(ptrdiff_t)index * mask.stride] != 0;
-}
-
 static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;
 }

@@ -4,7 +4,6 @@
 
 #include "failures.h"
 #include "instances.h"
-#include "schedule.h"
 
 Snapshot *snapshot_new(size_t count) {
     Snapshot *snapshot = calloc(1, sizeof *snapshot);
@@ -100,16 +99,11 @@ ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot) {
     return -1;
 }
 
-bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled) {
-    const Call call = {.mask = mask};
-    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .snapshot = snapshot};
-
+bool snapshots_fit(const Pool *pool, const Snapshot *snapshot, Mask mask) {
     for (size_t i = 0; i < pool->settings.count; i++) {
         if ((mask.data == NULL || is_in(mask, i)) && !is_own(pool, snapshot, i)) {
             return false;
         }
     }
-    task.listed = true;
-    *troubled = schedule_run(&task, schedule_choose(pool, mask));
     return true;
 }

@@ -21,9 +21,9 @@ EDITS = {
     "neither": {PARAMETER: ""},
     "causality none": {PARAMETER: 'causality="none" variability="parameter"'},
     "another kind of co-simulation": {"CoSimulation_StandAlone": "CoSimulation_Tool"},
-    "no capabilities": {"<Capabilities/>": ""},
+    "no capabilities": {"<Capabilities />": ""},
     "an empty implementation": {
-        "<CoSimulation_StandAlone><Capabilities/></CoSimulation_StandAlone>": ""
+        "<CoSimulation_StandAlone><Capabilities /></CoSimulation_StandAlone>": ""
     },
     "no number of event indicators": {' numberOfEventIndicators="0"': ""},
     "no model name": {' modelName="Zoo"': ""},

@@ -27,22 +27,25 @@ class HouseEnv(TaskEnv):
     Args:
         scenario: "autumn", "frost" or "spring": two weeks that training leaves out. By default an
             episode begins on a day that is drawn from the others.
+        fmi_version: Of the FMU, "2.0" or "3.0".
         log_level: As for ``TaskEnv``.
         render_mode: As for ``TaskEnv``.
         options: More arguments of ``TaskEnv``.
 
     Raises:
-        ConfigError: If the scenario is unknown.
+        ConfigError: If the scenario is unknown, or there is no such FMU.
     """
 
     def __init__(
         self,
         scenario: str | None = None,
+        fmi_version: str = "2.0",
         log_level: int = logging.WARNING,
         *,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        task = Task.read(HOUSE_TASK)
+        fmu = {"bundled": "House", "fmi_version": fmi_version}
+        task = Task.of({"extends": str(HOUSE_TASK), "fmu": fmu})
         task = task if scenario is None else task.in_scenario(scenario)
         super().__init__(task, log_level, render_mode=render_mode, **options)
