@@ -28,10 +28,10 @@ if TYPE_CHECKING:
         TaskError,
     )
     from fmugym.fmi.status import Status
+    from fmugym.linearization import LinearModel, linearize
     from fmugym.pool import Backend, Paced
     from fmugym.recording import Recorder, Recording, replay
     from fmugym.task.snapshot import Snapshot
-    from fmugym.tools.linearization import LinearModel, linearize
     from fmugym.vector import FMUVectorEnv
     from fmugym.vector.sensitivities import derivatives
 
@@ -89,7 +89,7 @@ _MODULES = {
     "pool": ["Backend", "Paced"],
     "recording": ["Recorder", "Recording", "replay"],
     "task.snapshot": ["Snapshot"],
-    "tools.linearization": ["LinearModel", "linearize"],
+    "linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
     "vector.sensitivities": ["derivatives"],
 }

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines import LQR, PID, Constant, Hysteresis, Random, Schedule
+from fmugym.baselines import LQR, PID, Constant, Hysteresis, Random, Schedule, controller_of
 from fmugym.vector import FMUVectorEnv
 
 KELVIN = 273.15
@@ -307,3 +307,32 @@ class TestMistakes:
     def test_numbers_of_a_pid(self, arguments):
         with pytest.raises(fmugym.ConfigError):
             PID("T_air", 0.0, **arguments)
+
+
+class TestTexts:
+    def test_a_text_makes_a_controller(self, house):
+        made = controller_of("pid of=T_air setpoint=294.15 kp=0.4 ti=7200").bind(house)
+        usual = PID("T_air", 294.15, kp=0.4, ti=7200.0).bind(house)
+        for temperature in (290.0, 293.0, 296.0):
+            observation = np.array([temperature, 300.0])
+            assert made.act(observation) == usual.act(observation)
+        assert controller_of("hysteresis of=T_air setpoint=T_w band=1").setpoint == "T_w"
+        schedule = controller_of("schedule 06:00=0.8 22:00=0.3").bind(house)
+        assert schedule.act(np.zeros(2)) == pytest.approx(0.3)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("", "expected a controller and its arguments"),
+            ("pid 'of=T", "expected a controller and its arguments"),
+            ("pit of=T", "unknown controller 'pit'; did you mean 'pid'"),
+            ("pid T", "expected an argument such as 'kp=0.5', got 'T'"),
+            ("pid of=T setpoint=1", "PID needs the argument 'kp'"),
+            ("pid of=T setpiont=1 kp=1", "argument of PID 'setpiont'; did you mean 'setpoint'"),
+            ("pid of=T setpoint=1 kp=high", "kp"),
+            ("schedule", "at least one time"),
+        ],
+    )
+    def test_mistakes(self, text, message):
+        with pytest.raises(fmugym.ConfigError, match=message):
+            controller_of(text)

@@ -167,6 +167,38 @@ class TestSimulate:
         again = run(capsys, "simulate", task, "--episodes", "2", "--seed", "3", "--json")[1]
         assert again == out
 
+    def test_a_controller(self, capsys):
+        controller = "hysteresis of=T setpoint=21 band=0.3"
+        options = "--scenario", "frost", "--steps", "96"
+        code, out, err = run(
+            capsys, "simulate", "fmugym/House-v0", "--controller", controller, *options, "--json"
+        )
+        assert (code, err) == (0, "")
+        (warm,) = json.loads(out)["episodes"]
+        cold = run(capsys, "simulate", "fmugym/House-v0", "--action", "0", *options, "--json")[1]
+        assert warm["total_cost"] < 0.2 * json.loads(cold)["episodes"][0]["total_cost"]
+
+    def test_a_controller_begins_each_episode_anew(self, capsys):
+        controller = "pid of=T setpoint=21 kp=0.3 ti=7200"
+        options = "--scenario", "frost", "--steps", "20", "--json"
+        arguments = "simulate", "fmugym/House-v0", "--controller", controller, *options
+        both = run(capsys, *arguments, "--seed", "4", "--episodes", "2")[1]
+        second = run(capsys, *arguments, "--seed", "5")[1]
+        assert json.loads(both)["episodes"][1] == json.loads(second)["episodes"][0]
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("--controller", "pid of=T_zone setpoint=21 kp=1"), "observation in of 'T_zone'"),
+            (("--controller", "pit"), "unknown controller 'pit'"),
+            (("--scenario", "forst"), "'forst'"),
+        ],
+    )
+    def test_controllers_and_scenarios_that_are_none(self, arguments, message, capsys):
+        code, _, err = run(capsys, "simulate", "fmugym/House-v0", *arguments)
+        assert code == 1
+        assert message in err
+
     def test_a_table_of_all_steps(self, tmp_path, capsys):
         fmugym.Task.from_dict(TASK | {"costs": {"effort": "abs(tau)"}}).write(tmp_path / "a.toml")
         arguments = "--action", "0.01", "--output", tmp_path / "run.csv"

@@ -19,10 +19,9 @@ STOREYS = [
     {"config"},
     {"task"},
     {"env"},
-    {"vector", "lab", "identification"},
-    {"registration", "recording", "single", "testing", "sb3", "declared"},
+    {"vector", "lab", "identification", "linearization"},
+    {"registration", "recording", "single", "testing", "sb3", "declared", "baselines"},
     {"envs", "tools"},
-    {"baselines"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

@@ -13,5 +13,15 @@ All read the observation by the names of its elements and return actions of the 
 from fmugym.baselines.base import Controller
 from fmugym.baselines.feedback import LQR, PID, Hysteresis
 from fmugym.baselines.feedforward import Constant, Random, Schedule
+from fmugym.baselines.parsing import controller_of
 
-__all__ = ["LQR", "PID", "Constant", "Controller", "Hysteresis", "Random", "Schedule"]
+__all__ = [
+    "LQR",
+    "PID",
+    "Constant",
+    "Controller",
+    "Hysteresis",
+    "Random",
+    "Schedule",
+    "controller_of",
+]

@@ -12,7 +12,7 @@ from fmugym.baselines.base import Controller, FloatArray, Signal
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.lazy import scipy_module
-from fmugym.tools.linearization import LinearModel
+from fmugym.linearization import LinearModel
 
 __all__ = ["LQR", "PID", "Hysteresis"]
 

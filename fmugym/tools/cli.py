@@ -5,12 +5,12 @@
     fmugym info model.fmu [--json] [--all] [--filter GLOB]
     fmugym new model.fmu [--output task.toml]
     fmugym validate task.toml|model.fmu|ID|module:Class [--json]
-    fmugym simulate task.toml|ID|module:Class [--action random|NUMBERS] [--scenario NAME]
-        [--seed N] [--episodes N] [--steps N] [--output run.csv] [--json]
+    fmugym simulate task.toml|ID|module:Class [--action random|NUMBERS] [--controller TEXT]
+        [--scenario NAME] [--seed N] [--episodes N] [--steps N] [--output run.csv] [--json]
     fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
         [--episodes N] [--no-normalize] [KEY=VALUE ...]
-    fmugym evaluate TASK [--agent FOLDER ...] [--action NUMBERS ...] [--scenario NAME]
-        [--episodes N] [--seed N] [--steps N] [--json]
+    fmugym evaluate TASK [--agent FOLDER ...] [--action NUMBERS ...] [--controller TEXT ...]
+        [--scenario NAME] [--episodes N] [--seed N] [--steps N] [--json]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
 
@@ -70,7 +70,7 @@ from fmugym.errors import FMUGymError
 from fmugym.tools.evaluation import evaluate, table
 from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.proposal import Proposal
-from fmugym.tools.simulation import Policy, action_of, simulate
+from fmugym.tools.simulation import Policy, action_of, policy_of, simulate
 from fmugym.tools.skeleton import Skeleton
 from fmugym.tools.stand_in import build_stand_in
 from fmugym.tools.targets import maker_of, scenarios_of
@@ -81,6 +81,7 @@ __all__ = ["main"]
 
 _INTERRUPTED: Final = 130
 _TASK: Final = "a task file, a registered id or module:Class"
+_CONTROLLER: Final = "a controller and its arguments: 'pid of=T setpoint=21 kp=0.5 ti=14400'"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -161,12 +162,15 @@ def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 
 
 def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    text = "play episodes with random or constant actions"
+    text = "play episodes with random or constant actions, or with a controller"
     command = commands.add_parser("simulate", help=text, description=text.capitalize() + ".")
     command.set_defaults(run=_simulate)
     command.add_argument("task", metavar="TASK", help=_TASK)
     command.add_argument(
         "--action", default="random", help="random (default), or the numbers of one action: 0.5,-1"
+    )
+    command.add_argument(
+        "--controller", metavar="TEXT", help=f"instead of an action: {_CONTROLLER}"
     )
     command.add_argument("--scenario", help="a scenario of the task file")
     command.add_argument("--seed", type=int, default=0, help="of the first episode; default 0")
@@ -196,7 +200,7 @@ def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    text = "let agents, random and constant actions play the same episodes"
+    text = "let agents, controllers, random and constant actions play the same episodes"
     command = commands.add_parser("evaluate", help=text, description=text.capitalize() + ".")
     command.set_defaults(run=_evaluate)
     command.add_argument("task", metavar="TASK", help=_TASK)
@@ -204,6 +208,9 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
         "--agent", type=Path, action="append", default=[], metavar="FOLDER", help="of train"
     )
     command.add_argument("--action", action="append", default=[], help="a constant action")
+    command.add_argument(
+        "--controller", action="append", default=[], metavar="TEXT", help=_CONTROLLER
+    )
     command.add_argument("--scenario", help="a scenario of the task file")
     command.add_argument("--episodes", type=int, default=10, help="default 10")
     command.add_argument("--seed", type=int, default=1_000_000, help="of the first episode")
@@ -272,7 +279,8 @@ def _simulate(arguments: argparse.Namespace) -> None:
     check_count("--steps", arguments.steps)
     with ExitStack() as stack:
         env = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
-        policy = action_of(env, arguments.action)
+        text = arguments.controller
+        policy = action_of(env, arguments.action) if text is None else policy_of(env, text)
         output = arguments.output
         table = None if output is None else stack.enter_context(_new_table(output))
         summaries = []
@@ -313,6 +321,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     policies: dict[str, Callable[[FMUEnv], Policy]] = {}
     for text in ("random", *arguments.action):
         policies[text if text == "random" else f"action {text}"] = partial(action_of, text=text)
+    policies |= {text: partial(policy_of, text=text) for text in arguments.controller}
     policies |= {str(folder): agent_policy(folder) for folder in arguments.agent}
     make_env = maker_of(arguments.task, arguments.scenario)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)

@@ -9,14 +9,29 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from fmugym.baselines import controller_of
 from fmugym.checks import number_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["Summary", "action_of", "simulate"]
+__all__ = ["Policy", "Summary", "action_of", "policy_of", "simulate"]
 
-Policy = Callable[[Any], Any]
-"""Chooses an action for an observation."""
+
+def _begin() -> None:
+    """A policy without a memory has nothing to forget."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Chooses actions.
+
+    Attributes:
+        act: Returns the action for an observation.
+        begin: Is called before an episode begins.
+    """
+
+    act: Callable[[Any], Any]
+    begin: Callable[[], None] = _begin
 
 
 @dataclass(frozen=True)
@@ -63,7 +78,7 @@ def action_of(env: FMUEnv, text: str) -> Policy:
     """
     space = env.action_space
     if text == "random":
-        return lambda observation: space.sample()
+        return Policy(lambda observation: space.sample())
     try:
         numbers = [number_of("action", float(part)) for part in text.split(",")]
         array = np.array(numbers).reshape(space.shape or ())
@@ -72,7 +87,21 @@ def action_of(env: FMUEnv, text: str) -> Policy:
     action = array.astype(space.dtype)[()]
     if not space.contains(action) or not np.allclose(action, array):
         raise ConfigError(f"the action {shown(text)} is not in {space}")
-    return lambda observation: action
+    return Policy(lambda observation: action)
+
+
+def policy_of(env: FMUEnv, text: str) -> Policy:
+    """Make the policy of a controller of ``fmugym.baselines``.
+
+    Args:
+        env: The environment.
+        text: See ``fmugym.baselines.controller_of``.
+
+    Raises:
+        ConfigError: If it names no controller, or the controller does not fit the environment.
+    """
+    controller = controller_of(text).bind(env)
+    return Policy(controller.act, controller.reset)
 
 
 def simulate(
@@ -92,13 +121,14 @@ def simulate(
         The numbers of the episode.
     """
     env.action_space.seed(seed)
+    policy.begin()
     observation, info = env.reset(seed=seed)
     writer = None if table is None else _Writer(table, seed)
     if writer is not None:
         writer.add(env, info, None, "")
     total, cost, end, begin = 0.0, None, "stopped", env.time
     for _ in range(most_steps):
-        observation, reward, terminated, truncated, info = env.step(policy(observation))
+        observation, reward, terminated, truncated, info = env.step(policy.act(observation))
         total += reward
         cost = float(info["cost"]) + (cost or 0.0) if "cost" in info else cost
         end = _end(terminated, truncated, info) or end

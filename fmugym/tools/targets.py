@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 
@@ -38,12 +39,12 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
         return partial(load, Task.from_dict(tomllib.loads(Proposal(FMU(path)).text())))
     if path.suffix.lower() == ".toml" or path.is_file():
         return partial(load, Task.read(path), scenario=scenario)
-    if scenario is not None:
-        raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
     module, separator, name = target.partition(":")
     if separator and name.isidentifier() and "/" not in module:
+        if scenario is not None:
+            raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
         return partial(load, Task.from_dict({"class": target}))
-    return partial(_registered, target)
+    return partial(_registered, target, {} if scenario is None else {"scenario": scenario})
 
 
 def scenarios_of(target: str) -> list[str]:
@@ -54,9 +55,9 @@ def scenarios_of(target: str) -> list[str]:
     return list(Task.read(path).document.get("scenarios", {}))
 
 
-def _registered(env_id: str) -> FMUEnv:
+def _registered(env_id: str, arguments: dict[str, Any]) -> FMUEnv:
     try:
-        env = gymnasium.make(env_id).unwrapped
+        env = gymnasium.make(env_id, **arguments).unwrapped
     except gymnasium.error.Error as error:
         raise ConfigError(
             f"{shown(env_id)} is no task file, no class and no registered id: {error}"

@@ -233,7 +233,7 @@ def _policy(model: Any, normalization: Any) -> Policy:
         action, _ = model.predict(observation, deterministic=True)
         return action if action.ndim else int(action)
 
-    return choose
+    return Policy(choose)
 
 
 def agent_policy(folder: Path) -> Callable[[FMUEnv], Policy]:
