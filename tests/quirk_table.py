@@ -48,6 +48,8 @@ class Quirk:
         log: A part of the warning in the log; empty if there is none.
         versions: Of FMI.
         probe_timeout: In seconds.
+        may_die_early: Whether the FMU may end the trial before a reset method is tried. Then
+            episodes begin by the reset function.
     """
 
     token: str
@@ -57,13 +59,15 @@ class Quirk:
     log: str = ""
     versions: tuple[int, ...] = (1, 2, 3)
     probe_timeout: float = 30.0
+    may_die_early: bool = False
 
     def __str__(self):
         return self.token
 
-    def method_of(self, version):
-        """How episodes begin with a version of FMI."""
-        return "reset" if version == 1 and self.method == "restore" else self.method
+    def methods_of(self, version):
+        """How episodes may begin with a version of FMI."""
+        found = "reset" if version == 1 and self.method == "restore" else self.method
+        return {found, "reset"} if self.may_die_early else {found}
 
     @property
     def row(self):
@@ -141,7 +145,7 @@ QUIRKS = (
     Quirk("strtok", "initializes with `strtok`", neighbours="one initialization at a time"),
     # Memory, files and calls
     Quirk("overruns", "writes a byte beyond its memory (it runs in worker processes)",
-          log="harms its process"),
+          log="harms its process", may_die_early=True),
     Quirk("changes directory", "makes its resources the working directory (you get yours back "
           "when the environment is closed)"),
     Quirk("needs its directory", "reads a file beside its library while that is loaded"),
