@@ -27,20 +27,20 @@ SLOW_MODULES = {
 """Programs that train, build, measure, or make cases by the hundred."""
 
 EVERY = {
-    "test_hostile_archive": 9,
-    "test_initial_states": 6,
-    "test_licences": 12,
-    "test_neighbours": 4,
-    "test_pool": 11,
-    "test_slow_models": 3,
-    "test_quirks": 113,
-    "test_rehearsals": 6,
-    "test_words": 31,
-    "test_zoo": 97,
+    "test_hostile_archive": 19,
+    "test_initial_states": 13,
+    "test_licences": 23,
+    "test_neighbours": 7,
+    "test_pool": 23,
+    "test_slow_models": 7,
+    "test_quirks": 167,
+    "test_rehearsals": 7,
+    "test_words": 61,
+    "test_zoo": 127,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""
 
-EVERY_OF_OTHERS = 17
+EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
@@ -75,6 +75,7 @@ SLOW_TESTS = (
     "test_identification.py::test_odd",
     "test_initial_states.py::TestFiles::test_of_an_environment",
     "test_initial_states.py::TestSingle::test_by_default",
+    "test_initial_states.py::TestSingle::test_is_initialized_once_for_all",
     "test_initial_states.py::TestSingle::test_drawn",
     "test_initial_states.py::TestSingle::test_native",
     "test_initial_states.py::TestSingle::test_other",
@@ -83,12 +84,16 @@ SLOW_TESTS = (
     "test_initial_states.py::TestVector",
     "test_lab_recording.py::test_temporary_videos",
     "test_lab_sessions.py::TestNothingLeaks",
+    "test_licences.py::TestInitializations::test_of_a_vector_environment",
     "test_licences.py::TestPace::test_of_several",
     "test_licences.py::TestRefusal::test_in_a_later_reset",
     "test_licences.py::TestSeats::test_the_trial_says",
     "test_licences.py::TestWaiting::test_in_a_reset",
     "test_lifecycle.py::TestManyLives",
     "test_native_helpers.py::test_a_busy",
+    "test_slow_models.py::TestProgress::test_of_a_trial_is_logged",
+    "test_trial.py::TestDeath::test_a_hang",
+    "test_vector_codec.py::test_gathered_as",
     "test_native_pool.py::test_memory",
     "test_native_threads.py::test_stress",
     "test_native_guards.py::test_want_of_memory",
