@@ -10,7 +10,7 @@ import fmugym
 PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
-    {"errors", "lazy", "_native"},
+    {"errors", "lazy", "signals", "_native"},
     {"checks"},
     {"archive", "distributions", "rendering"},
     {"fmi"},

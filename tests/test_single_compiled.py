@@ -6,6 +6,7 @@ import logging
 import math
 import pickle
 import random
+import signal
 import warnings
 import weakref
 from types import MethodType
@@ -644,3 +645,34 @@ def test_generated_expressions(reward, observed, variable):
     finally:
         env.close()
     require_equal(env, task)
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
+@pytest.mark.parametrize("name", ["require_equal", "make_late"])
+def test_what_a_signal_handler_raises_while_hooks_are_compiled_comes_out(monkeypatch, name):
+    """It is no mistake of the hooks, which are compiled in a later step."""
+
+    class RingError(Exception):
+        pass
+
+    def ring(*_):
+        raise RingError
+
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGALRM)
+        return usual(*arguments)
+
+    from fmugym.single import player
+
+    usual = getattr(player, name)
+    monkeypatch.setattr(player, name, interrupted)
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        with gym.make("fmugym/CartPole-v0", hooks="compiled").unwrapped as env:
+            env.reset(seed=0)
+            with pytest.raises(RingError):
+                env.step(1)
+            monkeypatch.setattr(player, name, usual)
+            env.step(1)
+    finally:
+        signal.signal(signal.SIGALRM, before)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
+from fmugym.signals import is_of_signal_handler
 from fmugym.single.trace import SingleTask, kind_of
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import conclude
@@ -117,14 +118,18 @@ class _Comparison:
                 inputs = env._input_writer.write(
                     env._get_inputs(), env.action, np.zeros(len(env.inputs))
                 )
-            except Exception:  # hooks may raise anything
+            except Exception as error:  # hooks may raise anything
+                if is_of_signal_handler(error):
+                    raise
                 return False
             _require("_get_inputs", self._wanted[:, index], np.array(inputs))
             self._place_after(index, inputs)
             try:
                 observed = None if self._task.seen else ()
                 result = conclude(env, env._form, False, False, observed)
-            except Exception:  # as above
+            except Exception as error:  # as above
+                if is_of_signal_handler(error):
+                    raise
                 return False
             self._compare_results(index, result)
         return True

@@ -14,6 +14,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.signals import is_of_signal_handler
 from fmugym.single.compare import require_equal
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
 from fmugym.task.readings import LATE, LateReading, make_late
@@ -94,6 +95,8 @@ class Player:
             self._task, self._required = task, False
             self._known = len(vars(env))
         except Exception as reason:  # hooks may raise anything
+            if is_of_signal_handler(reason):
+                raise
             env._player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
             if self._required:
