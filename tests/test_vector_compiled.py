@@ -1,6 +1,7 @@
 """Compiled hooks of vector environments are those of numbers, or are not compiled."""
 
 import re
+import signal
 
 import gymnasium as gym
 import numpy as np
@@ -257,3 +258,32 @@ class Unattended(Arithmetic):
 @pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
 def test_an_environment_without_inputs(hooks):
     require_pair_equal(Unattended, steps=20, hooks=hooks)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="needs a signal of Unix")
+@pytest.mark.parametrize("call", range(1, 5))
+def test_what_a_signal_handler_raises_in_a_hook_comes_out(call):
+    """Wherever the hook is called: alone, on arrays or on symbols."""
+
+    class RingError(Exception):
+        pass
+
+    calls = []
+
+    class Ringing(Drawing):
+        def _is_done(self):
+            calls.append(1)
+            if len(calls) == call:
+                signal.raise_signal(signal.SIGALRM)
+            return super()._is_done()
+
+    def ring(*_):
+        raise RingError
+
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        with pytest.raises(RingError):
+            FMUVectorEnv(Ringing, 3)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert len(calls) == call

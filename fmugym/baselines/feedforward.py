@@ -81,11 +81,10 @@ class Schedule(Controller):
 
     def _prepare(self) -> None:
         self._limits()
+        self._steps = np.zeros(self.count)
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
-        steps = getattr(self, "_steps", None)
-        kept = np.zeros(self.count) if steps is None or len(steps) != self.count else steps
-        self._steps = np.where(mask, 0.0, kept)
+        self._steps = np.where(mask, 0.0, self._steps)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
         time = (self._start + self._steps * self.time_step) % _DAY

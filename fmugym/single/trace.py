@@ -26,7 +26,13 @@ from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
 from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
 from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.tables import tables_in
-from fmugym.vector.hooks.trace import SeenArray, placed, tables_of, to_integer
+from fmugym.vector.hooks.trace import (
+    SeenArray,
+    in_hook,
+    require_unchanged,
+    tables_of,
+    to_integer,
+)
 
 __all__ = ["Kind", "SingleTask", "kind_of", "trace_single"]
 
@@ -191,18 +197,13 @@ class _Tracer:
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
         """Call a hook, and make cells of what it returns."""
-        try:
-            with numpy_of(self._graph), np.errstate(all="ignore"):
-                value = getattr(self._env, name)()
-                changed = self._contents.changed()
-                if changed is not None:
-                    raise UntraceableError(f"it changes self.{changed}")
-                cells = of(value)
-                if self._graph.is_inexact:
-                    raise UntraceableError("it multiplies arrays, and the library's sums differ")
-                return cells
-        except Exception as error:  # hooks do with numbers what symbols cannot do
-            raise UntraceableError(placed(self._env, name, error)) from error
+        with in_hook(self._env, name), numpy_of(self._graph), np.errstate(all="ignore"):
+            value = getattr(self._env, name)()
+            require_unchanged(self._contents)
+            cells = of(value)
+            if self._graph.is_inexact:
+                raise UntraceableError("it multiplies arrays, and the library's sums differ")
+            return cells
 
     def _constant(self, value: Any, dtype: npt.DTypeLike) -> Cell:
         return self._graph.constant(value, np.dtype(dtype))

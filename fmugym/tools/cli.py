@@ -128,10 +128,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: Callable[[argparse.Namespace], int | None],
+    text: str,
+) -> argparse.ArgumentParser:
+    command = commands.add_parser(name, help=text, description=f"{text.capitalize()}.")
+    command.set_defaults(run=run)
+    return command
+
+
 def _add_info(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "say what an FMU is, where it runs, and which variables it has"
-    info = commands.add_parser("info", help=text, description=text.capitalize() + ".")
-    info.set_defaults(run=_info)
+    info = _add(commands, "info", _info, text)
     info.add_argument("fmu", type=Path, metavar="FMU")
     info.add_argument("--json", action="store_true", help="print one JSON object")
     info.add_argument("--all", action="store_true", help="list local and other variables too")
@@ -145,8 +155,7 @@ def _add_info(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 def _add_new(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "write a task file for an FMU, to be filled in"
-    command = commands.add_parser("new", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_new)
+    command = _add(commands, "new", _new, text)
     command.add_argument("fmu", type=Path, metavar="FMU")
     command.add_argument(
         "--output", type=Path, metavar="FILE", help="a new file, instead of standard output"
@@ -155,16 +164,14 @@ def _add_new(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "run a few short episodes and say what is wrong with a task, and what to do about it"
-    command = commands.add_parser("validate", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_validate)
+    command = _add(commands, "validate", _validate, text)
     command.add_argument("task", metavar="TASK", help=f"{_TASK}, or an FMU")
     command.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "play episodes with random or constant actions, or with a controller"
-    command = commands.add_parser("simulate", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_simulate)
+    command = _add(commands, "simulate", _simulate, text)
     command.add_argument("task", metavar="TASK", help=_TASK)
     command.add_argument(
         "--action", default="random", help="random (default), or the numbers of one action: 0.5,-1"
@@ -182,8 +189,7 @@ def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "train an agent with Stable-Baselines3, and keep the best one"
-    command = commands.add_parser("train", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_train)
+    command = _add(commands, "train", _train, text)
     command.add_argument("task", metavar="TASK", help=_TASK)
     command.add_argument(
         "arguments", nargs="*", metavar="KEY=VALUE", help="arguments of the algorithm"
@@ -201,8 +207,7 @@ def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "let agents, controllers, random and constant actions play the same episodes"
-    command = commands.add_parser("evaluate", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_evaluate)
+    command = _add(commands, "evaluate", _evaluate, text)
     command.add_argument("task", metavar="TASK", help=_TASK)
     command.add_argument(
         "--agent", type=Path, action="append", default=[], metavar="FOLDER", help="of train"
@@ -220,8 +225,7 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def _add_skeleton(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "write a Python file with an environment for an FMU, to be filled in"
-    command = commands.add_parser("skeleton", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_skeleton)
+    command = _add(commands, "skeleton", _skeleton, text)
     command.add_argument("fmu", type=Path, metavar="FMU")
     command.add_argument(
         "--output", type=Path, metavar="FILE", help="a new file, instead of standard output"
@@ -230,8 +234,7 @@ def _add_skeleton(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def _add_stand_in(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     text = "build a replacement for an old libgfortran that an FMU needs; takes a C compiler"
-    command = commands.add_parser("stand-in", help=text, description=text.capitalize() + ".")
-    command.set_defaults(run=_stand_in)
+    command = _add(commands, "stand-in", _stand_in, text)
     command.add_argument("fmu", type=Path, metavar="FMU")
     command.add_argument(
         "--folder", type=Path, default=Path(), help="where to write it; by default this folder"

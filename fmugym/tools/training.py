@@ -156,9 +156,9 @@ def _import(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise ConfigError(
-            f"training needs Stable-Baselines3, which cannot be imported ({error}); install it "
-            "with: pip install 'fmugym-toolbox[sb3]'"
-        ) from None
+            f"training needs Stable-Baselines3, but {name} cannot be imported; install the extra: "
+            "pip install 'fmugym-toolbox[sb3]'"
+        ) from error
 
 
 class _Keeper:

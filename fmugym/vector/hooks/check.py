@@ -16,6 +16,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
+from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import ORDER
 from fmugym.vector.actions import is_array_space
@@ -250,6 +251,8 @@ def _result_of(env: FMUEnv, name: str) -> Any:
     try:
         result = getattr(env, name)()
     except Exception as error:
+        if is_of_signal_handler(error):
+            raise
         return _Failure(f"{type(error).__name__}: {error}")
     return dict(env.variables) if name == "_update" else result
 

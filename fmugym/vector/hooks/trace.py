@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.vector.contents import Contents, borrowed
@@ -36,7 +38,15 @@ from fmugym.vector.hooks.symbols import (
 )
 from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
-__all__ = ["SeenArray", "TracedTask", "placed", "tables_of", "to_integer", "trace_hooks"]
+__all__ = [
+    "SeenArray",
+    "TracedTask",
+    "in_hook",
+    "require_unchanged",
+    "tables_of",
+    "to_integer",
+    "trace_hooks",
+]
 
 
 @dataclass(frozen=True)
@@ -162,15 +172,11 @@ class _Tracer:
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
         """Call a hook, and make nodes of what it returns."""
-        try:
+        with in_hook(self._env, name):
             with numpy_of(self._graph), np.errstate(all="ignore"):
                 value = getattr(self._env, name)()
-            changed = self._contents.changed()
-            if changed is not None:
-                raise UntraceableError(f"it changes self.{changed}")
+            require_unchanged(self._contents)
             return of(value)
-        except Exception as error:  # hooks do with numbers what symbols cannot do
-            raise UntraceableError(placed(self._env, name, error)) from error
 
     def _nodes(self, value: Any, shape: tuple[int, ...] | None, dtype: Any) -> npt.NDArray[Any]:
         """The nodes of a result, the environments last; one value stands for all environments."""
@@ -396,7 +402,25 @@ def _nearest(items: list[int], value: Any) -> Any:
     return np.where(inside, nearest, value)
 
 
-def placed(env: FMUEnv, name: str, error: Exception) -> str:
+@contextmanager
+def in_hook(env: FMUEnv, name: str) -> Iterator[None]:
+    """Call a hook on symbols: what it raises becomes an ``UntraceableError`` with its place."""
+    try:
+        yield
+    except Exception as error:  # hooks do with numbers what symbols cannot do
+        if is_of_signal_handler(error):
+            raise
+        raise UntraceableError(_placed(env, name, error)) from error
+
+
+def require_unchanged(contents: Contents) -> None:
+    """Raise an ``UntraceableError`` if a hook has changed an attribute in place."""
+    changed = contents.changed()
+    if changed is not None:
+        raise UntraceableError(f"it changes self.{changed}")
+
+
+def _placed(env: FMUEnv, name: str, error: Exception) -> str:
     """Say where a hook does what cannot be traced."""
     what = str(error) if isinstance(error, UntraceableError) else f"it fails on symbols: {error}"
     code = getattr(getattr(type(env), name), "__code__", None)
