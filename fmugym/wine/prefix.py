@@ -26,6 +26,9 @@ logger = logging.getLogger(__name__)
 _READY: Final = "made-by-fmugym"
 """A file in a prefix that is complete."""
 
+_TEMPORARY: Final = "temporary"
+"""The folder in a prefix for sockets, which Debian's Wine leaves behind."""
+
 _DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY")
 _ALWAYS_OFF: Final = "winemenubuilder.exe,winedbg.exe,mscoree,mshtml=d"
 """They would write menus, open a debugger, and download runtimes of .NET and HTML."""
@@ -83,7 +86,8 @@ def _environment(prefix: Path, outside: Mapping[str, str], off: str) -> dict[str
     own = {name: value for name, value in outside.items() if name not in _DISPLAYS}
     overrides = ";".join(filter(None, (off, own.get("WINEDLLOVERRIDES", ""))))
     own.setdefault("WINEDEBUG", "-all")
-    return own | {"WINEPREFIX": str(prefix), "WINEDLLOVERRIDES": overrides}
+    places = {"WINEPREFIX": str(prefix), "TMPDIR": str(prefix / _TEMPORARY)}
+    return own | places | {"WINEDLLOVERRIDES": overrides}
 
 
 def _prefix_for(loader: Path) -> Path:
@@ -108,6 +112,7 @@ def _make(loader: Path, prefix: Path) -> None:
     environment = _environment(prefix, os.environ, _ALWAYS_OFF)
     log = prefix.with_suffix(".log")
     try:
+        (prefix / _TEMPORARY).mkdir(parents=True)
         with log.open("wb") as output:  # no pipe: services of Wine keep it open for a while
             subprocess.run(
                 [str(loader), "wineboot", "--init"],
