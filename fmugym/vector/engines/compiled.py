@@ -44,6 +44,9 @@ logger = logging.getLogger(__name__)
 
 _BOOL = np.dtype(np.bool_)
 
+_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
+"""The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
+
 _WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
 """Magnitudes of other states that programs are compared with hooks on."""
 
@@ -207,7 +210,7 @@ class CompiledEngine(BatchEngine):
         env, dtype = self.env, self._actions[0].dtype
         space: Any = env.action_space
         is_discrete = isinstance(space, spaces.Discrete)
-        check = 1 if is_discrete else 2 if dtype == np.float64 else 3 if dtype == np.float32 else 0
+        check = 1 if is_discrete else _FLOAT_CHECKS.get(dtype, 0)
         low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
         flat = [actions.reshape(-1) for actions in self._actions]
         return {
