@@ -432,8 +432,11 @@ class Pool:
             None if the episode is not known as a whole.
         """
 
-    def costs(self) -> tuple[float, float, float]:
-        """The measured ns per instance of ``step``, ``reset``, ``step_or_reset``; 0 if unknown."""
+    def costs(self) -> tuple[float, float, float, float, float]:
+        """The measured ns per instance of some methods; 0 if unknown.
+
+        They are ``step``, ``reset``, ``step_or_reset`` and ``play``, and the first ``reset``.
+        """
 
     def uses_states(self) -> bool:
         """Whether resets restore saved initial states, as far as is known by now."""

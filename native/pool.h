@@ -155,7 +155,8 @@ enum { SAMPLES = 8 };
 /* The measured cost of an operation: a low quantile of the last samples. Other load on the
  * machine makes some samples much too high, but none too low. */
 typedef struct {
-    double low; /* ns per instance; 0 until it is known */
+    double low;   /* ns per instance; 0 until it is known */
+    double first; /* the first sample: later resets may restore states */
     double samples[SAMPLES];
     uint32_t taken;
     uint32_t calls;

@@ -43,12 +43,12 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import HealthArray, no_counts
+from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import SAMPLINGS, ResetMethod
-from fmugym.pool.tape import Judge, Rehearsals, Tape
+from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
 
@@ -504,7 +504,21 @@ class NativePool(SavingPool):
     @property
     def costs(self) -> dict[str, float]:
         """The measured time of one instance in ns by method; 0 if it is not known yet."""
-        return dict(zip(("step", "reset", "step_or_reset"), self._pool.costs(), strict=True))
+        names = ("step", "reset", "step_or_reset", "play", "first_reset")
+        return dict(zip(names, self._pool.costs(), strict=True))
+
+    def effort(self) -> Effort:
+        """See ``CountedPool.effort``."""
+        self._count_steps()
+        costs = {name: 1e-9 * cost for name, cost in self.costs.items()}
+        steps = [costs[name] for name in ("step", "step_or_reset", "play") if costs[name]] or [0.0]
+        of_steps = self._counts[:, Column.STEPS]
+        of_resets = float(self._counts[:, Column.RESETS].sum()) * costs["reset"]
+        return Effort(
+            total=float(of_steps.sum()) * min(steps) + of_resets,
+            episode=costs["first_reset"] + TAPE_ROWS * max(steps),
+            steps=int(of_steps[0]),
+        )
 
     def prepare_play(
         self,
