@@ -307,6 +307,20 @@ def play_all(envs, steps):
         envs.step(np.ones((envs.num_envs, 1), np.float32))
 
 
+def test_a_spare_waits_for_a_seat(make_fmu, caplog):
+    """Another environment has the last seat. Once it is free, rehearsals go on."""
+    path = make_fmu("fine")
+    env = TiringEnv(path, max_instances=2, **WAYS["native"])
+    other = TiringEnv(path, max_instances=2, **WAYS["native"])
+    play(env, 40)
+    assert "no spare instance for now: Tires.fmu needs 1 more instance(s) for a reh" in caplog.text
+    assert "repeats" not in caplog.text
+    other.close()
+    play(env, 100)
+    assert "a fresh instance repeats 3 steps" in caplog.text
+    env.close()
+
+
 def test_a_spare_that_crashes(make_fmu, caplog):
     """The training has survived by luck; later environments do not depend on it."""
     path = make_fmu("crash")

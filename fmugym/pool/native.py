@@ -46,6 +46,7 @@ from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
+from fmugym.pool.pacing import last_initialization
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import SAMPLINGS, ResetMethod
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
@@ -190,7 +191,7 @@ class NativePool(SavingPool):
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
                     "one_initialization": spec.one_initialization,
-                    "pace": (spec.initialization_interval, *spec.turn),
+                    "pace": spec.initialization_interval,
                     "start_outputs": (
                         np.array(spec.start_outputs).tobytes() if spec.blind_start else None
                     ),
@@ -208,6 +209,7 @@ class NativePool(SavingPool):
                     "statuses": self.statuses,
                     "observations": self.observations,
                     "health": self._counts,
+                    "last_initialization": last_initialization(spec),
                 },
                 count=self.num_instances,
                 threads=self.threads,
@@ -406,7 +408,10 @@ class NativePool(SavingPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._close()
+        try:
+            self._close()
+        finally:
+            self._return_seats()
 
     def _open_pool(self) -> _native.Pool:
         if not self._close.alive:

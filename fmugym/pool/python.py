@@ -268,6 +268,7 @@ class PythonPool(SavingPool):
                 self._library.close()
         finally:
             restore_arithmetic()
+            self._return_seats()
 
 
 def _recycle(slots: Sequence[Slot]) -> None:

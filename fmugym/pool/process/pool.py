@@ -390,7 +390,10 @@ class ProcessPool(SavingPool):
     def close(self) -> None:
         """See ``Pool.close``."""
         with self._lock:
-            self._crew.close()
+            try:
+                self._crew.close()
+            finally:
+                self._return_seats()
 
     def processes(self) -> list[int]:
         """Return the process numbers of the workers; 0 for a worker that was given up."""
@@ -449,8 +452,4 @@ def _share_out(setup: Setup, workers: int) -> list[Setup]:
     """Give each worker a block of the instances, the blocks as equal as can be."""
     bounds = [setup.num_instances * index // workers for index in range(workers + 1)]
     blocks = itertools.starmap(slice, itertools.pairwise(bounds))
-    specs = (replace(setup.spec, turn=(number, workers)) for number in range(workers))
-    return [
-        replace(setup, block=block, number=number, spec=spec)
-        for number, (block, spec) in enumerate(zip(blocks, specs, strict=True))
-    ]
+    return [replace(setup, block=block, number=number) for number, block in enumerate(blocks)]
