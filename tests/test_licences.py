@@ -354,6 +354,6 @@ class TestInitializations:
             DemandingEnv, make_fmu(folder, "licensed"), max_instances=2, probe_timeout=None
         )
         env = make()
-        with pytest.raises(LicenceError, match="needs 2 more instance.* for a trial"):
+        with pytest.raises(LicenceError, match=r"needs 2 more instance.* for a trial"):
             fmugym.FMUVectorEnv(make, 2)
         env.close()

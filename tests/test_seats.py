@@ -21,6 +21,7 @@ from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec
 
 PROGRAM = """
+import os
 import sys
 import fmugym
 from test_seats import SeatedEnv
