@@ -116,7 +116,7 @@ def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
         "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
         "reloads": method == ResetMethod.LIBRARY,
         "one_initialization": spec.one_initialization,
-        "pace": (spec.initialization_interval, *spec.turn),
+        "pace": spec.initialization_interval,
         "start_outputs": np.array(spec.start_outputs).tobytes() if spec.blind_start else None,
     }
 

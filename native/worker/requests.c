@@ -505,7 +505,7 @@ bool worker_answer(Worker *w, Reader *reader) {
     const uint8_t request = read_flag(reader);
 
     if (request >= REQUESTS) {
-        send_error("there is no such request");
+        send_error("workers in Wine cannot do this");
         return true;
     }
     answers[request](w, reader);

@@ -19,6 +19,7 @@ from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.pacing import last_initialization, pace_file
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
 from fmugym.pool.process.worker import Setup
@@ -52,6 +53,9 @@ _REQUESTS: Final = (
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
+
+_UNKNOWN: Final = 255
+"""The number of a request that the program refuses."""
 
 _INTEGER, _NUMBER, _FLAG = struct.Struct("<q"), struct.Struct("<d"), struct.Struct("<?")
 _FAULT: Final = struct.Struct("<I")
@@ -149,8 +153,9 @@ class ProgramCoding:
             writer.integers(len(content), *content)
             return b"".join(writer.parts)
         self._asked, arguments = content
-        if self._asked in _REQUESTS:
-            writer.parts.append(bytes([_REQUESTS.index(self._asked)]))
+        if self._asked != "open":
+            number = _REQUESTS.index(self._asked) if self._asked in _REQUESTS else _UNKNOWN
+            writer.parts.append(bytes([number]))
         write: Callable[..., None] | None = getattr(self, f"_ask_{self._asked}", None)
         if write is not None:
             write(writer, *arguments)
@@ -222,6 +227,9 @@ class ProgramCoding:
         writer.text(os.fsencode(windows_path(path)))
         writer.integers(self._memory.size, setup.num_instances, setup.block.start)
         writer.integers(*offsets_of(setup.spec, setup.num_instances, setup.number), ECHO_SIZE)
+        last_initialization(setup.spec)  # makes the file ready
+        pace = pace_file(setup.spec)
+        writer.text(b"" if pace is None else os.fsencode(windows_path(pace)))
 
     # Other requests, and their answers
 
@@ -327,9 +335,7 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
     writer.integers(*(experiment[name] for name in ("substeps", "warm_up_steps", "retries")))
     names = ("restores", "rebuilds", "reloads", "one_initialization")
     writer.flags(*(experiment[name] for name in names))
-    interval, *turn = experiment["pace"]
-    writer.numbers(interval)
-    writer.integers(*turn)
+    writer.numbers(experiment["pace"])
 
 
 def _write_variables(writer: _Writer, variables: Mapping[str, Any]) -> None:
