@@ -141,6 +141,14 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 
+def is_in_wine(node_id):
+    """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
+    return (
+        node_id.startswith("test_windows_fmus.py::TestInWine")
+        or "wine" in node_id.partition("[")[2]
+    )
+
+
 def is_slow(node_id, number):
     """Whether the default run leaves out a test.
 
@@ -149,7 +157,7 @@ def is_slow(node_id, number):
         number: How many combinations of the same test came before.
     """
     module = node_id.partition(".py")[0]
-    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS):
+    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS) or is_in_wine(node_id):
         return True
     return number % EVERY.get(module, EVERY_OF_OTHERS) > 0
 
@@ -157,4 +165,5 @@ def is_slow(node_id, number):
 def is_exhaustive(node_id, number):
     """Whether a slow test is left to ``.ci/full``; the arguments are those of ``is_slow``."""
     module = node_id.partition(".py")[0]
-    return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0
+    left_out = is_in_wine(node_id) or number % EVERY_IN_CI.get(module, 1) > 0
+    return is_slow(node_id, number) and left_out

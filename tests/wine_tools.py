@@ -22,7 +22,7 @@ def why_not():
 
 
 def for_windows(path, folder):
-    """Copy an FMU with a library for Windows only: its own, or one built of a source of the tests."""
+    """Copy an FMU with a library for Windows only: its own, or one built of a test's source."""
     files = fmu_tools.read_fmu(path)
     kept = {
         name: data

@@ -29,6 +29,7 @@ from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.process.output import print_line_by_line
+from fmugym.pool.process.windows import ProgramCoding
 from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
@@ -126,7 +127,7 @@ def _try(request: Request, notes: Notes) -> None:
 
 def _initializations() -> int:
     """How many initializations this process has begun."""
-    count: int = Instance.initializations
+    count: int = Instance.initializations + ProgramCoding.initializations
     if has_native_pool():
         from fmugym import _native
 

@@ -219,6 +219,7 @@ static void answer_reset(Worker *w, Reader *reader) {
     worker_publish(w);
     Writer writer = {.bytes = NULL};
     write_integer(&writer, growth_after(w, mask));
+    write_integer(&writer, (int64_t)number_of_initializations());
     send_result(&writer);
 }
 

@@ -1,7 +1,7 @@
 """The messages to and from the worker program for Windows; see ``native/worker``.
 
 Numbers are little-endian: integers and floating-point numbers of 8 bytes, flags of one. A text or
-block begins with its length. The program answers one request after the other.
+block begins with its length. The program answers requests in their order.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 import os
 import struct
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -54,6 +55,7 @@ _REQUESTS: Final = (
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
 
+_NUMBERS: Final = {name: number for number, name in enumerate(_REQUESTS)}
 _UNKNOWN: Final = 255
 """The number of a request that the program refuses."""
 
@@ -138,13 +140,19 @@ class ProgramCoding:
 
     Args:
         memory: Shared with the program.
+
+    Attributes:
+        initializations: How many initializations all programs that this process has started have
+            begun.
     """
 
+    initializations: ClassVar[int] = 0
     _setup: Setup
 
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
-        self._asked = "open"
+        self._asked: deque[tuple[str, tuple[Any, ...]]] = deque()  # without an answer so far
+        self._initializations = 0
 
     def dumps(self, code: bytes, content: Any) -> bytes:
         """See ``Coding.dumps``; the object of a request is its name and its arguments."""
@@ -152,11 +160,11 @@ class ProgramCoding:
         if code == Code.RELEASE:
             writer.integers(len(content), *content)
             return b"".join(writer.parts)
-        self._asked, arguments = content
-        if self._asked != "open":
-            number = _REQUESTS.index(self._asked) if self._asked in _REQUESTS else _UNKNOWN
-            writer.parts.append(bytes([number]))
-        write: Callable[..., None] | None = getattr(self, f"_ask_{self._asked}", None)
+        name, arguments = content
+        self._asked.append((name, arguments))
+        if name != "open":
+            writer.parts.append(bytes([_NUMBERS.get(name, _UNKNOWN)]))
+        write: Callable[..., None] | None = getattr(self, f"_ask_{name}", None)
         if write is not None:
             write(writer, *arguments)
         return b"".join(writer.parts)
@@ -168,10 +176,11 @@ class ProgramCoding:
             return self._message(reader)
         if code == Code.FAULT:
             return _FAULT.unpack(data)[0]
+        name, arguments = self._asked.popleft()
         if code == Code.ERROR:
-            return self._error(reader)
-        read: Callable[[_Reader], Any] | None = getattr(self, f"_answer_{self._asked}", None)
-        return None if read is None else read(reader)
+            return self._error(reader, name)
+        read: Callable[..., Any] | None = getattr(self, f"_answer_{name}", None)
+        return None if read is None else read(reader, *arguments)
 
     # Messages and errors
 
@@ -183,11 +192,11 @@ class ProgramCoding:
         index, status = reader.integer(), reader.integer()
         return as_record(self._name(index), status, reader.text(), reader.text())
 
-    def _error(self, reader: _Reader) -> FMUGymError:
+    def _error(self, reader: _Reader, asked: str) -> FMUGymError:
         if reader.flag() == _OF_INSTANCE:
             return SimulationError(self._failure(reader, reader.integer()))
         text = reader.text()
-        if self._asked == "open":
+        if asked == "open":
             return FMULoadError(loading_failed(self._setup.path.name, text))
         return SimulationError(text)
 
@@ -252,8 +261,11 @@ class ProgramCoding:
         writer.values(values, np.float64)
         writer.values(mask, np.bool_)
 
-    def _answer_reset(self, reader: _Reader) -> int:
-        return reader.integer()
+    def _answer_reset(self, reader: _Reader, *_: Any) -> int:
+        growth, count = reader.integer(), reader.integer()
+        ProgramCoding.initializations += count - self._initializations
+        self._initializations = count
+        return growth
 
     def _ask_begin_by(self, writer: _Writer, method: str) -> None:
         writer.flags(method == ResetMethod.INSTANCE)
@@ -274,7 +286,7 @@ class ProgramCoding:
     def _ask_bundle(self, writer: _Writer, indices: IndexArray) -> None:
         writer.block(np.ascontiguousarray(indices, np.int64).tobytes())
 
-    def _answer_bundle(self, reader: _Reader) -> Serialized:
+    def _answer_bundle(self, reader: _Reader, _: IndexArray) -> Serialized:
         return reader.block(), reader.indices(), reader.indices()
 
     def _ask_unbundle(self, writer: _Writer, bundle: Bundle, indices: IndexArray) -> None:
@@ -287,7 +299,7 @@ class ProgramCoding:
     def _ask_record_of(self, writer: _Writer, index: int) -> None:
         writer.integers(index)
 
-    def _answer_record_of(self, reader: _Reader) -> Record | None:
+    def _answer_record_of(self, reader: _Reader, _: int) -> Record | None:
         if reader.is_done:
             return None
         starts = [
@@ -298,18 +310,18 @@ class ProgramCoding:
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
 
     def _ask_failure(self, writer: _Writer, index: int) -> None:
-        self._index = index
         writer.integers(index)
 
-    def _answer_failure(self, reader: _Reader) -> str:
-        return self._failure(reader, self._index)
+    def _answer_failure(self, reader: _Reader, index: int) -> str:
+        return self._failure(reader, index)
 
     def _ask_read(self, writer: _Writer, variables: tuple[Variable, ...]) -> None:
-        self._shape = len(variables), self._setup.block.stop - self._setup.block.start
         writer.access(variables, self._version)
 
-    def _answer_read(self, reader: _Reader) -> FloatArray:
-        return np.frombuffer(reader.rest(), np.float64).reshape(self._shape)
+    def _answer_read(self, reader: _Reader, variables: tuple[Variable, ...]) -> FloatArray:
+        block = self._setup.block
+        shape = len(variables), block.stop - block.start
+        return np.frombuffer(reader.rest(), np.float64).reshape(shape)
 
 
 def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) -> None:
