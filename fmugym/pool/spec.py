@@ -14,7 +14,10 @@ __all__ = [
     "DEFAULT_LEAK_LIMIT",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
+    "DEFAULT_TOLERANCE",
+    "FIXED_STEP_SOLVERS",
     "SAMPLINGS",
+    "SOLVERS",
     "PoolSpec",
     "ResetMethod",
     "whole_number_of_steps",
@@ -28,6 +31,15 @@ SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 
 The order is that of ``Sampling`` in ``native/pool.h``.
 """
+
+SOLVERS: Final = ("dormand_prince", "euler", "rk4", "rosenbrock")
+"""The methods of integration for model exchange; see ``fmugym.fmi.methods``."""
+
+FIXED_STEP_SOLVERS: Final = ("euler", "rk4")
+
+DEFAULT_TOLERANCE: Final = 1e-6
+"""Relative tolerance of the solver where neither the config nor the FMU gives one: float32
+observations do not show smaller errors."""
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
 """How long a call to a worker process may take, in seconds of real time."""
@@ -89,6 +101,10 @@ class PoolSpec:
         licence_wait: How long to wait for a refused licence, in seconds of real time.
         blind_start: Whether outputs have the start values of the model description until the first
             step, because the FMU cannot be read before.
+        solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``; the
+            relative tolerance is ``solver_tolerance``.
+        max_step: The longest step of the solver, in seconds; None for no limit other than the
+            communication step.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
             FMU's states can be saved; see ``fmugym.pool.saving``.
     """
@@ -116,6 +132,8 @@ class PoolSpec:
     blind_start: bool = False
     samplings: tuple[str, ...] = ()
     records: bool = False
+    solver: str = SOLVERS[0]
+    max_step: float | None = None
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""
@@ -125,6 +143,11 @@ class PoolSpec:
     def start_outputs(self) -> tuple[float, ...]:
         """The start values of the outputs in the model description; 0 where it has none."""
         return tuple(variable.start_number for variable in self.outputs)
+
+    @property
+    def solver_tolerance(self) -> float:
+        """The relative tolerance of the solver for model exchange."""
+        return DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
 
     @property
     def communication_step_size(self) -> float:

@@ -41,6 +41,7 @@ class Constructed(Pictured):
     """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs."""
 
     fmi_version: ClassVar[int | None]
+    fmi_interface: ClassVar[str | None]
     reset_options: ClassVar[tuple[str, ...]]
     metadata: dict[str, Any]
 
@@ -85,7 +86,7 @@ class Constructed(Pictured):
         _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
         self.render_mode = self._checked_render_mode(render_mode)
-        self.fmu = open_fmu(type(self), fmu_path, self.config)
+        self.fmu = open_fmu(type(self), fmu_path, self.config, self.fmi_interface)
         self._require_fmi_version()
         self._interface = resolve(self.config, self.fmu.description)
         self._spec = self._interface.pool_spec()
@@ -145,7 +146,8 @@ class Constructed(Pictured):
             raise ConfigError(
                 f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
                 f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
-                f"derive from FMI{found}CSEnv instead"
+                f"derive from FMI{found}{'CS' if self.fmi_interface != 'model_exchange' else 'ME'}Env "
+                "instead"
             )
 
     def _warn_of_peculiarities(self) -> None:
