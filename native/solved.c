@@ -156,9 +156,13 @@ Status solved_set(const Library *library, void *component, Type type, const uint
             status = solver_enter_events(&me->solver);
         }
     }
-    return good(status)
-               ? fmi->set(library, me->solver.component, type, references, count, values)
-               : status;
+    if (good(status)) {
+        status = fmi->set(library, me->solver.component, type, references, count, values);
+    }
+    if (!good(status)) {
+        me->last[type].references = NULL;
+    }
+    return status;
 }
 
 Status solved_set_string(const Library *library, void *component, uint32_t reference,

@@ -180,7 +180,8 @@ Status solver_settle(Solver *me) {
         status = model->update(me->library, me->component, &events);
         restore_floats(me);
     }
-    me->memory.next_event = events.has_next ? events.next : INFINITY;
+    me->memory.next_event =
+        events.has_next && !isnan(events.next) ? events.next : INFINITY;
     me->memory.terminated |= events.terminate;
     if (!good(status) || events.terminate) {
         return status;

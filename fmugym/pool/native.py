@@ -705,14 +705,14 @@ def _solving(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] |
     model = description.model_exchange
     if model is None:
         return None
-    states = rates = None
+    solving, states, rates = spec.solving, None, None
     if description.capabilities.provides_directional_derivatives and model.state_references:
         states = np.array(model.state_references, np.uint32).tobytes()
         rates = np.array(model.derivative_references, np.uint32).tobytes()
     return (
-        spec.solver.encode(),
-        spec.solver_tolerance,
-        math.inf if spec.max_step is None else spec.max_step,
+        solving.solver.encode(),
+        solving.tolerance,
+        solving.max_step,
         model.number_of_states,
         model.number_of_event_indicators,
         model.needs_completed_integrator_step,

@@ -8,6 +8,8 @@ from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import Variable
+from fmugym.fmi.methods import METHODS
+from fmugym.fmi.solver import Solving
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -32,10 +34,11 @@ SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 The order is that of ``Sampling`` in ``native/pool.h``.
 """
 
-SOLVERS: Final = ("dormand_prince", "euler", "rk4", "rosenbrock")
+SOLVERS: Final = tuple(METHODS)
 """The methods of integration for model exchange; see ``fmugym.fmi.methods``."""
 
-FIXED_STEP_SOLVERS: Final = ("euler", "rk4")
+FIXED_STEP_SOLVERS: Final = tuple(name for name, method in METHODS.items() if not method.order)
+"""Those whose steps do not depend on the tolerance."""
 
 DEFAULT_TOLERANCE: Final = 1e-6
 """Relative tolerance of the solver where neither the config nor the FMU gives one: float32
@@ -101,8 +104,7 @@ class PoolSpec:
         licence_wait: How long to wait for a refused licence, in seconds of real time.
         blind_start: Whether outputs have the start values of the model description until the first
             step, because the FMU cannot be read before.
-        solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``; the
-            relative tolerance is ``solver_tolerance``.
+        solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
         max_step: The longest step of the solver, in seconds; None for no limit other than the
             communication step.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
@@ -145,9 +147,10 @@ class PoolSpec:
         return tuple(variable.start_number for variable in self.outputs)
 
     @property
-    def solver_tolerance(self) -> float:
-        """The relative tolerance of the solver for model exchange."""
-        return DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
+    def solving(self) -> Solving:
+        """How the equations of FMUs of model exchange are solved."""
+        tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
+        return Solving(self.solver, tolerance, self.max_step or math.inf)
 
     @property
     def communication_step_size(self) -> float:
