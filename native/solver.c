@@ -457,6 +457,43 @@ static Status complete(Solver *me, bool *event) {
     return status;
 }
 
+/* Takes a very short step if an indicator is 0. As the states move, it may become positive at once,
+ * and the sign after a whole step would not tell: a ball that bounces may be down again. */
+static Status leave_zero(Solver *me, double until, double *end, bool *event) {
+    bool any = false;
+
+    for (size_t i = 0; i < me->solving->indicators; i++) {
+        any |= me->z[i] == 0.0;
+    }
+    if (!any) {
+        return STATUS_OK;
+    }
+    *end = me->memory.time + resolution(me, until);
+    for (size_t i = 0; i < me->n; i++) {
+        me->next[i] = me->x[i] + (*end - me->memory.time) * me->rates[i];
+    }
+    Status status = place(me, *end, me->next);
+    if (good(status)) {
+        status = get_indicators(me, me->next_z);
+    }
+    *event = good(status) && crosses(me, me->z, me->next_z);
+    return status;
+}
+
+/* Takes a step as long as the method can, up to this time or the first event. */
+static Status take_whole_step(Solver *me, double until, double *end, bool *event) {
+    Status status = take_step(me, until, end);
+
+    if (good(status)) {
+        status = place(me, *end, me->next);
+    }
+    if (good(status)) {
+        status = get_indicators(me, me->next_z);
+    }
+    *event = good(status) && crosses(me, me->z, me->next_z);
+    return *event ? locate(me, end) : status;
+}
+
 /* Takes one step, to this time or the first event. */
 static Status step_to(Solver *me, double until) {
     bool state_event = false, step_event = false;
@@ -464,17 +501,10 @@ static Status step_to(Solver *me, double until) {
     Status status = know(me);
 
     if (good(status)) {
-        status = take_step(me, until, &end);
+        status = leave_zero(me, until, &end, &state_event);
     }
-    if (good(status)) {
-        status = place(me, end, me->next);
-    }
-    if (good(status)) {
-        status = get_indicators(me, me->next_z);
-    }
-    if (good(status) && crosses(me, me->z, me->next_z)) {
-        state_event = true;
-        status = locate(me, &end);
+    if (good(status) && !state_event) {
+        status = take_whole_step(me, until, &end, &state_event);
     }
     if (!good(status)) {
         return status;

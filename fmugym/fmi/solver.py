@@ -404,15 +404,32 @@ class Solver:
         if rates is not None and not interrupted:
             self.rates = rates
 
+    def _leave_zero(self, until: float) -> tuple[float, State] | None:
+        """Take a very short step if an indicator is 0, and return its end if that is an event.
+
+        As the states move, the indicator may become positive at once, and the sign after a whole
+        step would not tell: a ball that bounces may be down again.
+        """
+        if 0.0 not in self._z:
+            return None
+        end = self.time + self._resolution(until)
+        size = end - self.time
+        after = [x + size * rate for x, rate in zip(self.x, self.rates, strict=True)]
+        self._place(end, after)
+        return (end, after) if _crosses(self._z, self._indicators()) else None
+
     def _step_to(self, until: float) -> None:
         """Take one step, to this time or the first event."""
         self._know()
-        end, after = self._take_step(until)
-        self._place(end, after)
-        z = self._indicators()
-        event = _crosses(self._z, z)
-        if event:
-            end, after = self._locate(end, after, z)
+        left = self._leave_zero(until)
+        event, z = left is not None, self._z
+        end, after = left or self._take_step(until)
+        if not event:
+            self._place(end, after)
+            z = self._indicators()
+            event = _crosses(self._z, z)
+            if event:
+                end, after = self._locate(end, after, z)
         self._move_on(end, after, z, event)
         if self._fmu.completes:
             wants_event, terminate = self._fmu.complete()
