@@ -302,3 +302,207 @@ def stick_and_slip(step, count, belt=0.1, static=1.0, kinetic=0.6):
         else:
             rows.append([place + belt * since, belt, 0.0])
     return rows
+
+
+class TestPools:
+    """The contract of ``fmugym.pool.base`` for pools of model exchange."""
+
+    every_kind = pytest.mark.parametrize("kind", OPTIONS)
+    CASES = (
+        ("ball", [], ["h", "v", "bounces"], "h", "dormand_prince"),
+        ("circuit", ["duty"], ["voltage", "discharges"], "limit", "rk4"),
+        ("friction", [], ["x", "v", "mode"], "static", "dormand_prince"),
+        ("robertson", [], ["y1", "y2", "y3"], "y1", "rosenbrock"),
+        ("van_der_pol", [], ["x1", "x2"], "mu", "euler"),
+    )
+    every_case = pytest.mark.parametrize("case", CASES, ids=[f"{c[0]}-{c[4]}" for c in CASES])
+
+    @staticmethod
+    def episode(pool, steps, seed=1, first=0):
+        """Do steps with changing inputs; outputs and statuses of each."""
+        rng = np.random.default_rng(seed)
+        inputs = np.round(rng.uniform(0.2, 0.8, (first + steps, *pool.inputs.shape)), 1)
+        rows = []
+        for values in inputs[first:]:
+            outputs, statuses = pool.step(values)
+            assert not statuses.any(), pool.failure(int(statuses.argmax()))
+            rows.append(outputs.copy())
+        return np.array(rows)
+
+    def pool_of(self, make_pool, case, kind, n, **spec):
+        model, inputs, outputs, name, solver = case
+        step = 1.0 if model == "robertson" else 0.04
+        spec = {"solver": solver, "max_step": 0.01 if solver in ("euler", "rk4") else None} | spec
+        pool = make_pool(model, step, kind, n, inputs, outputs, **spec)
+        start(pool, {name: np.linspace(0.4, 1.0, n)})
+        return pool
+
+    @every_case
+    @pytest.mark.parametrize("kind", ["python", "process"])
+    def test_all_pools_give_the_same_bits(self, make_pool, case, kind):
+        native = self.episode(self.pool_of(make_pool, case, "native", 3), 60)
+        other = self.episode(self.pool_of(make_pool, case, kind, 3), 60)
+        assert native.tobytes() == other.tobytes()
+
+    @every_case
+    def test_neighbours_and_threads_change_nothing(self, make_pool, case):
+        many = self.episode(self.pool_of(make_pool, case, "native", 200), 20)
+        again = self.episode(self.pool_of(make_pool, case, "native", 200), 20)
+        assert many.tobytes() == again.tobytes()
+        alone = self.pool_of(make_pool, case, "python", 200)
+        assert self.episode(alone, 20).tobytes() == many.tobytes()
+
+    @every_case
+    @every_kind
+    def test_a_restored_state_goes_on_in_the_same_way(self, make_pool, case, kind):
+        pool = self.pool_of(make_pool, case, kind, 2)
+        self.episode(pool, 17)
+        snapshot = pool.save()
+        went_on = self.episode(pool, 30, first=17)
+        pool.restore(snapshot)
+        assert self.episode(pool, 30, first=17).tobytes() == went_on.tobytes()
+
+    @every_case
+    @pytest.mark.parametrize("kinds", [("native", "python"), ("python", "native")])
+    def test_states_pass_from_pool_to_pool(self, make_pool, case, kinds):
+        first, second = (self.pool_of(make_pool, case, kind, 1) for kind in kinds)
+        for pool in (first, second):
+            pool.trust_states_if(lambda: True)
+        self.episode(first, 17)
+        zero = np.zeros(1, np.int64)
+        second.restore_instances(first.save_instances(zero), zero, zero)
+        went_on = self.episode(first, 30, first=17)
+        assert self.episode(second, 30, first=17).tobytes() == went_on.tobytes()
+
+    @every_kind
+    def test_a_reset_forgets_the_solver(self, make_pool, kind):
+        case = self.CASES[0]
+        pool = self.pool_of(make_pool, case, kind, 2)
+        first = self.episode(pool, 30)
+        start(pool, {case[3]: np.linspace(0.4, 1.0, 2)})
+        assert self.episode(pool, 30).tobytes() == first.tobytes()
+
+    @every_kind
+    def test_tunable_parameters_change_between_steps(self, make_pool, kind):
+        pool = make_pool("dahlquist", 0.5, kind, inputs=["u"])
+        start(pool)
+        pool.step(np.array([[1.0]]))
+        x = pool.outputs[0, 0]
+        pool.write((pool.variable("k"),), np.array([[2.0]]))
+        outputs, _ = pool.step(np.array([[1.0]]))
+        assert outputs[0, 0] == pytest.approx(0.5 + (x - 0.5) * math.exp(-1), abs=1e-6)
+
+    @every_kind
+    def test_warm_up_and_substeps(self, make_pool, kind):
+        pool = make_pool("dahlquist", 0.5, kind, warm_up_steps=3, substeps=4)
+        start(pool)
+        assert pool.outputs[0, 0] == pytest.approx(math.exp(-1.5), abs=1e-6)
+        assert pool.step()[0][0, 0] == pytest.approx(math.exp(-2), abs=1e-6)
+
+
+E = np.array([0.7], np.float32)
+"""The action: which part of its speed the ball keeps."""
+
+
+class BallEnv(fmugym.FMI2MEEnv):
+    """Is done when the ball has bounced thrice."""
+
+    def __init__(self, path, backend=None, isolation=None, **config):
+        config = {
+            "model_input_names": "e",
+            "bounds": {"e": (0, 1)},
+            "model_output_names": ["h", "v", "bounces"],
+            "model_parameters": {"h": fmugym.Uniform(0.5, 1.5)},
+            "time_step": 0.05,
+        } | config
+        super().__init__(path, config, backend=backend, isolation=isolation)
+
+    def _is_done(self):
+        return self.out["bounces"] > 2.5
+
+
+class AnyBallEnv(BallEnv):
+    fmi_interface = None
+
+
+class TestEnvironments:
+    BOTH = ("ModelExchange", "CoSimulation")
+
+    def test_an_episode(self, fmu_path):
+        env = BallEnv(fmu_path("ball"))
+        env.reset(seed=3)
+        first = env.state[0]
+        terminated, steps = False, 0
+        while not terminated:
+            _, _, terminated, truncated, _ = env.step(E)
+            steps += 1
+            assert not truncated
+        fall = math.sqrt(2 * first / 9.81)
+        last = fall * (1 + 2 * 0.7 + 2 * 0.49)  # the third bounce
+        assert steps == math.ceil(last / 0.05)
+        env.close()
+
+    def test_a_vector_environment_gives_the_same_as_single_ones(self, fmu_path):
+        path = fmu_path("ball")
+        many = fmugym.FMUVectorEnv(lambda: BallEnv(path), 4)
+        many.reset(seed=7)
+        singles = [BallEnv(path) for _ in range(4)]
+        for seed, env in enumerate(singles, start=7):
+            env.reset(seed=seed)
+        for _ in range(20):
+            observations, *_ = many.step(np.tile(E, (4, 1)))
+            expected = [env.step(E)[0] for env in singles]
+            np.testing.assert_array_equal(observations, expected)
+        for env in (many, *singles):
+            env.close()
+
+    @pytest.mark.parametrize("isolation", ["none", "process"])
+    def test_a_snapshot(self, fmu_path, isolation):
+        env = BallEnv(fmu_path("ball"), isolation=isolation)
+        env.reset(seed=1)
+        for _ in range(11):
+            env.step(E)
+        snapshot = env.save_state()
+        went_on = [env.step(E)[0].tolist() for _ in range(10)]
+        env.restore_state(snapshot)
+        assert [env.step(E)[0].tolist() for _ in range(10)] == went_on
+        env.close()
+
+    def test_an_fmu_with_both_interfaces_may_choose(self, fmu_path):
+        path = fmu_path("ball", interfaces=self.BOTH)
+        for interface in (None, "co_simulation", "model_exchange"):
+            env = AnyBallEnv(path, interface=interface)
+            assert env.fmu.description.interface == (interface or "co_simulation")
+            env.reset(seed=1)
+            for _ in range(8):
+                env.step(E)
+            exact = TestEvents.height(0.4, h=env.parameters["h"])
+            is_exact = abs(env.state[0] - exact) < 1e-6
+            assert is_exact == (interface == "model_exchange")
+            env.close()
+
+    def test_interfaces_that_contradict_each_other(self, fmu_path):
+        with pytest.raises(ConfigError, match=r"co_simulation.*BallEnv.*model_exchange"):
+            BallEnv(fmu_path("ball"), interface="co_simulation")
+        with pytest.raises(FMULoadError, match=r"model exchange.*co-simulation"):
+            BallEnv(fmu_path("ball", interfaces=("CoSimulation",)))
+        with pytest.raises(FMULoadError, match=r"co-simulation.*model exchange"):
+            AnyBallEnv(fmu_path("ball"), interface="co_simulation")
+
+    @pytest.mark.parametrize(
+        "config", [{"solver": "rk45"}, {"solver": 4}, {"max_step": 0}, {"interface": "me"}]
+    )
+    def test_bad_config(self, fmu_path, config):
+        with pytest.raises(ConfigError, match=next(iter(config))):
+            BallEnv(fmu_path("ball"), **config)
+
+    def test_a_solver_that_gives_up_truncates(self, fmu_path):
+        env = BallEnv(fmu_path("ball"), model_parameters={"v_min": 0.0}, time_step=1.0)
+        env._is_done = lambda: False
+        env.reset()
+        results = [env.step(E) for _ in range(3)]
+        assert [result[3] for result in results] == [False, False, True]
+        assert "100000" in results[-1][4]["fault"]
+        env.reset()
+        assert not env.step(E)[3]
+        env.close()
