@@ -27,7 +27,7 @@ static bool build(Pool *pool, Instance *me, bool logging) {
                                log_environment(&pool->log, index), logging,
                                &s->solving, &pool->floats};
 
-    pace_wait(&pool->pace);
+    pace_wait(&pool->settings.pace);
     mutex_lock(pool->making);
     begin_call(CALL_INSTANTIATE);
     me->component = s->fmi->instantiate(me->library, &identity);

@@ -10,18 +10,15 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
+from fmugym.declared.devices import DEVICE_KEYS
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.functions import FUNCTIONS
 from fmugym.declared.quantities import duration
 from fmugym.declared.series import Series, read_data, read_schedule
-from fmugym.declared.variables import (
-    Record,
-    Records,
-    number,
-    number_or_distribution,
-    start_value,
-)
+from fmugym.declared.values import number, number_or_distribution
+from fmugym.declared.variables import Record, Records, start_value
+from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
 
@@ -119,6 +116,7 @@ class Declarations:
         observed: The names that the agent sees, and where they stand.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
+        warm_up: What happens before an episode begins.
     """
 
     root: Entry
@@ -134,6 +132,7 @@ class Declarations:
     rewards: dict[str, Term] = field(init=False)
     costs: dict[str, Term] = field(init=False)
     flags: dict[str, Expression] = field(init=False)
+    warm_up: WarmUpTable = field(init=False)
 
     @classmethod
     def read(cls, root: Entry, description: ModelDescription) -> Declarations:
@@ -154,6 +153,7 @@ class Declarations:
         root.required("agent").table(AGENT_KEYS)
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
+        declared.warm_up = read_warm_up(root, declared.actions)
         declared.observed = list(declared._read_observed())
         declared.rewards = _terms(root.child("reward"), ("expr", "weight"))
         declared.costs = _terms(root.child("costs"), ("expr", "limit"))
@@ -193,7 +193,7 @@ class Declarations:
 
     @property
     def expressions(self) -> list[Expression]:
-        """All expressions."""
+        """All expressions, and the names that controllers measure."""
         updates = [memory.update for memory in self.memory.values()]
         terms = [*self.rewards.values(), *self.costs.values()]
         return [
@@ -202,6 +202,7 @@ class Declarations:
             *(derived.expression for derived in self.derived.values()),
             *(term.expression for term in terms),
             *self.flags.values(),
+            *map(Expression.parse, self.warm_up.signals()),
         ]
 
     def is_output(self, name: str) -> bool:
@@ -294,8 +295,8 @@ class Declarations:
             self.records.check_input(entry, record)
             if record.variable is None and not record.is_direct:
                 raise record.entry.error(
-                    f"{record.alias!r} is no input of the FMU: 'delta', 'rate', 'min_on' and "
-                    "'min_off' are for inputs"
+                    f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
+                    f"{', '.join(map(repr, DEVICE_KEYS))} are for inputs"
                 )
         if len({bool(record.levels) for record in actions}) > 1:
             raise entry.error("either all actions have levels, or none has")
@@ -313,12 +314,14 @@ class Declarations:
             if target.value is not None:
                 unit = series.entry.child("unit")
                 record = self.records.input_of(target, None if unit.value is None else unit.text())
+                _require_plain_input(record)
                 yield record.alias, (record, Expression.parse(name))
         for entry in _section(self.root, "inputs"):
             record = self.records.find(entry, entry.name, "input")
             if record in self.actions and record.variable is not None:
                 raise entry.error(f"{entry.name!r} is an action already")
             self.records.check_input(entry, record)
+            _require_plain_input(record)
             yield entry.name, (record, parsed(entry))
 
     def _read_observed(self) -> Iterator[tuple[Entry, str]]:
@@ -329,6 +332,15 @@ class Declarations:
                 if record not in self.actions:
                     self.records.check_output(entry, name)
             yield entry, name
+
+
+def _require_plain_input(record: Record) -> None:
+    """Refuse keys of actuators for an input that no action writes: they would do nothing."""
+    if not record.is_direct or record.levels:
+        raise record.entry.error(
+            f"{record.alias!r} is written by an expression, not by an action: only 'name', 'unit', "
+            "'min' and 'max' are for it"
+        )
 
 
 SETPOINTS: Final = ("value", "schedule", "steps", "ramp", "sine")

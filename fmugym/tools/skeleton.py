@@ -64,7 +64,7 @@ from fmugym.testing import check_fmu_env
 FMU_PATH = {path}  # a relative path is relative to this file
 
 
-class {name}(fmugym.FMI{version}CSEnv):
+class {name}(fmugym.{base}):
     """TODO: what is there to learn?"""
 
     def __init__(self, log_level: int = logging.WARNING) -> None:
