@@ -160,6 +160,7 @@ class Library(TypedDict):
     states: bool
     categories: tuple[bytes, ...]
     mark: Mark | None
+    solving: tuple[Any, ...] | None
 
 class Experiment(TypedDict):
     """The times of an episode."""

@@ -50,10 +50,10 @@ class FMUEnv(Constructed):
     """An FMU as a Gymnasium environment.
 
     A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv``, or from
-    ``FMI2MEEnv`` for model exchange, and supplies ``_is_done``; every other hook of ``fmugym.task.hooks.Hooks`` has a default. A step calls the
-    hooks once each, in the order in which they stand there. All but ``_get_inputs`` and ``_update``
-    must be free of side effects. None may draw random numbers; random values are distributions in
-    the config.
+    ``FMI2MEEnv`` for model exchange, and supplies ``_is_done``; every other hook of
+    ``fmugym.task.hooks.Hooks`` has a default. A step calls the hooks once each, in the order in
+    which they stand there. All but ``_get_inputs`` and ``_update`` must be free of side effects.
+    None may draw random numbers; random values are distributions in the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.

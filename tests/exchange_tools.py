@@ -5,7 +5,6 @@ from pathlib import Path
 import building
 import fmu_tools
 
-
 STATES = {
     "dahlquist": ["x"],
     "ball": ["h", "v"],

@@ -13,7 +13,7 @@ from fmpy.fmi2 import FMU2Model, fmi2EventInfo
 from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
 from fmugym.fmi.methods import State
-from fmugym.fmi.solver import Equations, Events, Failed, Memory, Mode, Solver, Solving
+from fmugym.fmi.solver import CallError, Equations, Events, Memory, Mode, Solver, Solving
 from fmugym.fmi.status import Status, sane
 
 __all__ = ["ExchangeInstance", "FMI2ExchangeInstance"]
@@ -51,7 +51,9 @@ class ExchangeInstance(Instance):
         self._last.clear()
 
     def _prepare_initialization(self) -> Initialize:
-        solver, initialize = self._own_solver(), super()._prepare_initialization()
+        solver = self._own_solver()
+        # the class of the FMI version, which stands between this one and Instance
+        initialize = super()._prepare_initialization()  # type: ignore[safe-super]
 
         def run(span: Span, set_start_values: Callable[[], None]) -> None:
             self._forget(Memory(time=span.start_time))
@@ -59,7 +61,7 @@ class ExchangeInstance(Instance):
             solver.forget(Memory(time=span.start_time, mode=Mode.IN_EVENTS))
             try:
                 solver.settle()
-            except Failed as failure:
+            except CallError as failure:
                 self.check("the initial event", failure.status)
 
         return run
@@ -81,7 +83,7 @@ class ExchangeInstance(Instance):
             try:
                 if mode is Mode.IN_CONTINUOUS_TIME:
                     solver.enter_events()
-            except Failed as failure:
+            except CallError as failure:
                 return failure.status
             return int(set_(*arguments))
 
@@ -128,7 +130,7 @@ class FMUEquations(Equations):
     def __init__(self, instance: ExchangeInstance) -> None:
         description = instance._description
         model = description.model_exchange
-        assert model is not None  # noqa: S101  (for the type checker: the class was chosen by it)
+        assert model is not None
         self._instance = instance
         self.number_of_states = model.number_of_states
         self.number_of_indicators = model.number_of_event_indicators
@@ -146,7 +148,7 @@ class FMUEquations(Equations):
             function = self._functions[name] = self._instance._function(name)
         status = sane(function(self._instance._component, *arguments))
         if status > Status.WARNING:
-            raise Failed(status)
+            raise CallError(status)
 
     def _get(self, name: str, buffer: Any, count: int) -> State:
         self._call(name, buffer, ctypes.c_size_t(count))
@@ -158,7 +160,7 @@ class FMUEquations(Equations):
 
     def set_states(self, x: State) -> None:
         """See ``Equations.set_states``."""
-        self._numbers[:] = x
+        self._numbers[: len(x)] = x  # type: ignore[assignment]  # ctypes converts floats
         self._call("SetContinuousStates", self._numbers, ctypes.c_size_t(len(x)))
 
     def get_states(self) -> State:

@@ -17,7 +17,7 @@ from typing import ClassVar, Final, NamedTuple
 from fmugym.fmi.methods import METHODS, State
 from fmugym.fmi.status import Status
 
-__all__ = ["Equations", "Events", "Failed", "Memory", "Mode", "Solver", "Solving"]
+__all__ = ["CallError", "Equations", "Events", "Memory", "Mode", "Solver", "Solving"]
 
 _MOST_UPDATES: Final = 1000
 _MOST_EVENTS: Final = 100_000
@@ -48,7 +48,7 @@ class Solving:
     max_step: float = math.inf
 
 
-class Failed(Exception):
+class CallError(Exception):
     """A call of the FMU returned a status worse than a warning, or the solver gives up."""
 
     def __init__(self, status: int) -> None:
@@ -108,7 +108,7 @@ class Events(NamedTuple):
 
 
 class Equations(ABC):
-    """The functions of model exchange of one instance. All raise ``Failed`` for a bad status."""
+    """The functions of model exchange of one instance. All raise ``CallError`` for a bad status."""
 
     number_of_states: int
     number_of_indicators: int
@@ -199,9 +199,9 @@ class Solver:
     def _remember(self, **changes: object) -> None:
         self.memory = replace(self.memory, **changes)  # type: ignore[arg-type]
 
-    def _fail(self, text: str) -> Failed:
+    def _fail(self, text: str) -> CallError:
         self._complain(text)
-        return Failed(Status.ERROR)
+        return CallError(Status.ERROR)
 
     # Calls of the FMU.
 
@@ -375,7 +375,7 @@ class Solver:
             end = until if size >= remaining else self.time + size
             try:
                 after, error = self._method.step(self, end)
-            except Failed as failure:
+            except CallError as failure:
                 if not self._method.order or failure.status != Status.DISCARD:
                     raise
                 error = math.inf
@@ -447,7 +447,7 @@ class Solver:
         """Integrate to this time, and handle all events until then and at it; return the status."""
         try:
             return self._advance(until)
-        except Failed as failure:
+        except CallError as failure:
             return failure.status
 
     def _advance(self, until: float) -> int:

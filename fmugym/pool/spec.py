@@ -14,10 +14,10 @@ from fmugym.fmi.solver import Solving
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "DEFAULT_LEAK_LIMIT",
-    "INITIALIZATION_FACTOR",
-    "ISOLATIONS",
     "DEFAULT_TOLERANCE",
     "FIXED_STEP_SOLVERS",
+    "INITIALIZATION_FACTOR",
+    "ISOLATIONS",
     "SAMPLINGS",
     "SOLVERS",
     "PoolSpec",

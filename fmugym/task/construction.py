@@ -153,11 +153,11 @@ class Constructed(Pictured):
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
         if self.fmi_version is not None and found != self.fmi_version:
+            kind = "CS" if self.fmu.description.interface == "co_simulation" else "ME"
             raise ConfigError(
                 f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
                 f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
-                f"derive from FMI{found}{'CS' if self.fmi_interface != 'model_exchange' else 'ME'}Env "
-                "instead"
+                f"derive from FMI{found}{kind}Env instead"
             )
 
     def _warn_of_peculiarities(self) -> None:

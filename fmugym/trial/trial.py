@@ -365,7 +365,10 @@ def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> No
     An FMU that is found to harm its process counts as harmful with every other config, too.
     """
     verdict = _with_harm(verdict, candidate)
-    for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path, candidate.interface)):
+    for key in (
+        _verdict_key(candidate, spec, starts),
+        _content_key(candidate.path, candidate.interface),
+    ):
         remember(key, verdict.to_text())
 
 
@@ -423,7 +426,9 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         *(name, verdict.instances, verdict.initializations),
     )
     if verdict.complete:
-        remember(_content_key(request.candidate.path, request.candidate.interface), verdict.to_text())
+        remember(
+            _content_key(request.candidate.path, request.candidate.interface), verdict.to_text()
+        )
     return verdict
 
 
@@ -690,7 +695,9 @@ def content_of(path: Path) -> str:
 def _content_key(path: Path, interface: str) -> str:
     """The scope of a verdict: content, interface, platform, and version of the package."""
     scope = f"{content_of(path)} {fmpy.platform_tuple} {_version()}"
-    return _digest(f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode())
+    return _digest(
+        f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode()
+    )
 
 
 @functools.lru_cache(maxsize=256)
