@@ -50,6 +50,7 @@ from fmugym.pool.settings import (
     experiment_settings,
     library_settings,
     record_from,
+    solving_settings,
     types_and_references,
     variable_settings,
     variables_of,
@@ -154,6 +155,7 @@ class NativePool(SavingPool):
                         "private": private_libraries,
                         "logging": log.isEnabledFor(logging.INFO),
                         "mark": None if self._mark is None else self._mark.page,
+                        "solving": solving_settings(description, spec),
                     },
                 ),
                 experiment=cast("_native.Experiment", experiment_settings(spec)),
@@ -185,7 +187,9 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
-            access = _native.Access(version, *types_and_references(variables, version))
+            is_exchange = self._fmu.description.model_exchange is not None
+            parts = types_and_references(variables, version)
+            access = _native.Access(version, *parts, is_exchange)
             self._accesses[variables] = access
         return access
 

@@ -24,6 +24,7 @@ __all__ = [
     "experiment_settings",
     "library_settings",
     "record_from",
+    "solving_settings",
     "types_and_references",
     "variable_settings",
     "variables_of",
@@ -128,6 +129,27 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
         "strings": tuple((v.value_reference, text.encode()) for v, text in spec.strings),
         "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
     }
+
+
+def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
+    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    model = description.model_exchange
+    if model is None:
+        return None
+    solving, states, rates = spec.solving, None, None
+    if description.capabilities.provides_directional_derivatives and model.state_references:
+        states = np.array(model.state_references, np.uint32).tobytes()
+        rates = np.array(model.derivative_references, np.uint32).tobytes()
+    return (
+        solving.solver.encode(),
+        solving.tolerance,
+        solving.max_step,
+        model.number_of_states,
+        model.number_of_event_indicators,
+        model.needs_completed_integrator_step,
+        states,
+        rates,
+    )
 
 
 def types_and_references(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes]:

@@ -7,9 +7,9 @@
 #include "../records.h"
 #include "worker.h"
 
-static const Fmi *fmi_of(int64_t version) {
-    static const Fmi *const versions[] = {&fmi1, &fmi2, &fmi3};
-    return version < 1 || version > 3 ? NULL : versions[version - 1];
+static const Fmi *fmi_of(int64_t version, bool exchange) {
+    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3}, {NULL, &exchange2, NULL}};
+    return version < 1 || version > 3 ? NULL : versions[exchange][version - 1];
 }
 
 bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
@@ -106,10 +106,42 @@ static const char *const *read_texts(Reader *reader, size_t *count) {
     return texts;
 }
 
+/* Copies a block of value references, one for each state; NULL if it is empty. */
+static const uint32_t *read_references(Reader *reader, size_t states) {
+    size_t size;
+    const char *bytes = read_block(reader, &size);
+    uint32_t *references = malloc(size + 1);
+
+    reader->sound = reader->sound && references != NULL &&
+                    (size == 0 || size == states * sizeof *references);
+    if (!reader->sound || size == 0) {
+        free(references);
+        return NULL;
+    }
+    return memcpy(references, bytes, size);
+}
+
+static void read_solving(Reader *reader, Solving *solving) {
+    solving->method = method_of(read_text(reader));
+    solving->tolerance = read_number(reader);
+    solving->max_step = read_number(reader);
+    solving->states = (size_t)read_integer(reader);
+    solving->indicators = (size_t)read_integer(reader);
+    solving->completes = read_flag(reader);
+    solving->state_references = read_references(reader, solving->states);
+    solving->rate_references = read_references(reader, solving->states);
+    reader->sound = reader->sound && solving->method != NULL;
+}
+
 static void read_library(Reader *reader, Settings *s) {
     size_t paths;
+    const int64_t version = read_integer(reader);
+    const bool exchange = read_flag(reader);
 
-    s->fmi = fmi_of(read_integer(reader));
+    s->fmi = fmi_of(version, exchange);
+    if (exchange) {
+        read_solving(reader, &s->solving);
+    }
     s->model = read_text(reader);
     s->token = read_text(reader);
     s->resources = read_text(reader);

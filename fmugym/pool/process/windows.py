@@ -31,6 +31,7 @@ from fmugym.pool.settings import (
     experiment_settings,
     library_settings,
     record_from,
+    solving_settings,
     types_and_references,
     variable_settings,
 )
@@ -219,6 +220,8 @@ class ProgramCoding:
         place = PlaceOfFMU.in_wine(
             setup.folder, setup.folder / setup.library, description.fmi_major_version
         )
+        writer.integers(description.fmi_major_version)
+        _write_solving(writer, solving_settings(description, spec))
         _write_library(writer, library_settings(description, place), setup.log_level)
         experiment = experiment_settings(spec)
         _write_experiment(writer, experiment)
@@ -325,12 +328,23 @@ class ProgramCoding:
 
 
 def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) -> None:
-    writer.integers(library["version"])
     for name in ("model", "token", "resources"):
         writer.text(library[name])
     _write_texts(writer, library["paths"])
     writer.flags(log_level <= logging.INFO, library["states"])
     _write_texts(writer, library["categories"])
+
+
+def _write_solving(writer: _Writer, solving: tuple[Any, ...] | None) -> None:
+    writer.flags(solving is not None)
+    if solving is not None:
+        name, tolerance, max_step, states, indicators, completes, references, rates = solving
+        writer.text(name)
+        writer.numbers(tolerance, max_step)
+        writer.integers(states, indicators)
+        writer.flags(completes)
+        writer.block(references or b"")
+        writer.block(rates or b"")
 
 
 def _write_texts(writer: _Writer, texts: Sequence[bytes]) -> None:
