@@ -170,9 +170,10 @@ def _sentence(content: bytes) -> list[str]:
         return []
     if content[1] == _NO_CALL:
         said = content[_TEXT].partition(b"\0")[0].decode(errors="replace").strip()
+        how = describe_exit(-content[0])
         return [
-            f"in training, its process ended with {describe_exit(-content[0])} outside of its calls "
-            f"because the heap was damaged ({printable(said)})"
+            f"in training, its process ended with {how} outside of its calls because the heap was "
+            f"damaged ({printable(said)})"
         ]
     how = "a call of exit" if content[0] == _EXIT else describe_exit(-content[0])
     return [f"in training, it ended its process with {how} in {_CALLS[content[1]]}"]
