@@ -1,9 +1,10 @@
 """Compare every FMU of a folder with FMPy: ``python tests/held_out.py FOLDER [--timeout S]``.
 
 Each FMU for co-simulation plays three episodes with inputs that move: in a single environment, in
-vector environments with one and two threads, and in worker processes. FMPy makes the same calls on a fresh instance of a
-fresh copy of the library for each episode. Each of these runs in a process of its own. There is a
-line for each FMU, and the share of right ones among those that FMPy can step at the end.
+vector environments with one and with two threads, and in worker processes. FMPy makes the same
+calls on a fresh instance of a fresh copy of the library for each episode. Each of these runs in a
+process of its own. There is a line for each FMU, and the share of right ones among those that FMPy
+can step at the end.
 
 "same" means equal to the last bit, "close" within ten solver tolerances.
 """
