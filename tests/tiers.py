@@ -8,6 +8,7 @@ in the default run: of a test with many combinations of parameters, it takes eve
 SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
+    "test_copies",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
@@ -45,6 +46,7 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_copies": 2,
     "test_quirks": 4,
     "test_words": 5,
     "test_zoo": 5,
