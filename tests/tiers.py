@@ -12,6 +12,7 @@ SLOW_MODULES = {
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
+    "test_examples_planners",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
@@ -47,6 +48,7 @@ EVERY_OF_OTHERS = 31
 
 EVERY_IN_CI = {
     "test_copies": 2,
+    "test_examples_planners": 4,
     "test_quirks": 4,
     "test_words": 5,
     "test_zoo": 5,
