@@ -20,7 +20,7 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification", "linearization"},
-    {"registration", "recording", "single", "testing", "sb3", "declared", "baselines"},
+    {"registration", "recording", "single", "testing", "sb3", "declared", "baselines", "series"},
     {"envs", "tools"},
     {"__init__", "__main__", "clock"},
 ]

@@ -67,6 +67,7 @@ class TaskEnv(FMUEnv):
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
         self.cost_limits = plan.cost_limits
+        self._quantities_of_task = plan.quantities
         self._observation_names, self._masks = plan.observation_names, plan.action_masks
         for name, function in plan.hooks.items():
             if name not in _own_hooks(type(self)):
