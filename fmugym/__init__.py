@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fmugym.task.snapshot import Snapshot
     from fmugym.vector import FMUVectorEnv
     from fmugym.vector.sensitivities import derivatives
+    from fmugym.vector.trajectories import linearize_along
 
 __all__ = [
     "FMU",
@@ -68,6 +69,7 @@ __all__ = [
     "derivatives",
     "envs",
     "linearize",
+    "linearize_along",
     "load",
     "register",
     "replay",
@@ -92,6 +94,7 @@ _MODULES = {
     "linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
     "vector.sensitivities": ["derivatives"],
+    "vector.trajectories": ["linearize_along"],
 }
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),

@@ -22,13 +22,14 @@ from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
 from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
-from fmugym.task.episode import Episode
+from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import output_variable
 from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
 from fmugym.task.waiting import Waiting
+from fmugym.task.warm_up import WarmUps, rows_of_one
 
 __all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
 
@@ -170,10 +171,11 @@ class FMUEnv(Constructed):
         episode = plan.draw(self.np_random if generator is None else generator)
         self._ended = True  # there is no episode if the FMU fails
         try:
-            pool.reset(plan.model_variables, episode.start_values)
-            if pool.statuses.item(0) > Status.WARNING:
-                raise failed_reset(pool.failure(0))
-            self._begin_episode(episode)
+            if self._warm_ups is None:
+                self._reset_pool(pool, plan, episode)
+                self._begin_episode(episode)
+            else:
+                self._begin_with_warm_up(self._warm_ups, pool, plan, episode)
             observation, info = self._observation_and_info()
         except BaseException:
             self._ended = True
@@ -183,6 +185,33 @@ class FMUEnv(Constructed):
         if self.render_mode == "human":
             self.render()
         return observation, info
+
+    @staticmethod
+    def _reset_pool(pool: Pool, plan: EpisodePlan, episode: Episode) -> None:
+        pool.reset(plan.model_variables, episode.start_values)
+        if pool.statuses.item(0) > Status.WARNING:
+            raise failed_reset(pool.failure(0))
+
+    def _begin_with_warm_up(
+        self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
+    ) -> None:
+        """Begin an episode with a warm-up, or in the state that an earlier one has led to."""
+        starts = episode.start_values
+        rows = {name: np.asarray(v)[..., None] for name, v in episode.variables.items()}
+        found = warm_ups.find(pool, plan.model_variables, starts, rows, [0])
+        if not found:
+            self._reset_pool(pool, plan, episode)
+        self._begin_episode(episode)
+        if found:
+            warm_ups.restore(pool, found)
+            variables = found[0].variables
+        else:
+            written = warm_ups.run(pool, rows_of_one(self), np.zeros(1, np.int64))
+            variables = {name: row[..., 0] for name, row in written.items()}
+        self.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
+        self.inputs = tuple(self._input_row.tolist())
+        self._values = tuple(self._output_row.tolist())
+        self.state = self.previous_state = self._values[: self._output_count]
 
     def _prepare_player(self, pool: Pool) -> None:
         """Prepare to compile the hooks, where that may be possible."""
@@ -398,7 +427,7 @@ class FMUEnv(Constructed):
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
-        steps = self._spec.warm_up_steps + self.step_count
+        steps = self._warm_up_steps + self.step_count
         return self._spec.communication_point(steps * self._spec.substeps)
 
     def _fault_of_hooks(

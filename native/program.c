@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "fmi.h"
+#include "halves.h"
 #include "platform.h"
 
 #define NAME_IT(operation, name) [operation] = name,
@@ -66,7 +67,8 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
     case CALL:
         return i.extra < program->number_of_calls;
     case CALL_SQUARE:
-        return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2;
+        return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2 &&
+               program->calls[i.extra].values == 3;
     case CAST:
         return i.extra < VALUE_TYPES * VALUE_TYPES;
     case TAKE:
@@ -245,7 +247,7 @@ static void load_stopped(const Source *s, size_t begin, size_t count, uint8_t *t
     }
 }
 
-static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1};
+static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1, 2};
 
 /* The first loop looks whether there is any such value; nearly always there is none. */
 #define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
@@ -261,6 +263,12 @@ static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 
 
 NOTE_NOT_FINITE(double, note_not_finite, int64_t, fabs, DBL_MAX)
 NOTE_NOT_FINITE(float, note_not_finite32, int32_t, fabsf, FLT_MAX)
+
+static void note_not_finite16(const Half *values, size_t count, Notes *notes) {
+    for (size_t j = 0; j < count; j++) {
+        notes->not_finite[j] |= !half_is_finite(values[j]);
+    }
+}
 
 void program_clear_seen(const Program *program, char *const *seen, size_t index) {
     for (size_t i = 0; i < program->number_of_slots; i++) {
@@ -280,6 +288,8 @@ static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t c
         note_not_finite(from, count, notes);
     } else if (slot->type == VALUE_FLOAT) {
         note_not_finite32(from, count, notes);
+    } else if (slot->type == VALUE_HALF) {
+        note_not_finite16(from, count, notes);
     }
 }
 
@@ -289,12 +299,15 @@ static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t c
 static void call(const Called *called, size_t count, size_t lanes, const Registers *registers,
                  Instruction i) {
     const void *const *places = registers->places;
-    char *data[CALL_INPUTS + 1] = {(char *)places[i.a], (char *)places[i.b], (char *)places[i.c]};
+    char *data[CALL_VALUES] = {(char *)places[i.a], (char *)places[i.b], (char *)places[i.c]};
     const ptrdiff_t length = (ptrdiff_t)count;
+    Register other; /* the result that another instruction keeps */
 
-    data[called->inputs] = (char *)registers->own[i.to].bytes;
+    for (size_t k = called->inputs; k < called->values; k++) {
+        data[k] = (char *)(k == called->kept ? registers->own[i.to].bytes : other.bytes);
+    }
     called->loop(called->context, data, &length, called->sizes, called->auxiliary);
-    clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->inputs]);
+    clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->kept]);
 }
 
 /* Computing the end from the blocks shows the compiler that no value is left over. */
@@ -371,10 +384,9 @@ static void call_square(const Called *called, size_t count, size_t lanes, const 
         }                                                                                          \
         break;
 
-WIDE static void cast(uint16_t types, const void *from, size_t blocks, void *to) {
-    const int to_type = types % VALUE_TYPES;
-
-    switch (types / VALUE_TYPES) {
+WIDE static void cast_numbers(int from_type, int to_type, const void *from, size_t blocks,
+                              void *to) {
+    switch (from_type) {
         CASTS_FROM(0, double)
         CASTS_FROM(1, float)
         CASTS_FROM(2, int64_t)
@@ -386,6 +398,39 @@ WIDE static void cast(uint16_t types, const void *from, size_t blocks, void *to)
         CASTS_FROM(8, uint16_t)
         CASTS_FROM(9, uint8_t)
         CASTS_FROM(10, Flag)
+    }
+}
+
+/* A half becomes a float first, as in numpy. */
+static void cast_halves(const Half *from, int to_type, size_t blocks, void *to) {
+    Register floats;
+
+    EACH_LANE(floats.floats[j] = half_to_float(from[j]));
+    cast_numbers(VALUE_FLOAT, to_type, floats.floats, blocks, to);
+}
+
+/* Integers become floats first, as in numpy. */
+static void cast_to_halves(int from_type, const void *from, size_t blocks, Half *to) {
+    const double *doubles = from;
+    Register floats;
+
+    if (from_type == VALUE_DOUBLE) {
+        EACH_LANE(to[j] = half_of(doubles[j]));
+        return;
+    }
+    cast_numbers(from_type, VALUE_FLOAT, from, blocks, floats.floats);
+    EACH_LANE(to[j] = half_of(floats.floats[j]));
+}
+
+static void cast(uint16_t types, const void *from, size_t blocks, void *to) {
+    const int from_type = types / VALUE_TYPES, to_type = types % VALUE_TYPES;
+
+    if (from_type == VALUE_HALF) {
+        cast_halves(from, to_type, blocks, to);
+    } else if (to_type == VALUE_HALF) {
+        cast_to_halves(from_type, from, blocks, to);
+    } else {
+        cast_numbers(from_type, to_type, from, blocks, to);
     }
 }
 

@@ -21,6 +21,7 @@ from fmugym.declared.functions import FUNCTIONS
 from fmugym.declared.series import DATA_KEYS
 from fmugym.declared.task import KEYS
 from fmugym.declared.variables import VARIABLE_KEYS
+from fmugym.declared.warming import WARM_UP_KEYS
 from fmugym.errors import TaskError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -505,6 +506,7 @@ def merged(base, own):
         ("Variables", [*VARIABLE_KEYS]),
         ("Agent", AGENT_KEYS),
         ("Data and set points", [*DATA_KEYS, *SETPOINTS]),
+        ("Warm-up", WARM_UP_KEYS),
         ("Expressions", [*FUNCTIONS, "previous", *BUILT_IN, *CONSTANTS]),
     ],
 )

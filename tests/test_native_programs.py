@@ -45,7 +45,7 @@ def test_runs_of_any_length(n):
     x, y, action = rng.normal(size=(3, n))
     counts = rng.integers(-5, 5, n)
     flags, numbers, seen = np.zeros(n, np.bool_), np.zeros(n), np.zeros((n, 2), np.float32)
-    sine = loop_of(np.sin, (DOUBLE, DOUBLE)), 1, (8, 8, 0, 0)
+    sine = loop_of(np.sin, (DOUBLE, DOUBLE)), 1, (8, 8), 1
     code = (
         ("load_row", 0, 3),
         ("load_row", 1, 4),
@@ -106,7 +106,7 @@ def test_a_row_that_is_not_aligned():
 
 def squares(values, operation):
     """Raise values to the power of 2 in C."""
-    loop = loop_of(np.float_power, (DOUBLE,) * 3), 2, (8, 0, 8, 0)
+    loop = loop_of(np.float_power, (DOUBLE,) * 3), 2, (8, 0, 8), 2
     code = ("load_row", 0, 1), (operation, 0, 2, 1, 0), ("store_row", 1, 0, 2)
     stored = np.zeros_like(values)
     evaluate(code, (values, stored), np.zeros_like(values), constants=(2.0,), calls=(loop,))

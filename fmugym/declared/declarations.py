@@ -22,6 +22,7 @@ from fmugym.declared.variables import (
     number_or_distribution,
     start_value,
 )
+from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
 
@@ -119,6 +120,7 @@ class Declarations:
         observed: The names that the agent sees, and where they stand.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
+        warm_up: What happens before an episode begins.
     """
 
     root: Entry
@@ -134,6 +136,7 @@ class Declarations:
     rewards: dict[str, Term] = field(init=False)
     costs: dict[str, Term] = field(init=False)
     flags: dict[str, Expression] = field(init=False)
+    warm_up: WarmUpTable = field(init=False)
 
     @classmethod
     def read(cls, root: Entry, description: ModelDescription) -> Declarations:
@@ -154,6 +157,7 @@ class Declarations:
         root.required("agent").table(AGENT_KEYS)
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
+        declared.warm_up = read_warm_up(root, declared.actions)
         declared.observed = list(declared._read_observed())
         declared.rewards = _terms(root.child("reward"), ("expr", "weight"))
         declared.costs = _terms(root.child("costs"), ("expr", "limit"))
@@ -193,7 +197,7 @@ class Declarations:
 
     @property
     def expressions(self) -> list[Expression]:
-        """All expressions."""
+        """All expressions, and the names that controllers measure."""
         updates = [memory.update for memory in self.memory.values()]
         terms = [*self.rewards.values(), *self.costs.values()]
         return [
@@ -202,6 +206,7 @@ class Declarations:
             *(derived.expression for derived in self.derived.values()),
             *(term.expression for term in terms),
             *self.flags.values(),
+            *map(Expression.parse, self.warm_up.signals()),
         ]
 
     def is_output(self, name: str) -> bool:

@@ -164,7 +164,7 @@ class Naming:
         series, shift = self._declared.series[name], self._ahead
         if series.is_stepped:
             shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
-        now, shift = self._clock(), shift - series.start
+        now, shift = self.clock_code(), shift - series.start
         place = f"remainder(({now} + {shift!r}), {series.period!r})"
         self.constants[f"times_{name}"] = series.times
         self.constants[f"values_{name}"] = series.values
@@ -189,7 +189,7 @@ class Naming:
             case "time":
                 return Code(f"(env.time + {self._ahead!r})" if self._ahead else "env.time")
             case "clock":
-                return Code(f"({self._clock()} + {self._ahead!r})")
+                return Code(f"({self.clock_code()} + {self._ahead!r})")
             case "elapsed":
                 return Code(f"(env.step_count * {self._time_step!r} + {self._ahead!r})")
             case "step":
@@ -200,7 +200,7 @@ class Naming:
                 return code_of_number(self._time_step)
         return code_of_number(self._time_step / _SECONDS_PER_HOUR)
 
-    def _clock(self) -> str:
+    def clock_code(self) -> str:
         """Code for the time of data now; that of the FMU if the task sets no other clock."""
         if self._declared.root.child("clock").value is None:
             return "env.time"
@@ -275,9 +275,7 @@ class Naming:
         chosen = self.action_code(record, "action")
         if record.is_direct:
             return chosen
-        now = converted(
-            record.conversion, f"env.inputs[{self._declared.written.index(record.alias)}]"
-        )
+        now = self.present_code(record)
         if record.delta:
             chosen = f"fn_clip(({now} + {chosen}), {record.low!r}, {record.high!r})"
         if record.rate < np.inf:
@@ -286,6 +284,11 @@ class Naming:
         if record.is_switched:
             chosen = f"where({self.blocked_code(record, chosen)}, {now}, {chosen})"
         return chosen
+
+    def present_code(self, record: Record) -> str:
+        """Code for the value that an input has now, in the unit of the task."""
+        place = self._declared.written.index(record.alias)
+        return converted(record.conversion, f"env.inputs[{place}]")
 
     def blocked_code(self, record: Record, chosen: str) -> str:
         """Code for whether it is too early to switch to a value.

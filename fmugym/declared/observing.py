@@ -132,15 +132,26 @@ def _delay(declared: Declarations, name: str, time_step: float) -> int:
 
 
 def observed_values(
-    declared: Declarations, naming: Naming, kept: list[History], time_step: float
+    declared: Declarations,
+    naming: Naming,
+    kept: list[History],
+    time_step: float,
+    are_filled: bool = False,
 ) -> list[Seen]:
     """The numbers that the agent observes, in their order.
+
+    Args:
+        declared: The task.
+        naming: Gives names their code.
+        kept: The histories.
+        time_step: Length of a step in seconds.
+        are_filled: Whether a warm-up has filled the histories when an episode begins.
 
     Raises:
         ConfigError: If one is a constant, or there is no forecast or history of it.
     """
     _check_sensors(declared)
-    past = _Past(declared, naming, kept, time_step)
+    past = _Past(declared, naming, kept, time_step, are_filled)
     return [
         *_present(declared, past),
         *_forecasts(declared, naming, time_step),
@@ -163,9 +174,15 @@ class _Past:
     """Gives values now and some steps ago, as the agent measures them."""
 
     def __init__(
-        self, declared: Declarations, naming: Naming, kept: list[History], time_step: float
+        self,
+        declared: Declarations,
+        naming: Naming,
+        kept: list[History],
+        time_step: float,
+        are_filled: bool,
     ) -> None:
         self._declared, self._naming, self._time_step = declared, naming, time_step
+        self._are_filled = are_filled
         self._histories = {history.name: history for history in kept}
 
     def measured(self, entry: Entry, name: str, ago: int) -> str:
@@ -193,6 +210,8 @@ class _Past:
         if name in self._histories:
             history = self._histories[name]
             past = f"env.variables[{history.variable!r}][{ago - 1}]"
+            if self._are_filled:
+                return past
             return f"where(env.step_count == 0, {history.first}, {past})"
         return self._naming.forecast(entry, name, -ago * self._time_step)
 
@@ -277,7 +296,10 @@ def normalized(seen: Seen) -> str:
 
 
 def remember(
-    kept: list[History], values: Callable[[Any], Any], fills: Callable[[Any], Any]
+    kept: list[History],
+    values: Callable[[Any], Any],
+    fills: Callable[[Any], Any],
+    first_step: int = 1,
 ) -> Callable[[Any], None]:
     """Make a function of the environment that adds the latest values to histories.
 
@@ -285,11 +307,12 @@ def remember(
         kept: The histories.
         values: Gives the values to add.
         fills: Gives the other values in the first step.
+        first_step: The step count after the first step; negative if there is a warm-up.
     """
     names = [history.variable for history in kept]
 
     def update(env: Any) -> None:
-        is_first, variables = env.step_count == 1, env.variables
+        is_first, variables = env.step_count == first_step, env.variables
         for name, value, fill in zip(names, values(env), fills(env), strict=True):
             variables[name] = _pushed(variables[name], value, fill, is_first)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
 from functools import cached_property
 from typing import Any, Final
@@ -14,8 +14,12 @@ from fmugym.archive.description import ModelDescription
 from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
+<<<<<<< HEAD
 from fmugym.declared.expressions import function_of
 from fmugym.declared.named import named_values
+=======
+from fmugym.declared.expressions import Expression, function_of
+>>>>>>> main
 from fmugym.declared.naming import CLOCK, NOISE, Moment, Naming, switch_names
 from fmugym.declared.observing import (
     NoiseKey,
@@ -29,7 +33,8 @@ from fmugym.declared.quantities import duration
 from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
-from fmugym.distributions import is_distribution
+from fmugym.declared.warming import DeclaredWarmUp, Pilot, signals_of
+from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.task.quantity import Quantities
@@ -69,6 +74,7 @@ class Plan:
         observation_names: The names of the elements of the observation.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if the actions have no levels.
+        warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
         cost_limits: What the costs of an episode may add up to, by name.
 
     Raises:
@@ -87,19 +93,97 @@ class Plan:
         for name in declared.derived:
             self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
         self._kept = histories(declared, self._naming, self._time_step)
-        self._seen = observed_values(declared, self._naming, self._kept, self._time_step)
+        self._warm_steps = self._steps_of_warm_up()
+        self._seen = observed_values(
+            declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
+        )
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
+        self.warm_up = self._make_warm_up() if self._warm_steps else None
         self.action_masks = self._action_masks()
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 
+<<<<<<< HEAD
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""
         found = named_values(self._declared, self._naming)
         read = self._function(_tuple(code for _, code in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
+=======
+    # The warm-up.
+
+    def _steps_of_warm_up(self) -> int:
+        """The steps of a warm-up with moving inputs; 0 if there is none."""
+        table, step = self._declared.warm_up, self._time_step
+        if not (table.controllers or table.caches or self._declared.inputs):
+            return 0
+        count = whole_number_of_steps(table.period, step)
+        if count is None:
+            raise table.entry.error(
+                f"the warm-up must be a multiple of the time step of {step:g} s, got "
+                f"{table.period:g} s"
+            )
+        return count
+
+    def _make_warm_up(self) -> DeclaredWarmUp:
+        table, codes = self._declared.warm_up, self._input_codes(self._declared.warm_up.controllers)
+        switches = dict(self._switch_codes())
+        pilots = [self._pilot(record) for record in self._declared.actions]
+        signals = [self._signal_code(name) for name in table.signals()]
+        kept = [text for history in self._kept for text in (history.now, history.fill)]
+        texts = [*codes, *signals, *switches.values(), *kept, self._naming.clock_code()]
+        with table.entry.placing():
+            warm_up = DeclaredWarmUp(
+                self._warm_steps,
+                self._time_step,
+                [pilot for pilot in pilots if pilot is not None],
+                self._function(_tuple(codes)),
+                [*self._updates_of_histories(), *self._updates_of_switches()],
+                texts,
+                self._naming.constants,
+                (*(history.variable for history in self._kept), *switches),
+                table.caches,
+            )
+        if table.caches:
+            self._require_few_states(warm_up)
+        return warm_up
+
+    def _require_few_states(self, warm_up: DeclaredWarmUp) -> None:
+        """Refuse to keep states that hardly any later episode could use."""
+        values = {name: self.config["episode_variables"][name] for name in warm_up.depends_on}
+        parameters = {name: value for name, (_, value) in self._declared.parameters.items()}
+        for name, value in (parameters | values).items():
+            if is_distribution(value) and not isinstance(value, Choice):
+                raise self._declared.warm_up.entry.child("cache").error(
+                    f"the state after the warm-up depends on {name!r}, which is drawn from "
+                    f"{shown(value)}: nearly every episode needs a state of its own. Leave out "
+                    "'cache', or draw from a list of values"
+                )
+
+    def _pilot(self, record: Record) -> Pilot | None:
+        controller = self._declared.warm_up.controllers.get(record.alias)
+        if controller is None:
+            return None
+        names = signals_of(controller)
+        present = self._function(self._naming.present_code(record)) if record.delta else None
+        return Pilot(
+            record,
+            self._declared.actions.index(record),
+            controller,
+            tuple(names),
+            self._function(_tuple(map(self._signal_code, names))),
+            self._function(self._naming.clock_code()),
+            present,
+            self._declared.option("rescale"),
+        )
+
+    def _signal_code(self, name: str) -> str:
+        entry = self._declared.warm_up.entry.child("controller")
+        expression = Expression.parse(name)
+        return self._naming.code(entry, expression, Moment.SEEN).number.text
+>>>>>>> main
 
     # The config.
 
@@ -179,9 +263,10 @@ class Plan:
             raise start.error(
                 "start_time is one time; 'clock' takes lists, seasons and what is drawn"
             )
-        for key in ("warm_up", "start_time"):
-            if self._root.child(key).value is not None:
-                times[key] = self._root.child(key).check(duration)
+        if self._declared.warm_up.period:
+            times["warm_up"] = self._declared.warm_up.period
+        if start.value is not None:
+            times["start_time"] = start.check(duration)
         if self._root.child("substeps").value is not None:
             times["substeps"] = self._root.child("substeps").value
         if self._root.child("episode_length").value is not None:
@@ -237,21 +322,32 @@ class Plan:
 
     def _inputs(self) -> Hook:
         """Write the FMU's inputs, in their units."""
-        declared = self._declared
-        codes = [
-            inverted(record.conversion, self._naming.input_code(record))
-            for record in declared.actions
-            if record.variable is not None
-        ]
+        codes = self._input_codes()
+        return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+
+    def _input_codes(self, acting: Collection[str] | None = None) -> list[str]:
+        """Code for the FMU's inputs, in their units.
+
+        Args:
+            acting: The aliases of the actions that are chosen, the others keep their values; None
+                for all.
+        """
+        declared, codes = self._declared, list[str]()
+        for record in declared.actions:
+            if record.variable is None:
+                continue
+            code = inverted(record.conversion, self._naming.input_code(record))
+            is_kept = acting is not None and record.alias not in acting
+            codes.append(f"env.inputs[{len(codes)}]" if is_kept else code)
         for name, (record, expression) in declared.inputs.items():
             entry = self._root.child("inputs").child(name)
-            code = self._naming.code(entry, expression, Moment.BEFORE)
-            codes.append(inverted(record.conversion, code.number.text))
+            value = self._naming.code(entry, expression, Moment.BEFORE).number.text
+            codes.append(inverted(record.conversion, value))
         if not codes:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
             )
-        return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+        return codes
 
     def _action_masks(self) -> Hook | None:
         codes = []
@@ -305,14 +401,16 @@ class Plan:
     def _updates_of_histories(self) -> list[Hook]:
         if not self._kept:
             return []
-        values, fills = ([history.now for history in self._kept], [h.fill for h in self._kept])
-        return [remember(self._kept, self._function(_tuple(values)), self._function(_tuple(fills)))]
+        values = self._function(_tuple(history.now for history in self._kept))
+        fills = self._function(_tuple(history.fill for history in self._kept))
+        return [remember(self._kept, values, fills, 1 - self._warm_steps)]
 
     def _updates_of_switches(self) -> list[Hook]:
-        codes: dict[str, str] = {}
+        return self._assignments(dict(self._switch_codes()))
+
+    def _switch_codes(self) -> Iterator[tuple[str, str]]:
         for record in self._switched:
-            codes |= zip(switch_names(record), self._naming.switch_codes(record), strict=True)
-        return self._assignments(codes)
+            yield from zip(switch_names(record), self._naming.switch_codes(record), strict=True)
 
     def _updates_of_worst(self) -> list[Hook]:
         if not self._has_worst:

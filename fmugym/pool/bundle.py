@@ -88,6 +88,15 @@ class Bundle:
         data, ends = joined(map(self.state, chosen.tolist()))
         return Bundle(outputs, self.steps[chosen], data, ends)
 
+    @classmethod
+    def of_all(cls, bundles: Sequence[Bundle]) -> Bundle:
+        """Put bundles of one pool together."""
+        outputs = np.concatenate([bundle.outputs for bundle in bundles], axis=1)
+        steps = np.concatenate([bundle.steps for bundle in bundles])
+        data, ends = joined(b.state(place) for b in bundles for place in range(len(b)))
+        records = [bundle.records for bundle in bundles if bundle.records is not None]
+        return cls(outputs, steps, data, ends, sum(records, ()) if records else None)
+
     @property
     def content(self) -> tuple[object, ...]:
         """What two equal bundles have in common."""

@@ -210,6 +210,17 @@ class PythonPool(SavingPool):
         finally:
             restore_arithmetic()
 
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``."""
+        try:
+            with fmu_calls:
+                parts = [slot.differentiate(unknowns, knowns) for slot in self._slots]
+        finally:
+            restore_arithmetic()
+        return np.stack(parts, axis=2)
+
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
         return self._slots[index].knows_start(variables, values)

@@ -11,6 +11,7 @@
         [--episodes N] [--no-normalize] [KEY=VALUE ...]
     fmugym evaluate TASK [--agent FOLDER ...] [--action NUMBERS ...] [--controller TEXT ...]
         [--scenario NAME] [--episodes N] [--seed N] [--steps N] [--json]
+    fmugym demo [--seed N] [--output picture.png]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
 
@@ -66,7 +67,8 @@ from typing import Final, TextIO
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_count, check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import FMUGymError
+from fmugym.errors import ConfigError, FMUGymError
+from fmugym.tools.demo import LinearController, Training, show, write_picture
 from fmugym.tools.evaluation import evaluate, table
 from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.proposal import Proposal
@@ -123,6 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_simulate(commands)
     _add_train(commands)
     _add_evaluate(commands)
+    _add_demo(commands)
     _add_skeleton(commands)
     _add_stand_in(commands)
     return parser
@@ -221,6 +224,15 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     command.add_argument("--seed", type=int, default=1_000_000, help="of the first episode")
     command.add_argument("--steps", type=int, default=10_000, help="at most, in each episode")
     command.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    text = "train a controller of the bundled cart-pole in seconds, and show it in a window"
+    command = _add(commands, "demo", _demo, text)
+    command.add_argument("--seed", type=int, default=0, help="default 0")
+    command.add_argument(
+        "--output", type=Path, metavar="FILE", help="a new PNG file, instead of the window"
+    )
 
 
 def _add_skeleton(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -334,6 +346,37 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         print(json.dumps(facts, indent=2))
     else:
         print(table(scores))
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    check_seed(arguments.seed)
+    training = Training(arguments.seed)
+    untrained = training.controller
+    solved = False
+    for one in training.rounds():
+        print(
+            f"round {one.number}: {one.mean:.0f} steps in the mean, {one.best:.0f} at best; "
+            f"controller {one.held_out:.0f} of 500"
+        )
+        solved = one.is_solved
+    print(f"{training.steps} steps of the cart-pole FMU in {training.seconds:.2f} s")
+    _show(untrained, training.controller, arguments)
+    return int(not solved)
+
+
+def _show(
+    untrained: LinearController, trained: LinearController, arguments: argparse.Namespace
+) -> None:
+    seed = arguments.seed + 2_000_000
+    if arguments.output is not None:
+        write_picture([untrained, trained], seed, arguments.output)
+        print(plain(f"{arguments.output}: an episode before the training, and one after it"))
+        return
+    try:
+        print(f"before the training: {show(untrained, seed)} steps")
+        print(f"after the training: {show(trained, seed)} steps")
+    except ConfigError:
+        print("There is no display for a window: --output demo.png writes a picture")
 
 
 def _new_table(path: Path) -> TextIO:

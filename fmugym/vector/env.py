@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import logging
 import pickle
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -452,10 +453,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         candidates.parameters = tunable_values(self._prototype, parameters, candidates.count)
         present = self.save_state() if self._is_ready else None
         start = self._start_of_rollout(snapshot, present, candidates.count)
-        try:
+        with self._returning_to(present):
             parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
             return joined_rollouts(parts, candidates.count)
+
+    @contextmanager
+    def _returning_to(self, present: Snapshot | None) -> Iterator[None]:
+        """Return to the present episodes afterwards, or to none; nothing starts in between."""
+        engine = self._engine
+        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
+        try:
+            yield
         finally:
+            engine.starts_at_ends = starts_at_ends
             self._is_ready = False
             if present is not None:
                 self._place(present, np.arange(self.num_envs))
@@ -489,11 +499,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             if engine.has_moved:  # a step has failed: the engine knows what follows
                 self._begin(start, places, candidates)
         first = None if actions is not None else engine.observe(np.arange(self.num_envs))
-        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
-        try:
-            return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
-        finally:
-            engine.starts_at_ends = starts_at_ends
+        return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
 
     def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
         """Bring all environments to the places where candidates begin."""

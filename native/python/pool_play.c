@@ -472,7 +472,7 @@ static bool take_observations(PyPool *self, const Playing *playing, PyObject *se
  * integers, Q for those without sign, ? for Booleans. */
 static bool has_letter(const Py_buffer *buffer, int letter) {
     const char *format = buffer->format == NULL ? "B" : buffer->format;
-    const char *const letters = letter == 'd'   ? "fd"
+    const char *const letters = letter == 'd'   ? "fde"
                                 : letter == 'q' ? "bhilq"
                                 : letter == 'Q' ? "BHILQ"
                                                 : "?";

@@ -372,13 +372,23 @@ class ProcessPool(SavingPool):
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
+        return np.concatenate(self._asked("reading variables", "read", variables), axis=1)
+
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``."""
+        parts = self._asked("a directional derivative", "differentiate", unknowns, knowns)
+        return np.concatenate(parts, axis=2)
+
+    def _asked(self, doing: str, name: str, *arguments: Any) -> list[FloatArray]:
+        """Ask all workers for arrays, in the order of their blocks."""
         with self._lock:
             self._require_present()
-            parts = self._crew.run(
-                "reading variables", self._crew.supervisors, lambda s: s.tell("read", variables)
-            )
+            crew = self._crew
+            parts = crew.run(doing, crew.supervisors, lambda s: s.tell(name, *arguments))
             self._require_present()
-            return np.concatenate(list(parts.values()), axis=1)
+            return list(parts.values())
 
     def close(self) -> None:
         """See ``Pool.close``."""

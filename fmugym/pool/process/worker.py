@@ -309,6 +309,13 @@ class BlockWorker:
         """See ``Pool.read``."""
         return self._pool.read(variables)
 
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``."""
+        np.copyto(self._pool.inputs, self._block.inputs)
+        return self._pool.differentiate(unknowns, knowns)
+
     def close(self) -> None:
         """Free the instances and leave ``serve``."""
         self._serving = False
