@@ -14,12 +14,8 @@ from fmugym.archive.description import ModelDescription
 from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
 from fmugym.declared.entries import Entry
-<<<<<<< HEAD
-from fmugym.declared.expressions import function_of
-from fmugym.declared.named import named_values
-=======
 from fmugym.declared.expressions import Expression, function_of
->>>>>>> main
+from fmugym.declared.named import named_values
 from fmugym.declared.naming import CLOCK, NOISE, Moment, Naming, switch_names
 from fmugym.declared.observing import (
     NoiseKey,
@@ -105,13 +101,12 @@ class Plan:
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 
-<<<<<<< HEAD
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""
         found = named_values(self._declared, self._naming)
         read = self._function(_tuple(code for _, code in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
-=======
+
     # The warm-up.
 
     def _steps_of_warm_up(self) -> int:
@@ -183,7 +178,6 @@ class Plan:
         entry = self._declared.warm_up.entry.child("controller")
         expression = Expression.parse(name)
         return self._naming.code(entry, expression, Moment.SEEN).number.text
->>>>>>> main
 
     # The config.
 

@@ -197,9 +197,13 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)
         return observation, reward, terminated, truncated, info
 
+    def complete(self) -> None:
+        """Complete the file; rows that follow are only in memory."""
+        self._recorder.close()
+
     def close(self) -> None:
         """Complete the file, and close the environment."""
-        self._recorder.close()
+        self.complete()
         super().close()
 
 

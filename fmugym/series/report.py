@@ -38,7 +38,7 @@ th, td { padding: 6px 12px; text-align: right; white-space: nowrap; }
 th { background: var(--wash); font-weight: 600; color: var(--soft); }
 tr + tr td { border-top: 1px solid var(--line); }
 th.text, td.text { text-align: left; }
-td.first { font-weight: 600; }
+td.first { font-weight: 600; white-space: normal; min-width: 16ch; }
 td.bad { color: var(--bad); font-weight: 600; }
 td.best { color: var(--good); font-weight: 600; }
 figure { margin: 6px 0 0; overflow-x: auto; }
