@@ -75,6 +75,17 @@ def echo_to(memory: Array, /) -> None:
         memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
     """
 
+def claim_initialization(last: Array, interval: float, /) -> float:
+    """Take the next moment at which an instance may be made or initialized.
+
+    Args:
+        last: The latest such moment that is taken, in ns, int64, of shape (1,); 0 for none.
+        interval: Seconds between two of them.
+
+    Returns:
+        The seconds until then.
+    """
+
 @final
 class Access:
     """A list of variables of one FMI version.
@@ -161,7 +172,7 @@ class Experiment(TypedDict):
     rebuilds: bool
     reloads: bool
     one_initialization: bool
-    pace: tuple[float, int, int]
+    pace: float
     start_outputs: bytes | None
 
 class Variables(TypedDict):
@@ -174,13 +185,18 @@ class Variables(TypedDict):
     sampling: bytes
 
 class Arrays(TypedDict):
-    """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
+    """The pool's own arrays.
+
+    ``health`` is int64, see ``fmugym.pool.health``, and so is ``last_initialization``, of shape
+    (1,), see ``fmugym.pool.pacing``.
+    """
 
     inputs: Array
     outputs: Array
     statuses: Array
     observations: Array
     health: Array
+    last_initialization: Array
 
 Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
 """An episode: types and references of the start variables, start values, first outputs, and rows of
@@ -432,8 +448,11 @@ class Pool:
             None if the episode is not known as a whole.
         """
 
-    def costs(self) -> tuple[float, float, float]:
-        """The measured ns per instance of ``step``, ``reset``, ``step_or_reset``; 0 if unknown."""
+    def costs(self) -> tuple[float, float, float, float, float]:
+        """The measured ns per instance of some methods; 0 if unknown.
+
+        They are ``step``, ``reset``, ``step_or_reset`` and ``play``, and the first ``reset``.
+        """
 
     def uses_states(self) -> bool:
         """Whether resets restore saved initial states, as far as is known by now."""

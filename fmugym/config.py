@@ -97,10 +97,10 @@ class EnvConfig:
             ``fmugym.trial.opening.make_pool``.
         call_timeout: Seconds of real time that a call of an FMU may take in a worker process. A
             reset or an instantiation may take ten times as long. None for no limit.
-        max_instances: How many instances may exist at once, for FMUs with licences: each instance
-            may take a seat. None for no limit.
+        max_instances: How many instances of the FMU may exist at once on this machine, for FMUs
+            with licences: each instance may take a seat. None for no limit.
         max_initializations_per_second: How many instantiations and initializations may begin in a
-            second of real time, counted together; None for no limit.
+            second of real time on this machine, counted together; None for no limit.
         keep_initial_states: Whether to keep the state after initialization and warm-up, for other
             instances and on disk, where this gives the same results to the last bit. For models
             that take long to initialize.

@@ -26,7 +26,7 @@ static bool build(Pool *pool, Instance *me, bool logging) {
     const Identity identity = {name_of(pool, index), s->token, s->resources,
                                log_environment(&pool->log, index), logging};
 
-    pace_wait(&pool->pace);
+    pace_wait(&pool->settings.pace);
     mutex_lock(pool->making);
     begin_call(CALL_INSTANTIATE);
     me->component = s->fmi->instantiate(me->library, &identity);

@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
 from fmugym.declared.declarations import AGENT_KEYS, BUILT_IN, SETPOINTS
+from fmugym.declared.devices import DEVICE_KEYS
 from fmugym.declared.expressions import CONSTANTS
 from fmugym.declared.functions import FUNCTIONS
 from fmugym.declared.series import DATA_KEYS
@@ -504,6 +505,7 @@ def merged(base, own):
     [
         ("Keys", KEYS),
         ("Variables", [*VARIABLE_KEYS]),
+        ("Sensors and actuators", DEVICE_KEYS),
         ("Agent", AGENT_KEYS),
         ("Data and set points", [*DATA_KEYS, *SETPOINTS]),
         ("Warm-up", WARM_UP_KEYS),

@@ -10,18 +10,14 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
+from fmugym.declared.devices import DEVICE_KEYS
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.functions import FUNCTIONS
 from fmugym.declared.quantities import duration
 from fmugym.declared.series import Series, read_data, read_schedule
-from fmugym.declared.variables import (
-    Record,
-    Records,
-    number,
-    number_or_distribution,
-    start_value,
-)
+from fmugym.declared.values import number, number_or_distribution
+from fmugym.declared.variables import Record, Records, start_value
 from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
@@ -299,8 +295,8 @@ class Declarations:
             self.records.check_input(entry, record)
             if record.variable is None and not record.is_direct:
                 raise record.entry.error(
-                    f"{record.alias!r} is no input of the FMU: 'delta', 'rate', 'min_on' and "
-                    "'min_off' are for inputs"
+                    f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
+                    f"{', '.join(map(repr, DEVICE_KEYS))} are for inputs"
                 )
         if len({bool(record.levels) for record in actions}) > 1:
             raise entry.error("either all actions have levels, or none has")
@@ -318,12 +314,14 @@ class Declarations:
             if target.value is not None:
                 unit = series.entry.child("unit")
                 record = self.records.input_of(target, None if unit.value is None else unit.text())
+                _require_plain_input(record)
                 yield record.alias, (record, Expression.parse(name))
         for entry in _section(self.root, "inputs"):
             record = self.records.find(entry, entry.name, "input")
             if record in self.actions and record.variable is not None:
                 raise entry.error(f"{entry.name!r} is an action already")
             self.records.check_input(entry, record)
+            _require_plain_input(record)
             yield entry.name, (record, parsed(entry))
 
     def _read_observed(self) -> Iterator[tuple[Entry, str]]:
@@ -334,6 +332,15 @@ class Declarations:
                 if record not in self.actions:
                     self.records.check_output(entry, name)
             yield entry, name
+
+
+def _require_plain_input(record: Record) -> None:
+    """Refuse keys of actuators for an input that no action writes: they would do nothing."""
+    if not record.is_direct or record.levels:
+        raise record.entry.error(
+            f"{record.alias!r} is written by an expression, not by an action: only 'name', 'unit', "
+            "'min' and 'max' are for it"
+        )
 
 
 SETPOINTS: Final = ("value", "schedule", "steps", "ramp", "sine")

@@ -10,10 +10,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.declared.declarations import Declarations
+from fmugym.declared.devices import DEVICE_KEYS, NOISE
 from fmugym.declared.entries import Entry
-from fmugym.declared.naming import NOISE, Moment, Naming
+from fmugym.declared.naming import Moment, Naming, queue_name
 from fmugym.declared.quantities import duration
-from fmugym.declared.variables import number
+from fmugym.declared.values import number
+from fmugym.declared.variables import Record
 from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = [
@@ -106,11 +108,21 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     length = _count(entry.required("length"), time_step) if declared.remembered else 0
     lengths = dict.fromkeys(declared.remembered, length)
     for _, name in declared.observed:
-        delay = _delay(declared, name, time_step)
-        if delay or name in lengths:
-            lengths[name] = lengths.get(name, 0) + delay
+        record = _sensor_of(declared, name)
+        late = 0 if record is None else naming.delay_of(record) + record.device.remembers
+        if late or name in lengths:
+            lengths[name] = lengths.get(name, 0) + late
     of_variables = {name: n for name, n in lengths.items() if name not in declared.series}
-    return [_history(entry, naming, name, count) for name, count in of_variables.items()]
+    kept = [_history(entry, naming, name, count) for name, count in of_variables.items()]
+    late_ones = [record for record in declared.actions if record.device.delay]
+    return [*kept, *(_queue(naming, record) for record in late_ones)]
+
+
+def _queue(naming: Naming, record: Record) -> History:
+    """What the agent has chosen for an action with a delay."""
+    name, start = queue_name(record), naming.start_code(record)
+    chosen = naming.action_code(record, "action")
+    return History(name, name, naming.delay_of(record), chosen, start, start)
 
 
 def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
@@ -123,12 +135,9 @@ def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
     return History(name, f"history of {name}", length, *codes, present.text)
 
 
-def _delay(declared: Declarations, name: str, time_step: float) -> int:
-    """By how many steps the agent observes a name late."""
-    record = declared.records.get(name) if declared.is_output(name) else None
-    if record is None or not record.delay:
-        return 0
-    return _count(record.entry.child("delay"), time_step)
+def _sensor_of(declared: Declarations, name: str) -> Record | None:
+    """The record of what is measured; None for what the agent knows without a sensor."""
+    return declared.records.get(name) if declared.is_output(name) else None
 
 
 def observed_values(
@@ -137,8 +146,8 @@ def observed_values(
     kept: list[History],
     time_step: float,
     are_filled: bool = False,
-) -> list[Seen]:
-    """The numbers that the agent observes, in their order.
+) -> tuple[list[Seen], list[History]]:
+    """The numbers that the agent observes, in their order, and what sensors remember.
 
     Args:
         declared: The task.
@@ -152,21 +161,23 @@ def observed_values(
     """
     _check_sensors(declared)
     past = _Past(declared, naming, kept, time_step, are_filled)
-    return [
+    seen = [
         *_present(declared, past),
         *_forecasts(declared, naming, time_step),
         *_remembered(declared, past, time_step),
     ]
+    return seen, past.memories
 
 
 def _check_sensors(declared: Declarations) -> None:
     """Refuse a sensor of what the agent does not observe: it would do nothing."""
     seen = {name for _, name in declared.observed} | set(declared.remembered)
     for record in declared.records.declared():
-        if record.is_measured and record.alias not in seen:
+        is_used = record.alias in seen or record in declared.actions
+        if not record.device.is_ideal and not is_used:
             raise record.entry.error(
-                f"'noise', 'quantum' and 'delay' are for what the agent observes, and "
-                f"{record.alias!r} is not in its observations"
+                f"{', '.join(map(repr, DEVICE_KEYS))} are for actions and for what the agent "
+                f"observes, and {record.alias!r} is not in its observations"
             )
 
 
@@ -183,23 +194,49 @@ class _Past:
     ) -> None:
         self._declared, self._naming, self._time_step = declared, naming, time_step
         self._are_filled = are_filled
+        self._measured: dict[str, History] = {}
         self._histories = {history.name: history for history in kept}
 
     def measured(self, entry: Entry, name: str, ago: int) -> str:
         """Code for what the agent measured some steps ago."""
-        delay = _delay(self._declared, name, self._time_step)
-        code = self._true(entry, name, ago + delay)
-        record = self._declared.records.get(name) if self._declared.is_output(name) else None
+        record = _sensor_of(self._declared, name)
         if record is None:
-            return code
-        if record.noise:
-            channel = self._naming.outputs.index(name)
-            count = f"(env.step_count - {ago})"
-            noise = f"noise(env.variables[{NOISE!r}], {count}, {channel})"
-            code = f"({code} + {record.noise!r} * {noise})"
-        if record.quantum:
-            code = f"({record.quantum!r} * fn_round(({code} / {record.quantum!r})))"
-        return code
+            return self._true(entry, name, ago)
+        fresh = self._fresh(entry, record, ago)
+        if not record.device.remembers:
+            return fresh
+        past = f"env.variables[{self._kept(entry, record, ago)!r}][{ago}]"
+        return past if self._are_filled else f"where(env.step_count == 0, {fresh}, {past})"
+
+    def _fresh(self, entry: Entry, record: Record, ago: int) -> str:
+        """Code for a measurement, whatever was measured before."""
+        name, device = record.alias, record.device
+        code = self._true(entry, name, ago + self._naming.delay_of(record))
+        return device.distorted(code, f"(env.step_count - {ago})", self._channel(name))
+
+    def _channel(self, name: str) -> int:
+        return self._naming.outputs.index(name)
+
+    def _kept(self, entry: Entry, record: Record, ago: int) -> str:
+        """The variable with what a sensor with a memory has given, the latest first."""
+        name, variable = record.alias, f"measured {record.alias}"
+        length = max(ago + 1, self._measured[name].length if name in self._measured else 0)
+        first = self._fresh(entry, record, 0)
+        is_first = f"(env.step_count == {self._naming.first_step})"
+        before = (
+            f"where({is_first}, {self._fresh(entry, record, 1)}, env.variables[{variable!r}][0])"
+        )
+        now = record.device.following(
+            first, before, "env.step_count", self._channel(name), self._time_step
+        )
+        fill = self._fresh(entry, record, 1)
+        self._measured[name] = History(name, variable, length, now, fill, first)
+        return variable
+
+    @property
+    def memories(self) -> list[History]:
+        """What sensors with a memory have given; to be updated after the histories."""
+        return list(self._measured.values())
 
     def _true(self, entry: Entry, name: str, ago: int) -> str:
         if ago == 0:

@@ -13,11 +13,13 @@ from gymnasium import spaces
 from fmugym.archive.description import ModelDescription
 from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations, Term
+from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression, function_of
 from fmugym.declared.named import named_values
-from fmugym.declared.naming import CLOCK, NOISE, Moment, Naming, switch_names
+from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
 from fmugym.declared.observing import (
+    History,
     NoiseKey,
     has_errors,
     histories,
@@ -85,12 +87,12 @@ class Plan:
         if needs_reward and not declared.rewards:
             raise task.root.error('the task has no reward; say one, for example: reward = "1"')
         self._time_step = _time_step(task.root, description)
-        self._naming = Naming(declared, self._time_step)
+        self._warm_steps = self._steps_of_warm_up()
+        self._naming = Naming(declared, self._time_step, self._warm_steps)
         for name in declared.derived:
             self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
         self._kept = histories(declared, self._naming, self._time_step)
-        self._warm_steps = self._steps_of_warm_up()
-        self._seen = observed_values(
+        self._seen, self._sensors = observed_values(
             declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
         )
         self.config = self._make_config()
@@ -127,7 +129,8 @@ class Plan:
         switches = dict(self._switch_codes())
         pilots = [self._pilot(record) for record in self._declared.actions]
         signals = [self._signal_code(name) for name in table.signals()]
-        kept = [text for history in self._kept for text in (history.now, history.fill)]
+        histories = [*self._kept, *self._sensors]
+        kept = [text for history in histories for text in (history.now, history.fill)]
         texts = [*codes, *signals, *switches.values(), *kept, self._naming.clock_code()]
         with table.entry.placing():
             warm_up = DeclaredWarmUp(
@@ -138,7 +141,7 @@ class Plan:
                 [*self._updates_of_histories(), *self._updates_of_switches()],
                 texts,
                 self._naming.constants,
-                (*(history.variable for history in self._kept), *switches),
+                (*(history.variable for history in histories), *switches),
                 table.caches,
             )
         if table.caches:
@@ -197,7 +200,8 @@ class Plan:
 
     def _variables(self) -> dict[str, Any]:
         remembered = {name: memory.start for name, memory in self._declared.memory.items()}
-        histories = {one.variable: np.zeros(one.length) for one in self._kept}
+        kept = [*self._kept, *self._sensors]
+        histories = {one.variable: np.zeros(one.length) for one in kept}
         switches: dict[str, float] = {}
         for record in self._switched:
             state, since = switch_names(record)
@@ -208,8 +212,8 @@ class Plan:
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
         """The key of noise, which is drawn last."""
-        records = [self._declared.records[name] for name in self._naming.outputs]
-        is_noisy = any(record.noise for record in records) or has_errors(self._declared)
+        devices = [record.device for record in self._declared.records.declared()]
+        is_noisy = any(one.is_random for one in devices) or has_errors(self._declared)
         if not is_noisy and not self._declared.steps:
             return {}
         parameters = [value for _, value in self._declared.parameters.values()]
@@ -393,11 +397,13 @@ class Plan:
         return hooks
 
     def _updates_of_histories(self) -> list[Hook]:
-        if not self._kept:
-            return []
-        values = self._function(_tuple(history.now for history in self._kept))
-        fills = self._function(_tuple(history.fill for history in self._kept))
-        return [remember(self._kept, values, fills, 1 - self._warm_steps)]
+        """The sensors follow what they measure."""
+        return [self._remembering(kept) for kept in (self._kept, self._sensors) if kept]
+
+    def _remembering(self, kept: list[History]) -> Hook:
+        values = self._function(_tuple(history.now for history in kept))
+        fills = self._function(_tuple(history.fill for history in kept))
+        return remember(kept, values, fills, self._naming.first_step)
 
     def _updates_of_switches(self) -> list[Hook]:
         return self._assignments(dict(self._switch_codes()))

@@ -43,12 +43,13 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import HealthArray, no_counts
+from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
+from fmugym.pool.pacing import last_initialization
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import SAMPLINGS, ResetMethod
-from fmugym.pool.tape import Judge, Rehearsals, Tape
+from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
 
@@ -190,7 +191,7 @@ class NativePool(SavingPool):
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
                     "one_initialization": spec.one_initialization,
-                    "pace": (spec.initialization_interval, *spec.turn),
+                    "pace": spec.initialization_interval,
                     "start_outputs": (
                         np.array(spec.start_outputs).tobytes() if spec.blind_start else None
                     ),
@@ -208,6 +209,7 @@ class NativePool(SavingPool):
                     "statuses": self.statuses,
                     "observations": self.observations,
                     "health": self._counts,
+                    "last_initialization": last_initialization(spec),
                 },
                 count=self.num_instances,
                 threads=self.threads,
@@ -406,7 +408,10 @@ class NativePool(SavingPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._close()
+        try:
+            self._close()
+        finally:
+            self._return_seats()
 
     def _open_pool(self) -> _native.Pool:
         if not self._close.alive:
@@ -504,7 +509,21 @@ class NativePool(SavingPool):
     @property
     def costs(self) -> dict[str, float]:
         """The measured time of one instance in ns by method; 0 if it is not known yet."""
-        return dict(zip(("step", "reset", "step_or_reset"), self._pool.costs(), strict=True))
+        names = ("step", "reset", "step_or_reset", "play", "first_reset")
+        return dict(zip(names, self._pool.costs(), strict=True))
+
+    def effort(self) -> Effort:
+        """See ``CountedPool.effort``."""
+        self._count_steps()
+        costs = {name: 1e-9 * cost for name, cost in self.costs.items()}
+        steps = [costs[name] for name in ("step", "step_or_reset", "play") if costs[name]] or [0.0]
+        of_steps = self._counts[:, Column.STEPS]
+        of_resets = float(self._counts[:, Column.RESETS].sum()) * costs["reset"]
+        return Effort(
+            total=float(of_steps.sum()) * min(steps) + of_resets,
+            episode=costs["first_reset"] + TAPE_ROWS * max(steps),
+            steps=int(of_steps[0]),
+        )
 
     def prepare_play(
         self,

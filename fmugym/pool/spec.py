@@ -81,8 +81,9 @@ class PoolSpec:
             or freed at a time. Steps run in parallel all the same.
         initialization_interval: The least real time in seconds from one instantiation or
             initialization to the next; see ``fmugym.pool.pacing``.
-        turn: Which turn this pool has in making and initializing instances, and how many turns
-            there are.
+        max_instances: How many instances may exist at once on this machine; None for no limit.
+        locks: The beginning of the paths of the files by which all environments of the FMU keep
+            to these two limits; "" for none.
         keep_states: Whether initial states are kept for other instances and processes, if the trial
             shows that they work there.
         state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
@@ -109,7 +110,8 @@ class PoolSpec:
     input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
     initialization_interval: float = 0.0
-    turn: tuple[int, int] = (0, 1)
+    max_instances: int | None = None
+    locks: str = ""
     licence_wait: float = 0.0
     keep_states: bool = False
     state_files: str = ""

@@ -93,6 +93,7 @@ class Interface:
             leak_limit=config.leak_limit,
             input_limits=tuple(map(self._limits, self.inputs)),
             initialization_interval=_interval(config.max_initializations_per_second),
+            max_instances=config.max_instances,
             licence_wait=config.licence_wait,
             keep_states=bool(config.keep_initial_states),
             samplings=self._samplings(),

@@ -20,10 +20,10 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
 ``--steps N``. All commands but ``train`` take ``--json``.
 
-``info``, ``new``, ``skeleton`` and ``stand-in`` execute nothing of the FMU, the others do. Output is
-printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the error stream
-says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments are wrong; 130
-after Ctrl-C, which keeps what was written until then.
+``info``, ``new``, ``skeleton`` and ``stand-in`` execute nothing of the FMU, the others do. Output
+is printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the error stream
+says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments are wrong;
+130 after Ctrl-C, which keeps what was written until then.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.

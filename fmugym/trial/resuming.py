@@ -14,13 +14,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.bundle import Bundle
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.saving import SavingPool
+from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.rehearsal import Starts
@@ -72,7 +73,12 @@ def do_states_work(candidate: Candidate, spec: PoolSpec, starts: Starts | None) 
     known = known_to_work(candidate, spec, starts)
     if known is not None:
         return known
-    grade = _grade(Request(candidate, spec, starts, resume=True))
+    try:
+        with taking(Seats.of(candidate.path.name, spec), 1, "a trial of saved states"):
+            grade = _grade(Request(candidate, spec, starts, resume=True))
+    except LicenceError as error:
+        logger.warning("snapshots keep the inputs of the episode for now: %s", error)
+        return False
     note_resuming(candidate, spec, starts, grade)
     if grade is not Grade.BITWISE:
         logger.warning(

@@ -34,11 +34,12 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMULoadError, LicenceError, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, LicenceError, unknown_name
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
+from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
@@ -54,6 +55,7 @@ __all__ = [
     "is_known_to_harm",
     "known_resuming",
     "known_verdict",
+    "locks_of",
     "marks_of",
     "meet",
     "note_harm",
@@ -245,6 +247,30 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
     return cache_folder() / "marks", _content_key(candidate.path)
 
 
+def locks_of(candidate: Candidate) -> str:
+    """The place of the files by which environments of an FMU keep to the limits of a licence.
+
+    They are in the cache folder, or in the user's own one for temporary files.
+
+    Returns:
+        The beginning of their paths.
+
+    Raises:
+        ConfigError: If there is no folder for them.
+    """
+    name = f"fmugym-{getattr(os, 'getuid', int)()}"
+    try:
+        folder = cache_folder() / "licences"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        folder = Path(tempfile.gettempdir()) / name / "licences"
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise ConfigError(f"the limits of a licence need the folder {folder}: {error}") from None
+    return str(folder / content_of(candidate.path))
+
+
 def examine(
     candidate: Candidate,
     spec: Any,
@@ -279,7 +305,8 @@ def examine(
     request = Request(candidate, spec, starts, several, alone)
     if known is not None and known.complete and _answers(known, spec, several=False):
         request = replace(request, known=known, check_memory=not known.isolate)
-    found = _examine(request, must_survive)
+    with taking(Seats.of(candidate.path.name, spec), 2 if several else 1, "a trial"):
+        found = _examine(request, must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found
@@ -634,7 +661,14 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     """The scope of a verdict on resets and neighbours."""
-    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0, keep_states=False)
+    tried = replace(
+        spec,
+        initialization_interval=0.0,
+        max_instances=None,
+        locks="",
+        licence_wait=0.0,
+        keep_states=False,
+    )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
     return f"{_content_key(candidate.path)}-{asked}"
 

@@ -204,6 +204,7 @@ typedef struct {
     long long substeps, warm_up_steps, retries;
     const char *sampling;
     Py_ssize_t samplings;
+    double pace;
 } Arguments;
 
 bool parse_group(PyObject *group, const char *format, char **names, ...) {
@@ -233,11 +234,11 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
                             "rebuilds",   "reloads",       "one_initialization",
                             "pace",       "start_outputs", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLpppp(dLL)z#:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLppppdz#:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns,
-                       &s->start_outputs, &a->start_outputs_size);
+                       &a->one_initialization, &a->pace, &s->start_outputs,
+                       &a->start_outputs_size);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -248,10 +249,12 @@ static bool parse_variables(PyObject *group, Arguments *a) {
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
-    static char *names[] = {"inputs", "outputs", "statuses", "observations", "health", NULL};
+    static char *names[] = {"inputs",       "outputs", "statuses",
+                            "observations", "health",  "last_initialization", NULL};
     PyObject **arrays = self->arrays;
-    return parse_group(group, "$OOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
-                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH]);
+    return parse_group(group, "$OOOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
+                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
+                       &arrays[LAST_INITIALIZATION]);
 }
 
 static bool parse(PyPool *self, PyObject *args, PyObject *kwargs, Arguments *a) {
@@ -384,7 +387,9 @@ static bool take_arrays(PyPool *self, const Arguments *a) {
            take_matrix(arrays[OBSERVATIONS], &buffers[OBSERVATIONS], WRITTEN, "observations",
                        ITEM_FLOAT32, n, a->num_observed) &&
            take_matrix(arrays[HEALTH], &buffers[HEALTH], WRITTEN, "health", ITEM_INT64, n,
-                       HEALTH_COUNTS);
+                       HEALTH_COUNTS) &&
+           take_vector(arrays[LAST_INITIALIZATION], &buffers[LAST_INITIALIZATION], WRITTEN,
+                       "last_initialization", ITEM_INT64, 1);
 }
 
 static bool settle(PyPool *self, const Arguments *a) {
@@ -415,6 +420,8 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;
+    s->pace.interval = (uint64_t)(a->pace * 1e9);
+    s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
     return take_mark(a->mark, &s->mark) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);

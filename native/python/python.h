@@ -13,7 +13,7 @@
 #include "buffers.h"
 #include "pool.h"
 
-enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
+enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, LAST_INITIALIZATION, BUFFERS };
 
 typedef struct {
     PyObject_HEAD Access access;
