@@ -124,7 +124,12 @@ class _One:
         self.prototype, self.count = env, 1
 
     def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
-        return np.array(function(self.prototype), np.float64)[:, np.newaxis]
+        env = self.prototype
+        env._tells = True  # nothing is written, so that compiled steps may go on
+        try:
+            return np.array(function(env), np.float64)[:, np.newaxis]
+        finally:
+            env._tells = False
 
     @property
     def pool(self) -> Pool:

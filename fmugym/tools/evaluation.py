@@ -50,11 +50,6 @@ class Score:
     kpis: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
-    def label(self) -> str:
-        """The controller, and the scenario if there is one."""
-        return self.name if self.scenario is None else f"{self.name} ({self.scenario})"
-
-    @property
     def mean(self) -> float:
         """The mean reward."""
         return float(np.mean(self.rewards))
@@ -161,7 +156,7 @@ def table(scores: Sequence[Score]) -> str:
     """Format scores for a terminal: lines of printable ASCII."""
     kpis = tuple(dict.fromkeys(name for score in scores for name in score.kpis))
     header = ("", "reward", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time")
-    rows = [header, *(_row(score, kpis) for score in scores)]
+    rows = [header, *(_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True))]
     widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -169,10 +164,17 @@ def table(scores: Sequence[Score]) -> str:
     )
 
 
-def _row(score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
+def _labels(scores: Sequence[Score]) -> list[str]:
+    """The controllers, and the scenarios if there are several."""
+    if len({score.scenario for score in scores}) < 2:
+        return [plain(score.name) for score in scores]
+    return [plain(f"{score.name} ({score.scenario})") for score in scores]
+
+
+def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
     half = confidence(score.rewards)
     return (
-        plain(score.label),
+        label,
         f"{score.mean:.6g}",
         "" if half is None else f"{half:.3g}",
         f"{np.mean(score.costs):.6g}" if score.costs else "",
@@ -205,14 +207,14 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     for axis, (label, values) in zip(axes, groups.items(), strict=True):
         _draw_scores(axis, values)
         axis.set_xlabel(label)
-    axes[0].set_yticks(range(len(scores)), [_shortened(score.label) for score in scores])
+    axes[0].set_yticks(range(len(scores)), list(map(_shortened, _labels(scores))))
     axes[0].invert_yaxis()
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     figure.savefig(path, dpi=150)
 
 
 def _shortened(text: str) -> str:
-    shown = plain(text).replace("$", r"\$")
+    shown = text.replace("$", r"\$")
     return shown if len(shown) <= _LONGEST_LABEL else f"{shown[: _LONGEST_LABEL - 3]}..."
 
 
