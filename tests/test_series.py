@@ -32,6 +32,7 @@ TASK = {
     "parameters": {"q_0": {"distribution": "uniform", "low": -3, "high": 3}},
     "reward": {"near": "-abs(error)", "effort": {"expr": "-abs(tau) * gain", "weight": 2}},
     "costs": {"fast": {"expr": "abs(q_dot)", "limit": 3}, "far": "abs(angle) > 90"},
+    "kpis": {"largest": {"max": "abs(angle)"}},
     "terminated": "abs(angle) > 200",
 }
 
@@ -76,6 +77,7 @@ class TestSingle:
             assert series["reward_terms.near"][row] == info["reward_terms"]["near"]
             assert series["costs.fast"][row] == info["costs"]["fast"]
             assert series["cost"][row] == info["cost"]
+            assert series["kpis.largest"][row] == info["kpis"]["largest"]
         before = zip(
             pairwise(series["angle"]), series["again"][1:], series["step"][1:], strict=True
         )
@@ -103,6 +105,19 @@ class TestSingle:
         env.reset(seed=0)
         (setpoint,) = env.series.of_kind("setpoint")
         assert (setpoint.of, setpoint.unit, setpoint.holds) == ("angle", "deg", True)
+        env.close()
+        env = RecordSeries(
+            fmugym.load(
+                {
+                    "fmu": {"bundled": "Pendulum"},
+                    "agent": {"actions": "tau", "observations": ["q", "q_dot"]},
+                    "setpoints": {"goal": {"value": 1, "of": "q_dot"}},
+                    "reward": "-abs(q)",
+                }
+            )
+        )
+        env.reset(seed=0)
+        assert [one.of for one in env.series.of_kind("setpoint")] == ["q_dot"]
         env.close()
 
     def test_globs_choose_variables(self):
@@ -431,5 +446,7 @@ class TestReport:
             for name in ("reward", "reward_terms.near", "costs.fast", "costs.far"):
                 shown = f"{one[name].sum():.4g}".replace("-", "\u2212")
                 assert shown in text
+            assert f"{np.abs(one['angle'][1:]).max():.4g}" in text
+        assert "largest" in text
         assert "at most 3" in text
         assert "truncated" in text

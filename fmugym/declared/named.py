@@ -73,9 +73,9 @@ def _of_name(declared: Declarations, name: str, kind: str, target: str = "") -> 
 
 
 def _targets(declared: Declarations) -> dict[str, str]:
-    """By set point, the variable that it is subtracted from or compared with somewhere."""
+    """By set point, the variable that it is for: as declared, or else in a difference somewhere."""
     setpoints = declared.root.child("setpoints").value or {}
-    found: dict[str, str] = {}
+    found = {one.setpoint: one.of for one in declared.deviations.values()}
     for first, second in _pairs(declared):
         for name, other in ((first, second), (second, first)):
             if name in setpoints and declared.is_output(other):

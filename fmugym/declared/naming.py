@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
 from typing import Any, Final
@@ -45,6 +45,8 @@ So the rounding of times does not matter.
 """
 
 
+NO_NAMES: Final[Mapping[str, str]] = {}
+
 _CHANNELS_OF_ACTUATORS: Final = 5_000
 _LONGEST_DELAY: Final = 2000
 
@@ -85,7 +87,7 @@ class Naming:
     def _read_names(self) -> tuple[list[str], list[str]]:
         """Observed variables come first, and next those whose previous values are needed."""
         declared, expressions = self._declared, self._declared.expressions
-        observed = [name for _, name in declared.observed] + declared.remembered
+        observed = declared.measured
         previous = sorted(set().union(*(e.previous_names for e in expressions)))
         used = sorted(set().union(*(e.names for e in expressions)))
         wanted = dict.fromkeys(filter(declared.is_output, observed + previous))
@@ -107,20 +109,35 @@ class Naming:
                     "read in one way only; write one as an expression of the other"
                 )
 
-    def code(self, entry: Entry, expression: Expression, moment: Moment) -> Code:
+    def code(
+        self,
+        entry: Entry,
+        expression: Expression,
+        moment: Moment,
+        others: Mapping[str, str] = NO_NAMES,
+    ) -> Code:
         """Make code of an expression.
+
+        Args:
+            entry: Where it stands.
+            expression: The expression.
+            moment: When it is evaluated.
+            others: The code of more names.
 
         Raises:
             ConfigError: If it has unknown names, or names that have no value at this moment.
         """
         with entry.placing():
-            return expression.code(self._names(moment))
+            return expression.code(self._names(moment, others))
 
-    def _names(self, moment: Moment) -> Names:
+    def _names(self, moment: Moment, others: Mapping[str, str]) -> Names:
+        def find(name: str) -> Code | None:
+            return Code(others[name]) if name in others else self.code_of(name, moment)
+
         return Names(
-            lambda name: self.code_of(name, moment),
+            find,
             (lambda name: None) if moment is Moment.BEFORE else self._previous_code_of,
-            self._known,
+            lambda: [*others, *self._known()],
         )
 
     def _known(self) -> list[str]:
@@ -275,7 +292,7 @@ class Naming:
         place, is_one = declared.actions.index(record), len(declared.actions) == 1
         if not record.levels:
             element = f"float64(env.{attribute}[{place}])"
-            return self._rescaled(record, element) if declared.option("rescale") else element
+            return self._rescaled(record, element) if declared.rescales else element
         self.constants[f"levels_{place}"] = np.array(record.levels)
         element = f"env.{attribute}" if is_one else f"env.{attribute}[{place}]"
         return f"take(levels_{place}, {element})"

@@ -27,6 +27,7 @@ __all__ = [
     "normalized",
     "observed_values",
     "remember",
+    "scaled",
 ]
 
 
@@ -107,7 +108,7 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     entry = declared.root.child("agent").child("history")
     length = _count(entry.required("length"), time_step) if declared.remembered else 0
     lengths = dict.fromkeys(declared.remembered, length)
-    for _, name in declared.observed:
+    for name in declared.measured:
         record = _sensor_of(declared, name)
         late = 0 if record is None else naming.delay_of(record) + record.device.remembers
         if late or name in lengths:
@@ -171,7 +172,7 @@ def observed_values(
 
 def _check_sensors(declared: Declarations) -> None:
     """Refuse a sensor of what the agent does not observe: it would do nothing."""
-    seen = {name for _, name in declared.observed} | set(declared.remembered)
+    seen = set(declared.measured)
     for record in declared.records.declared():
         is_used = record.alias in seen or record in declared.actions
         if not record.device.is_ideal and not is_used:
@@ -200,6 +201,10 @@ class _Past:
     def measured(self, entry: Entry, name: str, ago: int) -> str:
         """Code for what the agent measured some steps ago."""
         record = _sensor_of(self._declared, name)
+        deviation = self._declared.deviations.get(name)
+        if deviation is not None:
+            setpoint, of = (self.measured(entry, one, ago) for one in deviation)
+            return f"({setpoint} - {of})"
         if record is None:
             return self._true(entry, name, ago)
         fresh = self._fresh(entry, record, ago)
@@ -318,8 +323,22 @@ def _count(entry: Entry, step: float) -> int:
     return count
 
 
-def normalized(seen: Seen) -> str:
-    """Code for a value that lies between -1 and 1 where it is within its limits.
+def normalized(seen: Seen, nominal: float | None) -> Seen:
+    """Normalize a value by its usual size.
+
+    Raises:
+        ConfigError: If that is not known.
+    """
+    if nominal is None:
+        raise seen.entry.error(
+            f"{seen.name!r} has no nominal value: give it 'nominal', or 'min' and 'max'"
+        )
+    code, low, high = f"({seen.code} / {nominal!r})", seen.low / nominal, seen.high / nominal
+    return seen._replace(code=code, low=low, high=high)
+
+
+def scaled(seen: Seen) -> Seen:
+    """Scale a value so that it lies between -1 and 1 where it is within its limits.
 
     Raises:
         ConfigError: If a limit is infinite.
@@ -329,7 +348,7 @@ def normalized(seen: Seen) -> str:
             f"{seen.name!r} needs 'min' and 'max' so that observations can be normalized"
         )
     middle, half = (seen.low + seen.high) / 2, (seen.high - seen.low) / 2
-    return f"(({seen.code} - {middle!r}) / {half!r})"
+    return seen._replace(code=f"(({seen.code} - {middle!r}) / {half!r})", low=-1.0, high=1.0)
 
 
 def remember(

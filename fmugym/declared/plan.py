@@ -12,27 +12,31 @@ from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
 from fmugym.config import EnvConfig
-from fmugym.declared.declarations import Declarations, Term
+from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression, function_of
+from fmugym.declared.expressions import function_of
+from fmugym.declared.kpis import kpi_name
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
 from fmugym.declared.observing import (
     History,
     NoiseKey,
+    Seen,
     has_errors,
     histories,
     normalized,
     observed_values,
     remember,
+    scaled,
 )
+from fmugym.declared.parts import Term
+from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
 from fmugym.declared.quantities import duration
 from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
-from fmugym.declared.warming import DeclaredWarmUp, Pilot, signals_of
-from fmugym.distributions import Choice, is_distribution
+from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.task.quantity import Quantities
@@ -125,62 +129,16 @@ class Plan:
         return count
 
     def _make_warm_up(self) -> DeclaredWarmUp:
-        table, codes = self._declared.warm_up, self._input_codes(self._declared.warm_up.controllers)
         switches = dict(self._switch_codes())
-        pilots = [self._pilot(record) for record in self._declared.actions]
-        signals = [self._signal_code(name) for name in table.signals()]
-        histories = [*self._kept, *self._sensors]
-        kept = [text for history in histories for text in (history.now, history.fill)]
-        texts = [*codes, *signals, *switches.values(), *kept, self._naming.clock_code()]
-        with table.entry.placing():
-            warm_up = DeclaredWarmUp(
-                self._warm_steps,
-                self._time_step,
-                [pilot for pilot in pilots if pilot is not None],
-                self._function(_tuple(codes)),
-                [*self._updates_of_histories(), *self._updates_of_switches()],
-                texts,
-                self._naming.constants,
-                (*(history.variable for history in histories), *switches),
-                table.caches,
-            )
-        if table.caches:
-            self._require_few_states(warm_up)
-        return warm_up
-
-    def _require_few_states(self, warm_up: DeclaredWarmUp) -> None:
-        """Refuse to keep states that hardly any later episode could use."""
-        values = {name: self.config["episode_variables"][name] for name in warm_up.depends_on}
-        parameters = {name: value for name, (_, value) in self._declared.parameters.items()}
-        for name, value in (parameters | values).items():
-            if is_distribution(value) and not isinstance(value, Choice):
-                raise self._declared.warm_up.entry.child("cache").error(
-                    f"the state after the warm-up depends on {name!r}, which is drawn from "
-                    f"{shown(value)}: nearly every episode needs a state of its own. Leave out "
-                    "'cache', or draw from a list of values"
-                )
-
-    def _pilot(self, record: Record) -> Pilot | None:
-        controller = self._declared.warm_up.controllers.get(record.alias)
-        if controller is None:
-            return None
-        names = signals_of(controller)
-        present = self._function(self._naming.present_code(record)) if record.delta else None
-        return Pilot(
-            record,
-            self._declared.actions.index(record),
-            controller,
-            tuple(names),
-            self._function(_tuple(map(self._signal_code, names))),
-            self._function(self._naming.clock_code()),
-            present,
-            self._declared.option("rescale"),
+        maker = WarmUpMaker(self._declared, self._naming, self._time_step, self._function)
+        return maker.make(
+            self._warm_steps,
+            self._input_codes(self._declared.warm_up.controllers),
+            [*self._updates_of_histories(), *self._updates_of_switches()],
+            [*self._kept, *self._sensors],
+            switches,
+            self.config["episode_variables"],
         )
-
-    def _signal_code(self, name: str) -> str:
-        entry = self._declared.warm_up.entry.child("controller")
-        expression = Expression.parse(name)
-        return self._naming.code(entry, expression, Moment.SEEN).number.text
 
     # The config.
 
@@ -207,7 +165,8 @@ class Plan:
             state, since = switch_names(record)
             switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
-        variables = remembered | self._clock() | histories | switches | worst
+        kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
+        variables = remembered | self._clock() | histories | switches | worst | kpis
         return variables | self._noise(variables)
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
@@ -309,7 +268,7 @@ class Plan:
         """The action space; None if it is that of the inputs as they are."""
         records = self._declared.actions
         are_inputs = all(r.variable is not None and is_plain(r) for r in records)
-        rescales = self._declared.option("rescale")
+        rescales = self._declared.rescales
         if are_inputs and not self._declared.inputs and not rescales:
             return None
         if not records[0].levels:
@@ -361,16 +320,27 @@ class Plan:
     def _observation_space(self) -> spaces.Space[Any] | None:
         """The observation space; None if it is that of the outputs as they are."""
         names, records = [seen.name for seen in self._seen], self._declared.records
-        if self._declared.option("normalize"):
-            return _box([(-1.0, 1.0)] * len(names))
-        if names == self._naming.outputs and all(is_plain(records[name]) for name in names):
+        if (
+            self._declared.normalization is None
+            and names == self._naming.outputs
+            and all(is_plain(records[name]) for name in names)
+        ):
             return None
-        return _box([(seen.low, seen.high) for seen in self._seen])
+        return _box([(seen.low, seen.high) for seen in self._normalized])
+
+    @cached_property
+    def _normalized(self) -> list[Seen]:
+        """What the agent observes, in the form of its observations."""
+        declared = self._declared
+        match declared.normalization:
+            case "limits":
+                return [scaled(seen) for seen in self._seen]
+            case "nominal":
+                return [normalized(seen, declared.nominal_of(seen.name)) for seen in self._seen]
+        return self._seen
 
     def _observation(self) -> Hook:
-        normalizes = self._declared.option("normalize")
-        codes = [normalized(seen) if normalizes else seen.code for seen in self._seen]
-        values = self._function(_tuple(codes))
+        values = self._function(_tuple(seen.code for seen in self._normalized))
         return lambda env: np.array(values(env), dtype=np.float32)
 
     # What follows a step.
@@ -382,6 +352,7 @@ class Plan:
             *self._updates_of_histories(),
             *self._updates_of_switches(),
             *self._updates_of_worst(),
+            *self._updates_of_kpis(),
         ]
         if updates:
             hooks["_update"] = _in_turn(updates)
@@ -392,7 +363,7 @@ class Plan:
         if declared.rewards:
             hooks["_reward_policy"] = self._function(_sum(self._terms(declared.rewards)))
             hooks["_fault_reward"] = self._fault_reward()
-        if declared.costs or declared.has_reward_terms:
+        if declared.costs or declared.has_reward_terms or declared.kpis:
             hooks["_get_info"] = self._function(self._info())
         return hooks
 
@@ -417,6 +388,34 @@ class Plan:
             return []
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
         return self._assignments({WORST: f"fn_min(env.variables[{WORST!r}], {reward})"})
+
+    def _updates_of_kpis(self) -> list[Hook]:
+        terms, codes = self._term_codes(Moment.UPDATED), dict[str, str]()
+        for name, kpi in self._declared.kpis.items():
+            if kpi.how is not None:
+                value = self._naming.code(kpi.entry, kpi.expression, Moment.UPDATED, terms)
+                codes[kpi_name(name)] = kpi.updated(value.number.text)
+        return self._assignments(codes)
+
+    def _kpi_codes(self) -> dict[str, str]:
+        """Code for the figures of the episode until now."""
+        kpis = self._declared.kpis
+        known = {name: kpi.present for name, kpi in kpis.items() if kpi.how is not None}
+        names = self._term_codes(Moment.JUDGED) | known
+        others = {
+            name: self._naming.code(kpi.entry, kpi.expression, Moment.JUDGED, names).number.text
+            for name, kpi in kpis.items()
+            if kpi.how is None
+        }
+        return {name: (known | others)[name] for name in kpis}
+
+    def _term_codes(self, moment: Moment) -> dict[str, str]:
+        """Code for rewards and costs by their names, for the figures that use them."""
+        declared = self._declared
+        if not declared.kpis:
+            return {}
+        terms = {**declared.rewards, **declared.costs}
+        return {name: code for name, code in self._terms(terms, moment).items() if name}
 
     def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""
@@ -465,7 +464,7 @@ class Plan:
         return codes
 
     def _info(self) -> str:
-        """Code for the info: terms of the reward, and costs."""
+        """Code for the info: terms of the reward, costs, and figures of the episode."""
         rewards, costs = self._terms(self._declared.rewards), self._terms(self._declared.costs)
         parts: dict[str, str] = {}
         if self._declared.has_reward_terms:
@@ -473,6 +472,8 @@ class Plan:
         if costs:
             parts["cost"] = _in_steps(_sum(costs))
             parts["costs"] = _dict({name: _in_steps(code) for name, code in costs.items()})
+        if self._declared.kpis:
+            parts["kpis"] = _dict({n: _in_steps(code) for n, code in self._kpi_codes().items()})
         return _dict(parts)
 
     def _function(self, text: str) -> Hook:

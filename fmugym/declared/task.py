@@ -31,7 +31,7 @@ KEYS: Final = (
     *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
     "controllers",
     "agent",
-    *("reward", "costs", "terminated", "truncated", "config"),
+    *("reward", "costs", "kpis", "terminated", "truncated", "config"),
 )
 """The keys of a task."""
 

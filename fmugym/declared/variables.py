@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 VARIABLE_KEYS: Final = (
-    *("name", "unit", "min", "max", "levels", "delta", "min_on", "min_off", "sample"),
+    *("name", "unit", "min", "max", "nominal", "levels", "delta", "min_on", "min_off", "sample"),
     *DEVICE_KEYS,
     "description",
 )
@@ -51,6 +51,7 @@ class Record:
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
         low, high: The limits in the unit of the task; infinite where there are none.
+        nominal: The usual size of its values; None if neither the task nor the FMU says it.
         levels: The values that an action chooses from; empty for a continuous one.
         sample: What a step gives of the values after each substep, one of ``SAMPLINGS``.
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
@@ -68,6 +69,7 @@ class Record:
     high: float
     levels: tuple[float, ...] = ()
     sample: str = "last"
+    nominal: float | None = None
     delta: float = 0.0
     min_on: float = 0.0
     min_off: float = 0.0
@@ -218,6 +220,7 @@ class Records:
         device = read_device(entry)
         return Record(
             *(alias, entry, variable, wanted, conversion, low, high, levels, sample),
+            nominal=_nominal(entry, limited, conversion),
             device=device,
             **limits,
         )
@@ -243,6 +246,18 @@ def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[floa
     limits = (min(values), max(values)) if values else (variable.minimum, variable.maximum)
     low, high = sorted(map(conversion, limits))
     return low, high
+
+
+def _nominal(entry: Entry, variable: Variable | None, conversion: Conversion) -> float | None:
+    """The nominal value of the task, or that of the FMU unless its unit has another zero."""
+    nominal = entry.child("nominal")
+    if nominal.value is not None:
+        value = number(nominal)
+        if not 0 < value < math.inf:
+            raise nominal.error(f"nominal must be positive, got {value:g}")
+        return value
+    own = None if variable is None else variable.nominal
+    return None if not own or conversion.offset else abs(own * conversion.factor)
 
 
 def _of_actuator(entry: Entry) -> dict[str, Any]:

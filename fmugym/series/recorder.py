@@ -58,7 +58,7 @@ class _Recorder:
         """Write down that episodes have begun."""
         if self._memory is None:
             self._open(infos)
-        self._add(self._rows.begin(mask, observations))
+        self._add(self._rows.begin(mask, infos, observations))
 
     def _open(self, infos: Infos) -> None:
         self._rows = Rows(
@@ -88,7 +88,7 @@ class _Recorder:
             raise SimulationError("there is no recording before the first reset")
         block = self._memory.rows()
         limits = getattr(self.episodes.prototype, "cost_limits", {})
-        return TimeSeries(self._rows.columns, block.values, block.faults, limits, self._rows.kpis)
+        return TimeSeries(self._rows.columns, block.values, block.faults, limits)
 
     def close(self) -> None:
         """Complete the file."""

@@ -145,11 +145,11 @@ class Rows:
         self._episodes, self._choice, self._indices = episodes, choice, indices
         self._every, self._is_vector = every, is_vector
         self._summed = tuple(_summed(infos))
+        self._kpis = tuple(infos.names("kpis"))
         count = episodes.count
         self._sums = np.zeros((count, 1 + len(self._summed)))
         self._steps = np.zeros(count, np.int64)
         self._number = np.full(count, -1, np.int64)
-        self.kpis: dict[tuple[int, int], Mapping[str, float]] = {}
         self.columns = tuple(self._columns())
 
     def _columns(self) -> Iterator[Quantity]:
@@ -162,15 +162,16 @@ class Rows:
         for path in self._summed:
             kind = _GROUPS.get(path[0], "cost")
             yield Quantity(".".join(path), kind)
+        yield from (Quantity(f"kpis.{name}", "kpi") for name in self._kpis)
         yield from (Quantity("terminated", "flag"), Quantity("truncated", "flag"))
 
-    def begin(self, mask: MaskArray, observations: Any) -> Block:
+    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> Block:
         """Make the first rows of episodes."""
         self._number[mask] += 1
         self._steps[mask] = 0
         self._sums[mask] = 0.0
         no = np.zeros(len(mask), np.bool_)
-        return self._block(mask, self._values(observations), (no, no), {})
+        return self._block(mask, self._values(observations), (no, no), infos)
 
     def add(self, outcome: Outcome, idle: MaskArray) -> Block:
         """Make the rows of a step.
@@ -183,13 +184,11 @@ class Rows:
         self._sums += np.where(idle, 0.0, np.array([outcome.rewards, *terms])).T
         self._steps += ~idle
         ended = (outcome.terminated | outcome.truncated) & ~idle
-        for index, kpis in outcome.infos.each("kpis").items():
-            self.kpis[index, int(self._number[index])] = dict(kpis)
         values = self._values(outcome.observations)
         values[outcome.lost, : len(self._choice.places) + len(self._choice.variables)] = np.nan
         due = ~idle & (ended | (self._steps % self._every == 0))
         flags = outcome.terminated, outcome.truncated
-        block = self._block(due, values, flags, outcome.infos.each("fault"))
+        block = self._block(due, values, flags, outcome.infos)
         self._sums[due] = 0.0
         return block
 
@@ -203,7 +202,7 @@ class Rows:
         mask: MaskArray,
         values: FloatArray,
         flags: tuple[MaskArray, MaskArray],
-        faults: Mapping[int, str],
+        infos: Infos,
     ) -> Block:
         which = self._indices[mask[self._indices]]
         spec = self._episodes.prototype._spec
@@ -216,10 +215,13 @@ class Rows:
                 *values[which].T,
                 *self._sums[which].T,
             ),
+            *(infos.numbers("kpis", name)[which] for name in self._kpis),
             *(flag[which] for flag in flags),
         ]
         rows = {index: row for row, index in enumerate(which.tolist())}
-        told = {rows[index]: str(why) for index, why in faults.items() if index in rows}
+        told = {
+            rows[index]: str(why) for index, why in infos.each("fault").items() if index in rows
+        }
         return Block(np.array(parts, np.float64).T, told)
 
 

@@ -75,7 +75,7 @@ def _summary(key: tuple[int, int], series: TimeSeries) -> EpisodeSummary:
         terms=_totals(series, "reward term"),
         cost=_total(series, "cost") if costs else None,
         costs=_totals(series, "cost term"),
-        kpis=series.kpis.get(key, {}),
+        kpis={one.name.partition(".")[2]: series[one.name][-1] for one in series.of_kind("kpi")},
         end=_end(series),
     )
 

@@ -26,18 +26,17 @@ class TimeSeries:
     Attributes:
         columns: What the columns are. Beside the kinds of ``fmugym.task.quantity``, there are
             ``"index"`` (environment, episode, step), ``"time"``, ``"observation"``, ``"reward"``,
-            ``"reward term"``, ``"cost"``, ``"cost term"`` and ``"flag"`` (terminated, truncated).
+            ``"reward term"``, ``"cost"``, ``"cost term"``, ``"kpi"`` (of the episode until now) and
+            ``"flag"`` (terminated, truncated).
         values: Shape (rows, columns).
         faults: The reasons of faults by row.
         cost_limits: What the costs of an episode may add up to, by name.
-        kpis: The ``"kpis"`` of the info at the end of episodes, by environment and episode.
     """
 
     columns: tuple[Quantity, ...]
     values: FloatArray = field(repr=False)
     faults: Mapping[int, str] = field(default_factory=dict)
     cost_limits: Mapping[str, float] = field(default_factory=dict)
-    kpis: Mapping[tuple[int, int], Mapping[str, float]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -71,7 +70,7 @@ class TimeSeries:
     def _where(self, mask: Any) -> TimeSeries:
         rows = np.flatnonzero(mask).tolist()
         faults = {new: self.faults[old] for new, old in enumerate(rows) if old in self.faults}
-        return TimeSeries(self.columns, self.values[rows], faults, self.cost_limits, self.kpis)
+        return TimeSeries(self.columns, self.values[rows], faults, self.cost_limits)
 
     # Files.
 
