@@ -101,6 +101,9 @@ SLOW_TESTS = (
     "test_licences.py::TestWaiting::test_ends_when_another",
     "test_licences.py::TestWaiting::test_in_a_reset",
     "test_lifecycle.py::TestManyLives",
+    "test_model_exchange.py::TestEnvironments::test_a_solver",
+    "test_model_exchange.py::TestPools",
+    "test_model_exchange.py::TestSolvers::test_the_stiff",
     "test_native_guards.py::test_want_of_memory",
     "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
@@ -148,6 +151,9 @@ SLOW_TESTS = (
 )
 """Others, by the beginning of their node ids."""
 
+EXHAUSTIVE_TESTS = ("test_model_exchange.py::TestEvents::test_time_does_not",)
+"""Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
+
 
 def is_slow(node_id, number):
     """Whether the default run leaves out a test.
@@ -157,7 +163,7 @@ def is_slow(node_id, number):
         number: How many combinations of the same test came before.
     """
     module = node_id.partition(".py")[0]
-    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS):
+    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS + EXHAUSTIVE_TESTS):
         return True
     return number % EVERY.get(module, EVERY_OF_OTHERS) > 0
 
@@ -165,4 +171,6 @@ def is_slow(node_id, number):
 def is_exhaustive(node_id, number):
     """Whether a slow test is left to ``.ci/full``; the arguments are those of ``is_slow``."""
     module = node_id.partition(".py")[0]
+    if node_id.startswith(EXHAUSTIVE_TESTS):
+        return True
     return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0

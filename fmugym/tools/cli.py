@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        "fmugym", description="Look at a co-simulation FMU, make a task of it, and run that."
+        "fmugym", description="Look at an FMU, make a task of it, and run that."
     )
     parser.add_argument("--version", action="version", version=version("fmugym-toolbox"))
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
