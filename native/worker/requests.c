@@ -31,6 +31,7 @@ enum {
     REQUEST_COUNT_STEPS,
     REQUEST_FAILURE,
     REQUEST_READ,
+    REQUEST_REPLACE_RECORD,
     REQUEST_CLOSE,
     REQUESTS
 };
@@ -459,6 +460,35 @@ static void answer_record_of(Worker *w, Reader *reader) {
     send_result(&writer);
 }
 
+static void answer_replace_record(Worker *w, Reader *reader) {
+    const size_t index = (size_t)read_integer(reader), rows = (size_t)read_integer(reader);
+    const size_t width = w->settings.inputs->count;
+    Access start;
+
+    if (!read_access(reader, w->settings.fmi, &start)) {
+        send_error("a list of variables is damaged");
+        return;
+    }
+    size_t values, size;
+    int64_t *starts = read_integers(reader, &values); /* of the same size as float64 */
+    int64_t *inputs = read_integers(reader, &size);
+    if (reader->sound && index < w->settings.count && values == start.count &&
+        size == rows * width) {
+        pool_enter(&w->pool);
+        record_begin(&w->pool, index, &start, (const double *)starts);
+        for (size_t row = 0; row < rows; row++) {
+            record_add(&w->pool, index, (const double *)inputs + row * width);
+        }
+        pool_leave(&w->pool);
+        send_done();
+    } else {
+        send_error("a record is damaged");
+    }
+    free(starts);
+    free(inputs);
+    access_close(&start);
+}
+
 static void answer_count_steps(Worker *w, Reader *reader) {
     (void)reader;
     pool_enter(&w->pool);
@@ -501,6 +531,7 @@ bool worker_answer(Worker *w, Reader *reader) {
         [REQUEST_COUNT_STEPS] = answer_count_steps,
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_READ] = answer_read,
+        [REQUEST_REPLACE_RECORD] = answer_replace_record,
         [REQUEST_CLOSE] = answer_close,
     };
     const uint8_t request = read_flag(reader);

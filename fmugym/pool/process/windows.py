@@ -19,13 +19,13 @@ import numpy as np
 from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.bundle import Bundle, IndexArray, Record, SaveMethod
 from fmugym.pool.pacing import last_initialization, pace_file
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.reports import Failure, as_record, describe_failure, loading_failed
-from fmugym.pool.saving import Serialized, offers_states
+from fmugym.pool.saving import Serialized, offered_method
 from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
@@ -52,6 +52,7 @@ _REQUESTS: Final = (
     "count_steps",
     "failure",
     "read",
+    "replace_record",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
@@ -230,7 +231,7 @@ class ProgramCoding:
         _write_variables(writer, variable_settings(spec))
         writer.block(experiment["start_outputs"] or b"")
         writer.integers(setup.block.stop - setup.block.start, setup.threads)
-        writer.flags(spec.records or not offers_states(description, spec))
+        writer.flags(spec.records or offered_method(description, spec) is not SaveMethod.STATE)
         self._write_memory(writer, setup)
 
     def _write_memory(self, writer: _Writer, setup: Setup) -> None:
@@ -311,6 +312,13 @@ class ProgramCoding:
         steps = reader.integer()
         setup = self._setup
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
+
+    def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
+        variables = self._setup.description.variables
+        writer.integers(index, len(record.inputs))
+        writer.access([variables[name] for name in record.names], self._version)
+        for values in (record.starts, record.inputs):
+            writer.block(np.ascontiguousarray(values, np.float64).tobytes())
 
     def _ask_failure(self, writer: _Writer, index: int) -> None:
         writer.integers(index)
