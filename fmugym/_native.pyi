@@ -94,9 +94,12 @@ class Access:
         version: 1, 2 or 3.
         types: One byte for each variable, the number of its C type; see ``fmi.h``.
         references: Their value references, as bytes of native 32-bit integers.
+        is_exchange: Whether the FMU is run by model exchange.
     """
 
-    def __new__(cls, version: int, types: bytes, references: bytes, /) -> Access: ...
+    def __new__(
+        cls, version: int, types: bytes, references: bytes, is_exchange: bool = False, /
+    ) -> Access: ...
 
 @final
 class Draws:
@@ -157,6 +160,7 @@ class Library(TypedDict):
     states: bool
     categories: tuple[bytes, ...]
     mark: Mark | None
+    solving: tuple[Any, ...] | None
 
 class Experiment(TypedDict):
     """The times of an episode."""

@@ -73,7 +73,7 @@ class PythonPool(SavingPool):
         self._mark = mark
         self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
         with self._resetting:
-            self._library = Library(fmu, log)
+            self._library = Library(fmu, log, spec.solving)
         pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:
