@@ -452,6 +452,11 @@ class Pool:
             None if the episode is not known as a whole.
         """
 
+    def replace_record(
+        self, index: int, start: Access, starts: bytes, inputs: bytes, steps: int, /
+    ) -> None:
+        """Let an episode count as the one with these start values and inputs."""
+
     def costs(self) -> tuple[float, float, float, float, float]:
         """The measured ns per instance of some methods; 0 if unknown.
 

@@ -9,9 +9,11 @@ SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
     "test_cli_docs",
+    "test_copies",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
+    "test_examples_planners",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
@@ -46,6 +48,8 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_copies": 2,
+    "test_examples_planners": 4,
     "test_quirks": 4,
     "test_words": 5,
     "test_zoo": 5,

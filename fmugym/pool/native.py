@@ -374,6 +374,12 @@ class NativePool(SavingPool):
             np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
         )
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        access = self._access(tuple(self._variables[name] for name in record.names))
+        starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
+        self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
+
     def _count_steps(self) -> None:
         if self._close.alive:
             self._pool.count_steps()
