@@ -22,6 +22,7 @@ PAGES: Final = {
 MODULES: Final = {
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
+    "TorchRL": "fmugym.torchrl",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",
     "Pictures": "fmugym.rendering",
