@@ -628,13 +628,13 @@ class NativePool(SavingPool):
         own = self._pool
         return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
-    def start_of_play(self) -> Callable[..., int]:
+    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes after ``prepare_play``, outside of a step.
 
         Returns:
             A function of a mask, observations and drawn values (draws, N). It fills all of the
             observations, and the drawn values in the mask; ``given`` ones are read. It returns how
-            many instances had trouble.
+            many instances had trouble, and whether any episode of another one has ended.
         """
         return self._reset_of_play
 
