@@ -60,10 +60,10 @@ def rewards(value: Any, count: int) -> FloatArray:
 def write_inputs(value: Any, inputs: FloatArray) -> None:
     """Write the result of ``_get_inputs`` to the inputs of the FMUs, shape (k, N)."""
     length, count = inputs.shape
-    if type(value) is np.ndarray and value.dtype.kind in _NUMBERS:
-        if value.shape == inputs.shape or (length == 1 and value.shape == (count,)):
-            inputs[:] = value
-            return
+    is_array = type(value) is np.ndarray and value.dtype.kind in _NUMBERS
+    if is_array and (value.shape == inputs.shape or (length == 1 and value.shape == (count,))):
+        inputs[:] = value
+        return
     given(value, "_get_inputs")
     wanted = f"{length} numbers, or arrays of {count}"
     is_list = issubclass(type(value), list | tuple)
