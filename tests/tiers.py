@@ -8,9 +8,12 @@ in the default run: of a test with many combinations of parameters, it takes eve
 SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
+    "test_cli_docs",
+    "test_copies",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
+    "test_examples_planners",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
@@ -45,6 +48,8 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_copies": 2,
+    "test_examples_planners": 4,
     "test_quirks": 4,
     "test_words": 5,
     "test_zoo": 5,
@@ -57,6 +62,9 @@ these occurs with others in turn.
 
 SLOW_TESTS = (
     "test_cli.py::TestSkeleton::test_runs_for",
+    "test_cli_playing.py::TestBench::test_a_table",
+    "test_cli_playing.py::TestRecord::test_a_report",
+    "test_cli_playing.py::TestRecord::test_several",
     "test_cloud_pendulum.py::TestExits",
     "test_crashes.py::test_a_",
     "test_crashes.py::test_faulthandler",
@@ -121,6 +129,10 @@ SLOW_TESTS = (
     "test_seats.py::TestSeats::test_of_a_vector",
     "test_seats.py::TestSeats::test_waiting_ends",
     "test_seats.py::test_pace_of_two",
+    "test_series.py::TestFiles::test_memory",
+    "test_series.py::TestPictures::test_files",
+    "test_series.py::TestPictures::test_long",
+    "test_series.py::TestReport::test_it_is_one",
     "test_single_compiled.py::TestWays::test_worker_processes",
     "test_single_compiled.py::test_generated_expressions",
     "test_slow_models.py::TestProgress::test_is_not",

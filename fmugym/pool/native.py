@@ -375,6 +375,12 @@ class NativePool(SavingPool):
             np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
         )
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        access = self._access(tuple(self._variables[name] for name in record.names))
+        starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
+        self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
+
     def _count_steps(self) -> None:
         if self._close.alive:
             self._pool.count_steps()
@@ -623,13 +629,13 @@ class NativePool(SavingPool):
         own = self._pool
         return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
-    def start_of_play(self) -> Callable[..., int]:
+    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes after ``prepare_play``, outside of a step.
 
         Returns:
             A function of a mask, observations and drawn values (draws, N). It fills all of the
             observations, and the drawn values in the mask; ``given`` ones are read. It returns how
-            many instances had trouble.
+            many instances had trouble, and whether any episode of another one has ended.
         """
         return self._reset_of_play
 

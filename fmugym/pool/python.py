@@ -197,6 +197,10 @@ class PythonPool(SavingPool):
         """See ``SavingPool.record_of``."""
         return self._slots[index].record
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        self._slots[index].replace_record(record)
+
     def _keep_records(self) -> None:
         for slot in self._slots:
             slot.keeps_record = True

@@ -548,6 +548,7 @@ static PyMethodDef methods[] = {
     FAST("unbundle", py_unbundle),
     {"keep_records", py_keep_records, METH_NOARGS, NULL},
     {"record_of", py_record_of, METH_O, NULL},
+    {"replace_record", (PyCFunction)(void (*)(void))py_replace_record, METH_FASTCALL, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"recycle", py_recycle, METH_NOARGS, NULL},
     FAST("record", py_record),
