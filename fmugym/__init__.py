@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fmugym.config import EnvConfig
     from fmugym.declared import Task, TaskEnv, load
     from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-    from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
+    from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI2MEEnv, FMI3CSEnv, FMUEnv
     from fmugym.errors import (
         ConfigError,
         ContractError,
@@ -46,6 +46,7 @@ __all__ = [
     "EnvConfig",
     "FMI1CSEnv",
     "FMI2CSEnv",
+    "FMI2MEEnv",
     "FMI3CSEnv",
     "FMUEnv",
     "FMUGymError",
@@ -82,7 +83,7 @@ _MODULES = {
     "config": ["EnvConfig"],
     "declared": ["Task", "TaskEnv", "load"],
     "distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
-    "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"],
+    "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI2MEEnv", "FMI3CSEnv", "FMUEnv"],
     "errors": [
         *("ConfigError", "ContractError", "FMUGymError"),
         *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),

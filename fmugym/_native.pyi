@@ -94,9 +94,12 @@ class Access:
         version: 1, 2 or 3.
         types: One byte for each variable, the number of its C type; see ``fmi.h``.
         references: Their value references, as bytes of native 32-bit integers.
+        is_exchange: Whether the FMU is run by model exchange.
     """
 
-    def __new__(cls, version: int, types: bytes, references: bytes, /) -> Access: ...
+    def __new__(
+        cls, version: int, types: bytes, references: bytes, is_exchange: bool = False, /
+    ) -> Access: ...
 
 @final
 class Draws:
@@ -157,6 +160,7 @@ class Library(TypedDict):
     states: bool
     categories: tuple[bytes, ...]
     mark: Mark | None
+    solving: tuple[Any, ...] | None
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -330,7 +334,7 @@ class Pool:
     def actions_of_single(self) -> tuple[Any, Any]:
         """The actions of the last step and of the one before."""
 
-    def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
+    def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
     def save(self) -> Snapshot | int:
@@ -447,6 +451,11 @@ class Pool:
         Returns:
             None if the episode is not known as a whole.
         """
+
+    def replace_record(
+        self, index: int, start: Access, starts: bytes, inputs: bytes, steps: int, /
+    ) -> None:
+        """Let an episode count as the one with these start values and inputs."""
 
     def costs(self) -> tuple[float, float, float, float, float]:
         """The measured ns per instance of some methods; 0 if unknown.

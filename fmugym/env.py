@@ -31,7 +31,7 @@ from fmugym.task.step import conclude
 from fmugym.task.waiting import Waiting
 from fmugym.task.warm_up import WarmUps, rows_of_one
 
-__all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
+__all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI2MEEnv", "FMI3CSEnv", "FMUEnv"]
 
 _INTEGERS: Final = frozenset({int, np.int64})
 _WARNING: Final = int(Status.WARNING)
@@ -47,13 +47,13 @@ Result = tuple[Any, float, bool, bool, dict[str, Any]]
 
 
 class FMUEnv(Constructed):
-    """A co-simulation FMU as a Gymnasium environment.
+    """An FMU as a Gymnasium environment.
 
-    A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv`` and supplies
-    ``_is_done``; every other hook of ``fmugym.task.hooks.Hooks`` has a default. A step calls the
-    hooks once each, in the order in which they stand there. All but ``_get_inputs`` and ``_update``
-    must be free of side effects. None may draw random numbers; random values are distributions in
-    the config.
+    A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv``, or from
+    ``FMI2MEEnv`` for model exchange, and supplies ``_is_done``; every other hook of
+    ``fmugym.task.hooks.Hooks`` has a default. A step calls the hooks once each, in the order in
+    which they stand there. All but ``_get_inputs`` and ``_update`` must be free of side effects.
+    None may draw random numbers; random values are distributions in the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.
@@ -102,6 +102,10 @@ class FMUEnv(Constructed):
 
     fmi_version: ClassVar[int | None] = None
     """The FMI version that the FMU must have; None for any."""
+
+    fmi_interface: ClassVar[str | None] = None
+    """How the FMU is run, ``"co_simulation"`` or ``"model_exchange"``; None for as the config says.
+    """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
 
@@ -613,18 +617,31 @@ class FMI1CSEnv(FMUEnv):
     """Base class for FMUs of FMI 1.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 1
+    fmi_interface = "co_simulation"
 
 
 class FMI2CSEnv(FMUEnv):
     """Base class for FMUs of FMI 2.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 2
+    fmi_interface = "co_simulation"
+
+
+class FMI2MEEnv(FMUEnv):
+    """Base class for FMUs of FMI 2.0 model exchange; see ``FMUEnv``.
+
+    The equations are integrated by the ``solver`` of the config, one of fmugym's own.
+    """
+
+    fmi_version = 2
+    fmi_interface = "model_exchange"
 
 
 class FMI3CSEnv(FMUEnv):
     """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 3
+    fmi_interface = "co_simulation"
 
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:

@@ -7,6 +7,7 @@
 #include "fmi.h"
 #include "halves.h"
 #include "platform.h"
+#include "quick.h"
 
 #define NAME_IT(operation, name) [operation] = name,
 const char *const operation_names[NUMBER_OF_OPERATIONS] = {EACH_OPERATION(NAME_IT)};
@@ -27,6 +28,7 @@ static size_t number_of_operands(const Program *program, Instruction i) {
     case CALL:
         return program->calls[i.extra].inputs;
     case CALL_SQUARE:
+    case CALL_REMAINDER:
         return 2;
     case STORE_ROW:
     case STORE_SEEN:
@@ -67,6 +69,7 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
     case CALL:
         return i.extra < program->number_of_calls;
     case CALL_SQUARE:
+    case CALL_REMAINDER:
         return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2 &&
                program->calls[i.extra].values == 3;
     case CAST:
@@ -295,6 +298,15 @@ static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t c
 
 /* Operations of numpy */
 
+WIDE static bool is_any_set(const uint8_t *flags, size_t lanes) {
+    uint8_t any = 0;
+
+    for (size_t j = 0; j < lanes / PROGRAM_BLOCK * PROGRAM_BLOCK; j++) {
+        any |= flags[j];
+    }
+    return any != 0;
+}
+
 /* The casts drop const: a loop of numpy does not write to its inputs. */
 static void call(const Called *called, size_t count, size_t lanes, const Registers *registers,
                  Instruction i) {
@@ -316,46 +328,40 @@ static void call(const Called *called, size_t count, size_t lanes, const Registe
         statement;                                                                                 \
     }
 
-/* The power of 2, by a loop whose error is less than 0.55 units in the last place. Dekker's product
- * gives the error of the rounded square. Where it is less than 0.45 units, no such loop can round
- * in the other direction. Below a power of two the units are half as long; the loop handles those,
- * and numbers whose product might not be exact. */
-static inline uint8_t square_one(double x, double *square) {
-    const double shifted = x * 134217729.0, high = shifted - (shifted - x), low = x - high;
-    const double rounded = x * x;
-    const double error = ((high * high - rounded) + 2.0 * high * low) + low * low;
-    uint64_t bits, leading;
-    double power;
-
-    memcpy(&bits, &rounded, sizeof bits);
-    leading = bits & UINT64_C(0x7ff) << 52;
-    memcpy(&power, &leading, sizeof power);
-    *square = rounded;
-    return !((fabs(error) <= 0.45 * DBL_EPSILON * power) & (bits != leading) &
-             (rounded > 1e-250) & (rounded < 1e250));
-}
-
-WIDE static void square(const double *restrict x, size_t blocks, double *restrict to,
-                        uint8_t *restrict doubtful) {
-    EACH_LANE(doubtful[j] = square_one(x[j], &to[j]));
-}
-
-static void call_square(const Called *called, size_t count, size_t lanes, const double *x,
-                        const void *exponent, double *to) {
-    uint8_t doubtful[PROGRAM_WIDTH], places[PROGRAM_WIDTH];
-    double bases[PROGRAM_WIDTH], powers[PROGRAM_WIDTH];
+/* Calls the loop for the values that are doubtful. */
+static void call_where(const Called *called, size_t count, const uint8_t *doubtful,
+                       const double *x, const double *y, double *to) {
+    double first[PROGRAM_WIDTH], second[PROGRAM_WIDTH], found[PROGRAM_WIDTH];
+    uint8_t places[PROGRAM_WIDTH];
     ptrdiff_t number = 0;
 
-    square(x, lanes / PROGRAM_BLOCK, to, doubtful);
     for (size_t j = 0; j < count; j++) {
         places[number] = (uint8_t)j;
-        bases[number] = x[j];
+        first[number] = x[j];
+        second[number] = y[j];
         number += doubtful[j];
     }
-    char *data[] = {(char *)bases, (char *)exponent, (char *)powers};
-    called->loop(called->context, data, &number, called->sizes, called->auxiliary);
+    char *data[] = {(char *)first, (char *)second, (char *)found};
+    if (number > 0) {
+        called->loop(called->context, data, &number, called->sizes, called->auxiliary);
+    }
     for (ptrdiff_t k = 0; k < number; k++) {
-        to[places[k]] = powers[k];
+        to[places[k]] = found[k];
+    }
+}
+
+static void call_quick(const Called *called, size_t count, size_t lanes, uint16_t operation,
+                       const double *x, const double *y, Register *to) {
+    const size_t blocks = lanes / PROGRAM_BLOCK;
+    _Alignas(64) uint8_t doubtful[PROGRAM_WIDTH];
+
+    if (operation == CALL_SQUARE) {
+        quick_square(x, blocks, to->doubles, doubtful);
+    } else {
+        quick_remainder(x, y, blocks, to->doubles, doubtful);
+    }
+    if (is_any_set(doubtful, lanes)) {
+        call_where(called, count, doubtful, x, y, to->doubles);
     }
 }
 
@@ -696,8 +702,9 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
             call(&program->calls[i.extra], count, lanes, registers, i);
             break;
         case CALL_SQUARE:
-            call_square(&program->calls[i.extra], count, lanes, places[i.a], places[i.b],
-                        to->doubles);
+        case CALL_REMAINDER:
+            call_quick(&program->calls[i.extra], count, lanes, i.operation, places[i.a],
+                       places[i.b], to);
             break;
         case CAST:
             cast(i.extra, places[i.a], lanes / PROGRAM_BLOCK, to);

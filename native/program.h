@@ -29,6 +29,7 @@ enum {
     X(STORE_SEEN, "store_seen")                                                                    \
     X(CALL, "call")                                                                                \
     X(CALL_SQUARE, "call_square")                                                                  \
+    X(CALL_REMAINDER, "call_remainder")                                                            \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \

@@ -21,7 +21,7 @@ STOREYS = [
     {"env"},
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
-    {"registration", "recording", "single", "testing", "sb3", "declared"},
+    {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
     {"envs", "tools"},
     {"__init__", "__main__", "clock"},
 ]

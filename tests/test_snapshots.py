@@ -31,7 +31,7 @@ ACTIONS = np.random.default_rng(5).uniform(-1, 1, (60, 1)).astype(np.float32)
 class Track(fmugym.FMI2CSEnv):
     """Follow a target that moves; an integral, a history, drawn values and short episodes."""
 
-    def __init__(self, fmi_version="2.0", backend=None, hooks="auto", **changes):
+    def __init__(self, fmi_version="2.0", backend=None, hooks="auto", isolation=None, **changes):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
@@ -47,7 +47,8 @@ class Track(fmugym.FMI2CSEnv):
             "max_episode_steps": 12,
         }
         fmu = fmugym.bundled_fmu("Pendulum", fmi_version)
-        super().__init__(fmu, config | changes, backend=backend, hooks=hooks)
+        options = {"backend": backend, "hooks": hooks, "isolation": isolation}
+        super().__init__(fmu, config | changes, **options)
 
     fmi_version = None
 

@@ -66,6 +66,7 @@ class TaskEnv(FMUEnv):
         path = fmu_path(self.task)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
+        self._quantities_of_task = plan.quantities
         self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
         if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
             raise self.task.root.child("warm_up").error(

@@ -17,6 +17,7 @@ from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
 from fmugym.declared.kpis import kpi_name
+from fmugym.declared.named import named_values
 from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
 from fmugym.declared.observing import (
     History,
@@ -38,6 +39,7 @@ from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
+from fmugym.task.quantity import Quantities
 
 __all__ = ["Plan"]
 
@@ -104,6 +106,12 @@ class Plan:
         self.action_masks = self._action_masks()
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
+
+    def quantities(self) -> Quantities:
+        """Everything in the task that has a name and a value, and a function that reads it."""
+        found = named_values(self._declared, self._naming)
+        read = self._function(_tuple(code for _, code in found.values()))
+        return Quantities([quantity for quantity, _ in found.values()], read)
 
     # The warm-up.
 

@@ -178,6 +178,7 @@ class NativePool(SavingPool):
                     "states": description.capabilities.can_get_and_set_fmu_state,
                     "categories": tuple(c.encode() for c in description.error_categories),
                     "mark": None if self._mark is None else self._mark.page,
+                    "solving": _solving(description, spec),
                 },
                 experiment={
                     "start_time": spec.start_time,
@@ -231,7 +232,8 @@ class NativePool(SavingPool):
             version = self._fmu.description.fmi_major_version
             types = bytes(_type_number(variable, version) for variable in variables)
             references = np.array([v.value_reference for v in variables], np.uint32)
-            access = _native.Access(version, types, references.tobytes())
+            is_exchange = self._fmu.description.model_exchange is not None
+            access = _native.Access(version, types, references.tobytes(), is_exchange)
             self._accesses[variables] = access
         return access
 
@@ -371,6 +373,12 @@ class NativePool(SavingPool):
             np.array(values, np.float64),
             np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
         )
+
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        access = self._access(tuple(self._variables[name] for name in record.names))
+        starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
+        self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
     def _count_steps(self) -> None:
         if self._close.alive:
@@ -620,13 +628,13 @@ class NativePool(SavingPool):
         own = self._pool
         return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
-    def start_of_play(self) -> Callable[..., int]:
+    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes after ``prepare_play``, outside of a step.
 
         Returns:
             A function of a mask, observations and drawn values (draws, N). It fills all of the
             observations, and the drawn values in the mask; ``given`` ones are read. It returns how
-            many instances had trouble.
+            many instances had trouble, and whether any episode of another one has ended.
         """
         return self._reset_of_play
 
@@ -715,6 +723,27 @@ def _resources(folder: Path, version: int) -> bytes:
     if version == 2:
         return (folder / "resources").as_uri().encode()
     return os.path.join(folder, "resources", "").encode()
+
+
+def _solving(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
+    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    model = description.model_exchange
+    if model is None:
+        return None
+    solving, states, rates = spec.solving, None, None
+    if description.capabilities.provides_directional_derivatives and model.state_references:
+        states = np.array(model.state_references, np.uint32).tobytes()
+        rates = np.array(model.derivative_references, np.uint32).tobytes()
+    return (
+        solving.solver.encode(),
+        solving.tolerance,
+        solving.max_step,
+        model.number_of_states,
+        model.number_of_event_indicators,
+        model.needs_completed_integrator_step,
+        states,
+        rates,
+    )
 
 
 def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:

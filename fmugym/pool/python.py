@@ -73,7 +73,7 @@ class PythonPool(SavingPool):
         self._mark = mark
         self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
         with self._resetting:
-            self._library = Library(fmu, log)
+            self._library = Library(fmu, log, spec.solving)
         pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:
@@ -196,6 +196,10 @@ class PythonPool(SavingPool):
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
         return self._slots[index].record
+
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        self._slots[index].replace_record(record)
 
     def _keep_records(self) -> None:
         for slot in self._slots:

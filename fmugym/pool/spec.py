@@ -8,13 +8,18 @@ from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import Variable
+from fmugym.fmi.methods import METHODS
+from fmugym.fmi.solver import Solving
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "DEFAULT_LEAK_LIMIT",
+    "DEFAULT_TOLERANCE",
+    "FIXED_STEP_SOLVERS",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
     "SAMPLINGS",
+    "SOLVERS",
     "PoolSpec",
     "ResetMethod",
     "whole_number_of_steps",
@@ -28,6 +33,16 @@ SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 
 The order is that of ``Sampling`` in ``native/pool.h``.
 """
+
+SOLVERS: Final = tuple(METHODS)
+"""The methods of integration for model exchange; see ``fmugym.fmi.methods``."""
+
+FIXED_STEP_SOLVERS: Final = tuple(name for name, method in METHODS.items() if not method.order)
+"""Those whose steps do not depend on the tolerance."""
+
+DEFAULT_TOLERANCE: Final = 1e-6
+"""Relative tolerance of the solver where neither the config nor the FMU gives one: float32
+observations do not show smaller errors."""
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
 """How long a call to a worker process may take, in seconds of real time."""
@@ -90,6 +105,9 @@ class PoolSpec:
         licence_wait: How long to wait for a refused licence, in seconds of real time.
         blind_start: Whether outputs have the start values of the model description until the first
             step, because the FMU cannot be read before.
+        solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
+        max_step: The longest step of the solver, in seconds; None for no limit other than the
+            communication step.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
             FMU's states can be saved; see ``fmugym.pool.saving``.
     """
@@ -118,6 +136,8 @@ class PoolSpec:
     blind_start: bool = False
     samplings: tuple[str, ...] = ()
     records: bool = False
+    solver: str = SOLVERS[0]
+    max_step: float | None = None
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""
@@ -127,6 +147,12 @@ class PoolSpec:
     def start_outputs(self) -> tuple[float, ...]:
         """The start values of the outputs in the model description; 0 where it has none."""
         return tuple(variable.start_number for variable in self.outputs)
+
+    @property
+    def solving(self) -> Solving:
+        """How the equations of FMUs of model exchange are solved."""
+        tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
+        return Solving(self.solver, tolerance, self.max_step or math.inf)
 
     @property
     def communication_step_size(self) -> float:

@@ -43,6 +43,7 @@ class Constructed(Pictured):
     """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs."""
 
     fmi_version: ClassVar[int | None]
+    fmi_interface: ClassVar[str | None]
     reset_options: ClassVar[tuple[str, ...]]
     metadata: dict[str, Any]
 
@@ -91,7 +92,7 @@ class Constructed(Pictured):
         _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
         self.render_mode = self._checked_render_mode(render_mode)
-        self.fmu = open_fmu(type(self), fmu_path, self.config)
+        self.fmu = open_fmu(type(self), fmu_path, self.config, self.fmi_interface)
         self._require_fmi_version()
         self._interface = resolve(self.config, self.fmu.description)
         self._spec = self._interface.pool_spec()
@@ -152,10 +153,11 @@ class Constructed(Pictured):
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
         if self.fmi_version is not None and found != self.fmi_version:
+            kind = "CS" if self.fmu.description.interface == "co_simulation" else "ME"
             raise ConfigError(
                 f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
                 f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
-                f"derive from FMI{found}CSEnv instead"
+                f"derive from FMI{found}{kind}Env instead"
             )
 
     def _warn_of_peculiarities(self) -> None:

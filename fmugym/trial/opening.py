@@ -15,13 +15,14 @@ from fmugym.errors import ConfigError, FMULoadError, LicenceError, SimulationErr
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
+from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
 from fmugym.pool.mark import Mark, Remains, remains_of
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
-from fmugym.pool.saving import SavingPool, offers_states
+from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
@@ -254,7 +255,8 @@ class _Trust:
     ) -> _Trust:
         """Look up what earlier trials have shown; without a spare instance there is no other."""
         candidate, tried = Candidate.of(fmu), _tried(spec)
-        if not offers_states(fmu.description, replace(spec, reset_method=plan.method)):
+        method = offered_method(fmu.description, replace(spec, reset_method=plan.method))
+        if method is SaveMethod.REPLAY:
             return cls(spec, bool)
         known: bool | None = is_bundled(fmu.path)
         if not known:

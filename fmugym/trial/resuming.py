@@ -17,7 +17,7 @@ import numpy as np
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, PoolSpec
-from fmugym.pool.bundle import Bundle
+from fmugym.pool.bundle import Bundle, SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.saving import SavingPool
@@ -94,7 +94,10 @@ def _grade(request: Request) -> Grade:
     first = run(request)
     if first.sample is None:
         return Grade(first.answer.get("resuming", Grade.FAILS))
-    second = run(replace(request, resume=pickle.loads(first.sample)))
+    halfway: Halfway = pickle.loads(first.sample)
+    if halfway.state.method is not SaveMethod.STATE:  # copies stay in their process
+        return Grade.BITWISE
+    second = run(replace(request, resume=halfway))
     return Grade(second.answer.get("resuming", Grade.FAILS))
 
 

@@ -100,15 +100,23 @@ class Candidate:
     limits: ArchiveLimits
     preload: tuple[str, ...]
     timeout: float | None
+    interface: str = "co_simulation"
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
-        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout)
+        interface = fmu.description.interface
+        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface)
 
     def open(self) -> FMU:
         """Open the FMU without another trial."""
-        return FMU(self.path, limits=self.limits, preload=self.preload, probe_timeout=None)
+        return FMU(
+            self.path,
+            limits=self.limits,
+            preload=self.preload,
+            probe_timeout=None,
+            interface=self.interface,
+        )
 
     @property
     def exempt(self) -> bool:
@@ -227,13 +235,13 @@ def meet(fmu: FMU) -> None:
 
 def known_verdict(fmu: FMU) -> Verdict | None:
     """The verdict of the last trial of an FMU on this machine; None if there was none."""
-    return Verdict.from_text(recall(_content_key(fmu.path)))
+    return Verdict.from_text(recall(_content_key(fmu.path, fmu.description.interface)))
 
 
 def state_files(fmu: FMU) -> str:
     """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
-        return str(cache_folder() / "states" / _content_key(fmu.path))
+        return str(cache_folder() / "states" / _content_key(fmu.path, fmu.description.interface))
     except RuntimeError:  # there is no folder for caches
         return ""
 
@@ -244,7 +252,7 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
     Raises:
         RuntimeError: If there is no folder for caches.
     """
-    return cache_folder() / "marks", _content_key(candidate.path)
+    return cache_folder() / "marks", _content_key(candidate.path, candidate.interface)
 
 
 def locks_of(candidate: Candidate) -> str:
@@ -320,13 +328,13 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
 
 def is_known_to_harm(candidate: Candidate) -> bool:
     """Whether the cache says that an FMU harms its process."""
-    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
     return known is not None and known.isolate
 
 
 def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
     """Add the harm to its process that the FMU has done with any other config."""
-    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
     if known is None or not known.isolate or verdict.isolate:
         return verdict
     reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
@@ -357,7 +365,10 @@ def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> No
     An FMU that is found to harm its process counts as harmful with every other config, too.
     """
     verdict = _with_harm(verdict, candidate)
-    for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path)):
+    for key in (
+        _verdict_key(candidate, spec, starts),
+        _content_key(candidate.path, candidate.interface),
+    ):
         remember(key, verdict.to_text())
 
 
@@ -415,7 +426,9 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         *(name, verdict.instances, verdict.initializations),
     )
     if verdict.complete:
-        remember(_content_key(request.candidate.path), verdict.to_text())
+        remember(
+            _content_key(request.candidate.path, request.candidate.interface), verdict.to_text()
+        )
     return verdict
 
 
@@ -670,7 +683,7 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
         keep_states=False,
     )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
-    return f"{_content_key(candidate.path)}-{asked}"
+    return f"{_content_key(candidate.path, candidate.interface)}-{asked}"
 
 
 def content_of(path: Path) -> str:
@@ -679,9 +692,12 @@ def content_of(path: Path) -> str:
     return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
 
-def _content_key(path: Path) -> str:
-    """The scope of a verdict: this content, this platform, and this version of the package."""
-    return _digest(f"{content_of(path)} {fmpy.platform_tuple} {_version()}".encode())
+def _content_key(path: Path, interface: str) -> str:
+    """The scope of a verdict: content, interface, platform, and version of the package."""
+    scope = f"{content_of(path)} {fmpy.platform_tuple} {_version()}"
+    return _digest(
+        f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode()
+    )
 
 
 @functools.lru_cache(maxsize=256)

@@ -297,6 +297,10 @@ class BlockWorker:
         """See ``SavingPool.record_of``."""
         return self._pool.record_of(index)
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        self._pool.replace_record(index, record)
+
     def count_steps(self) -> None:
         """Add the steps until now to the shared counts."""
         self._pool.health()

@@ -165,6 +165,14 @@ class BatchEngine(Engine):
         self.env.variables.update(variables)
         return returned
 
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+        """See ``Engine.evaluate``."""
+        env = self.env
+        latest = replace(Readings.of(env), action=np.moveaxis(np.asarray(actions), 0, -1))
+        with reading(env, latest):
+            rows = function(env)
+        return np.array([np.broadcast_to(row, self._n) for row in rows], np.float64)
+
     def _with(self, variable: str, values: Mapping[int, Any]) -> FloatArray:
         """The row of an episode variable with other values for some environments."""
         row = np.array(self._row(variable))

@@ -172,7 +172,7 @@ class _Compiler:
         if len(set(letters)) == 1 and name in OPERATIONS:
             return name, 0
         call = self._call(node, ufunc, (node.dtype,), 0)
-        return "call_square" if self._is_square(node, ufunc) else "call", call
+        return self._quick_name(node, ufunc), call
 
     def _call(
         self, node: Node, ufunc: np.ufunc, results: tuple[np.dtype[Any], ...], index: int
@@ -187,8 +187,13 @@ class _Compiler:
     def _constant(self, node: Node) -> tuple[bool, ...]:
         return tuple(self._graph.nodes[operand].kind == "constant" for operand in node.operands)
 
+    def _quick_name(self, node: Node, ufunc: np.ufunc) -> str:
+        """The operation that calls a loop: one that needs no call for most values, if there is."""
+        if ufunc is np.remainder and set(self._letters(node)) == {"d"}:
+            return "call_remainder"
+        return "call_square" if self._is_square(node, ufunc) else "call"
+
     def _is_square(self, node: Node, ufunc: np.ufunc) -> bool:
-        """Whether a call is a power of 2 of which most values need no call."""
         if ufunc is not np.float_power or self._constant(node) != (False, True):
             return False
         bits: Any = self._graph.nodes[node.operands[1]].what
