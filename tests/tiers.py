@@ -52,6 +52,7 @@ EVERY_IN_CI = {
     "test_copies": 2,
     "test_examples_planners": 4,
     "test_quirks": 4,
+    "test_snapshot_machine": 4,
     "test_words": 5,
     "test_zoo": 5,
 }
