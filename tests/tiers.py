@@ -158,7 +158,10 @@ SLOW_TESTS = (
 )
 """Others, by the beginning of their node ids."""
 
-EXHAUSTIVE_TESTS = ("test_model_exchange.py::TestEvents::test_time_does_not",)
+EXHAUSTIVE_TESTS = (
+    "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
+    "test_model_exchange.py::TestEvents::test_time_does_not",
+)
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 
 
