@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from fmu_tools import PlainEnv, edited_fmu, probe_config, read_fmu, write_fmu
 from process_tools import FaultyEnv, faulty_fmu, start_values
-from wine_tools import for_windows
+from wine_tools import exchange_fmu, for_windows
 
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
@@ -280,6 +280,31 @@ class TestInWine:
         assert isinstance(env._pool, ProcessPool)
         (line,) = (r.getMessage() for r in caplog.records if "was tried with 2" in r.getMessage())
         assert " 0 initialization" not in line
+
+    @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
+    def test_model_exchange(self, tmp_path, opened, solver):
+        """x' = -k x from 1: the closed form."""
+        fmu = FMU(exchange_fmu(tmp_path / "Model.fmu", "dahlquist"))
+        spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1, tolerance=1e-8, solver=solver)
+        pool = opened(opening.make_pool(fmu, spec, 2, LOG))
+        outputs, _ = pool.reset((fmu.variable("k"),), np.array([[1.0, 2.0]]))
+        for _ in range(10):
+            outputs, statuses = pool.step()
+            assert not statuses.any()
+        np.testing.assert_allclose(outputs[0], np.exp([-1.0, -2.0]), rtol=1e-6)
+
+    def test_a_worker_whose_fmu_leaks_is_replaced(self, faulty, opened):
+        fmu = FMU(faulty)
+        variables = tuple(map(fmu.variable, start_values()))
+        values = np.array([list(start_values("leak", "reset").values())], float).T
+        spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1, leak_limit=2**20)
+        pool = opened(opening.make_pool(fmu, spec, 1, LOG))
+        processes = set()
+        for _ in range(30):
+            pool.reset(variables, values)
+            assert not pool.statuses.any()
+            processes.add(pool.processes()[0])
+        assert 1 < len(processes) < 10
 
     def test_info_says_that_it_runs_in_wine(self, cart_pole, capsys):
         assert cli.main(["info", str(cart_pole)]) == 0

@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 import building
+import exchange_tools
 import fmu_tools
 
 from fmugym import FMU
@@ -42,11 +43,26 @@ def _library(model, version):
 
 
 @functools.cache
-def windows_library(source, flags=()):
-    """The bytes of a library for Windows, made of a C file of this folder."""
+def windows_library(*sources, flags=(), stubs=""):
+    """The bytes of a library for Windows; the arguments are those of ``building.library``."""
     command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu"]
-    command += ["-shared", "-O1", "-g0", "-ffp-contract=off", *flags, building.HERE / source]
+    command += ["-shared", "-O1", "-g0", "-ffp-contract=off", '-DSTUBS="stubs.h"', "-I.", *flags]
     with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "stubs.h").write_text(stubs)
         target = Path(folder) / "made.dll"
-        subprocess.run([*command, "-o", target], check=True, cwd=folder)
+        files = [building.HERE / source for source in sources]
+        subprocess.run([*command, *files, "-o", target], check=True, cwd=folder)
         return target.read_bytes()
+
+
+def exchange_fmu(path, model):
+    """Write an FMU of FMI 2.0 for model exchange with a library for Windows only."""
+    stubs = fmu_tools.stubs(2, "fmi2", building.HERE / "exchange/fmi2.c")
+    sources = [f"exchange/{name}.c" for name in ("core", "usual", model, "fmi2")]
+    files = {
+        "modelDescription.xml": exchange_tools.describe(model, 2),
+        "binaries/win64/Model.dll": windows_library(
+            *sources, flags=("-DFMI_VERSION=2",), stubs=stubs
+        ),
+    }
+    return fmu_tools.write_fmu(Path(path), files)
