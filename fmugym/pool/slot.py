@@ -15,7 +15,7 @@ from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.attendant import InitialState
-from fmugym.pool.base import FloatArray, PoolSpec
+from fmugym.pool.base import FloatArray, PoolSpec, names_of
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
@@ -513,5 +513,5 @@ class Slot:
         if not self._instance.can_read:
             raise SimulationError("the instance needs a reset before anything can be read")
         access = Access(self._instance, variables)
-        self._instance.check("reading variables", access.get())
+        self._instance.check(f"reading {names_of(variables)}", access.get())
         return access.values
