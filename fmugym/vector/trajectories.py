@@ -16,7 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import start_variable
-from fmugym.task.snapshot import Snapshot
+from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.env import FMUVectorEnv
 from fmugym.vector.perturbations import Matrices, differentiate_by_starts
 from fmugym.vector.sensitivities import (
@@ -24,6 +24,7 @@ from fmugym.vector.sensitivities import (
     float_box,
     moved_both_ways,
     precise_step,
+    require_vector,
 )
 
 __all__ = ["LinearTrajectory", "linearize_along"]
@@ -109,10 +110,11 @@ def linearize_along(
         SimulationError: If a step fails, if the episode ends before the last step, or if the states
             do not determine what follows.
     """
+    require_vector(envs, "linearize_along")
     env = envs._prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)
-    start = envs._start_of_rollout(snapshot, None, 1)
+    start = envs._start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
     chosen = _states(env, states)
     if method is not None:
         check_option("method", method, _METHODS)
@@ -304,7 +306,7 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
 
 
 def _replaced(action: npt.NDArray[Any], place: tuple[int, ...], value: Any) -> npt.NDArray[Any]:
-    moved = action.copy()
+    moved = np.array(action)
     moved[place] = value
     return moved
 
