@@ -72,6 +72,19 @@ class TestDifferences:
         assert (found.states, found.outputs) == (("q", "q_dot"), ("q", "q_dot"))
         assert found.method == "differences"
 
+    def test_at_rest(self):
+        """The states are not exactly zero then."""
+
+        class Hanging(Precise):
+            def __init__(self):
+                super().__init__(model_parameters={"q_0": 1e-17, "q_dot_0": -3e-16})
+
+        found = along(Hanging, np.zeros((30, 1)), states=STARTS, method="differences")
+        directional = along(Hanging, np.zeros((30, 1)))
+        assert np.abs(found.x).max() < 1e-14
+        assert pytest.approx(directional.A, abs=1e-5) == found.A
+        assert pytest.approx(directional.B, abs=1e-5) == found.B
+
     def test_chained_are_those_by_all_actions(self):
         """``derivatives`` gives the effect of each action on each later observation."""
         with Precise() as env:

@@ -101,9 +101,9 @@ def linearize_along(
         method: By default ``"directional"`` where the FMU offers it for these states, otherwise
             ``"differences"``.
         step: For differences: how far a state is moved, as a fraction of its largest magnitude in
-            the trajectory (of its nominal value if that is 0), and an action, as a fraction of the
-            width of its space. By default the cube root of the precision of the numbers. An FMU
-            whose solver has a tolerance needs more: about the square root of the tolerance.
+            the trajectory (at least a thousandth of its nominal value), and an action, as a
+            fraction of the width of its space. By default the cube root of the precision of the
+            numbers. An FMU whose solver has a tolerance needs more: about the square root of it.
 
     Raises:
         ConfigError: If the arguments do not fit, or the FMU does not offer the method.
@@ -189,15 +189,11 @@ def _require_starts(env: FMUEnv, states: States, obstacle: str) -> None:
     """Refuse states that cannot be set."""
     description = env.fmu.description
     for name, start in states.items():
-        variable = description.variable(start)
-        if not variable.settable_at_start:
+        if not description.variable(start).settable_at_start:
+            hint = f"; directional derivatives need none, but {obstacle}" if obstacle else ""
             raise ConfigError(
-                f"{start!r} cannot be set before initialization, so that differences by the state "
-                f"{name!r} are not possible; states={{{name!r}: ...}} takes the name of its start "
-                f"variable (directional derivatives are not possible either: {obstacle})"
-                if obstacle
-                else f"{start!r} cannot be set before initialization; states={{{name!r}: ...}} "
-                "takes the name of the start variable of the state"
+                f"{start!r} cannot be set before initialization; states={{{name!r}: ...}} takes "
+                f"the name of the start variable of the state{hint}"
             )
         start_variable(description, start, 0.0)
 
