@@ -18,6 +18,7 @@ SLOW_MODULES = {
     "test_fuzz_face",
     "test_fuzz_hooks",
     "test_fuzz_signals",
+    "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_native_build",
@@ -76,6 +77,7 @@ SLOW_TESTS = (
     "test_crashes.py::test_the_call",
     "test_crashes.py::test_where",
     "test_crashes.py::test_without",
+    "test_declared.py::test_spawned",
     "test_examples_mpc.py::test_a_cell",
     "test_examples_mpc.py::test_it_swings",
     "test_examples_mpc.py::test_the_program_draws",
@@ -156,7 +158,10 @@ SLOW_TESTS = (
 )
 """Others, by the beginning of their node ids."""
 
-EXHAUSTIVE_TESTS = ("test_model_exchange.py::TestEvents::test_time_does_not",)
+EXHAUSTIVE_TESTS = (
+    "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
+    "test_model_exchange.py::TestEvents::test_time_does_not",
+)
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 
 

@@ -129,6 +129,7 @@ class NativePool(SavingPool):
         mark: Mark | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
+        spec = spec.fitting(fmu.description)
         if private_libraries is None:
             once = capabilities.can_be_instantiated_only_once_per_process
             private_libraries = once and num_instances > 1
