@@ -334,7 +334,7 @@ class Pool:
     def actions_of_single(self) -> tuple[Any, Any]:
         """The actions of the last step and of the one before."""
 
-    def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
+    def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
     def save(self) -> Snapshot | int:
