@@ -257,7 +257,7 @@ def _unreadable(request: Request, outputs: tuple[Variable, ...]) -> tuple[Variab
 def _can_read(request: Request, outputs: tuple[Variable, ...]) -> bool:
     spec = replace(request.spec, outputs=outputs, samplings=(), num_observed=0)
     starts = request.starts or Starts()
-    pool = local_pool(request.candidate.open(), spec, 1, logging.getLogger(__name__), threads=1)
+    pool = trial_pool(request.candidate.open(), spec, 1, logging.getLogger(__name__))
     try:
         _, statuses = pool.reset(starts.variables, starts.column(0))
         return bool(statuses[0] <= Status.WARNING)
