@@ -34,6 +34,7 @@ import rollouts
 import single
 import tasks
 import vector
+import windows
 from documents import DOCUMENTS
 from measure import Effort, processors
 from tables import Table
@@ -47,6 +48,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "heavy": heavy.tables,
     "exchange": exchange.tables,
     "isolation": isolation.tables,
+    "windows": windows.tables,
     "overlap": overlap.tables,
     "memory": memory.tables,
     "loaded": loaded.tables,
