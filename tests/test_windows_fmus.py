@@ -22,6 +22,8 @@ from wine_tools import exchange_fmu, for_windows
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.windows import REQUESTS
+from fmugym.pool.process.worker import BlockWorker
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools import cli
 from fmugym.trial import opening
@@ -119,6 +121,14 @@ class TestPaths:
 
 
 class TestProgram:
+    def test_it_answers_what_a_worker_of_python_answers(self):
+        methods = {name for name in vars(BlockWorker) if not name.startswith("_")}
+        assert set(REQUESTS) == methods - {
+            "open",
+            "serve",
+            "differentiate",
+        }  # only FMPy can do that
+
     def test_its_sources_are_found(self):
         names = {path.name for path in program.sources()}
         assert {"main.c", "requests.c", "fmi1.c", "fmi2.c", "fmi3.c", "pool.h"} <= names
@@ -281,10 +291,12 @@ class TestInWine:
         (line,) = (r.getMessage() for r in caplog.records if "was tried with 2" in r.getMessage())
         assert " 0 initialization" not in line
 
-    @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
-    def test_model_exchange(self, tmp_path, opened, solver):
+    @pytest.mark.parametrize(
+        ("version", "solver"), [(1, "dormand_prince"), (2, "rosenbrock"), (3, "dormand_prince")]
+    )
+    def test_model_exchange(self, tmp_path, opened, version, solver):
         """x' = -k x from 1: the closed form."""
-        fmu = FMU(exchange_fmu(tmp_path / "Model.fmu", "dahlquist"))
+        fmu = FMU(exchange_fmu(tmp_path / "Model.fmu", "dahlquist", version))
         spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1, tolerance=1e-8, solver=solver)
         pool = opened(opening.make_pool(fmu, spec, 2, LOG))
         outputs, _ = pool.reset((fmu.variable("k"),), np.array([[1.0, 2.0]]))

@@ -13,6 +13,9 @@ import fmu_tools
 from fmugym import FMU
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
+FOLDERS = {1: "win64", 2: "win64", 3: "x86_64-windows"}
+PREFIXES = {1: "Model_fmi", 2: "fmi2", 3: "fmi3"}
+
 
 def why_not():
     """Why Windows libraries cannot run here; "" if they can."""
@@ -37,9 +40,8 @@ def for_windows(path, folder):
 
 
 def _library(model, version):
-    folder = "x86_64-windows" if version == 3 else "win64"
     data = windows_library(f"{model.lower()}.c", flags=(f"-DFMI_VERSION={version}",))
-    return {f"binaries/{folder}/{model}.dll": data}
+    return {f"binaries/{FOLDERS[version]}/{model}.dll": data}
 
 
 @functools.cache
@@ -55,14 +57,14 @@ def windows_library(*sources, flags=(), stubs=""):
         return target.read_bytes()
 
 
-def exchange_fmu(path, model):
-    """Write an FMU of FMI 2.0 for model exchange with a library for Windows only."""
-    stubs = fmu_tools.stubs(2, "fmi2", building.HERE / "exchange/fmi2.c")
-    sources = [f"exchange/{name}.c" for name in ("core", "usual", model, "fmi2")]
+def exchange_fmu(path, model, version):
+    """Write an FMU for model exchange with a library for Windows only."""
+    shim = f"exchange/fmi{version}.c"
+    stubs = fmu_tools.stubs(version, PREFIXES[version], building.HERE / shim)
+    sources = [*(f"exchange/{name}.c" for name in ("core", "usual", model)), shim]
+    data = windows_library(*sources, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
     files = {
-        "modelDescription.xml": exchange_tools.describe(model, 2),
-        "binaries/win64/Model.dll": windows_library(
-            *sources, flags=("-DFMI_VERSION=2",), stubs=stubs
-        ),
+        "modelDescription.xml": exchange_tools.describe(model, version),
+        f"binaries/{FOLDERS[version]}/Model.dll": data,
     }
     return fmu_tools.write_fmu(Path(path), files)
