@@ -127,7 +127,7 @@ class TestProgram:
             "open",
             "serve",
             "differentiate",
-        }  # only FMPy can do that
+        }  # FMPy does
 
     def test_its_sources_are_found(self):
         names = {path.name for path in program.sources()}
