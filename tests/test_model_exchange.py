@@ -2,9 +2,11 @@
 
 import logging
 import math
+import re
 
 import exchange_tools
 import fmpy
+import fmu_tools
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -273,6 +275,32 @@ class TestEvents:
         pool = make_pool("friction", 0.1, outputs=["x", "v", "mode"], solver=solver, max_step=0.05)
         found = run(pool, 600)
         np.testing.assert_allclose(found, stick_and_slip(0.1, 600), atol=3e-6)
+
+    def test_states_in_arrays(self, tmp_path, make_pool):
+        """The states of FMI 3.0 may be elements of arrays; their number is what counts."""
+        path = exchange_tools.exchange_fmu(tmp_path / "friction.fmu", "friction", 3)
+        edits = {
+            re.compile('<Float64 name="x"[^>]*/>'): '<Float64 name="x" valueReference="0" '
+            'causality="local" initial="exact" start="0 0.1"><Dimension start="2"/></Float64>',
+            re.compile('<Float64 name="der.x."[^>]*/>'): '<Float64 name="der(x)" derivative="0" '
+            'valueReference="2" causality="local"><Dimension start="2"/></Float64>',
+            re.compile('<Float64 name="(v|der.v.)"[^>]*/>'): "",
+            re.compile('<ContinuousStateDerivative valueReference="3"/>'): "",
+        }
+        files = fmu_tools.read_fmu(path)
+        text = files["modelDescription.xml"].decode()
+        for old, new in edits.items():
+            text, count = old.subn(new, text)
+            assert count
+        fmu_tools.write_fmu(path, files | {"modelDescription.xml": text})
+        fmu = FMU(path)
+        assert fmu.description.model_exchange.number_of_states == 2
+        spec = PoolSpec((), (fmu.variable("mode"),), 0.1)
+        pool = opening.make_pool(fmu, spec, 1, LOG)
+        pool.variable = fmu.variable
+        found = run(pool, 600)[:, 0]
+        pool.close()
+        assert found.tolist() == [row[2] for row in stick_and_slip(0.1, 600)]
 
     def test_agreement_with_fmpy(self, fmu_path, make_pool):
         for model, outputs in (("ball", ["h", "v"]), ("circuit", ["voltage"])):
