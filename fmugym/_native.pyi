@@ -334,7 +334,7 @@ class Pool:
     def actions_of_single(self) -> tuple[Any, Any]:
         """The actions of the last step and of the one before."""
 
-    def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
+    def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
     def save(self) -> Snapshot | int:
@@ -451,6 +451,11 @@ class Pool:
         Returns:
             None if the episode is not known as a whole.
         """
+
+    def replace_record(
+        self, index: int, start: Access, starts: bytes, inputs: bytes, steps: int, /
+    ) -> None:
+        """Let an episode count as the one with these start values and inputs."""
 
     def costs(self) -> tuple[float, float, float, float, float]:
         """The measured ns per instance of some methods; 0 if unknown.

@@ -241,7 +241,7 @@ class TestTune:
 class TestTrack:
     def options(self, tmp_path):
         folder = "--output", tmp_path / "agent"
-        return "--envs", "2", "--steps", "64", "--episodes", "1", *ON_POLICY, *folder
+        return "--envs", "2", "--steps", "192", "--episodes", "1", *ON_POLICY, *folder
 
     def test_mlflow(self, task, tmp_path, capsys, monkeypatch):
         mlflow = pytest.importorskip("mlflow", reason="needs MLflow: the extra mlflow")
@@ -262,10 +262,9 @@ class TestTrack:
         pytest.importorskip("wandb", reason="needs W&B: the extra wandb")
         monkeypatch.setenv("WANDB_MODE", "offline")
         monkeypatch.setenv("WANDB_SILENT", "true")
-        monkeypatch.setenv("WANDB_DIR", str(tmp_path))
         code, _, err = run(capsys, "train", task, *self.options(tmp_path), "--track", "wandb")
         assert code == 0, err
-        assert list(tmp_path.rglob("offline-run-*/*.wandb"))
+        assert list((tmp_path / "agent").rglob("offline-run-*/*.wandb"))
 
     @pytest.mark.parametrize("name", ["mlflow", "wandb"])
     def test_a_missing_library_names_its_extra(self, name, task, tmp_path, capsys, monkeypatch):

@@ -4,15 +4,19 @@ The same planner moves them all. In each step it tries many sequences of actions
 and takes the first action of the best one.
 """
 
+# The README's animation: python docs/_site/gallery.py fmugym/Pendulum-v0 docs/images/pendulum.gif
+
 import io
 import os
+import sys
+from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
 import numpy as np
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
-from PIL import Image
+from PIL import Image, ImageOps
 
 import fmugym  # noqa: F401  (registers the ids)
 
@@ -27,8 +31,8 @@ ENVIRONMENTS: Final = {
 }
 CANDIDATES: Final = 512
 HORIZON: Final = 30
-PICTURES: Final = 120
-SIZE: Final = (360, 240)
+PICTURES: Final = 70
+SIZE: Final = (330, 240)  # at most
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -63,7 +67,7 @@ def _animation(env_id: str, arguments: dict[str, Any]) -> bytes:
         env.reset(seed=4)
         for action in _actions(env, planner):
             _, _, terminated, truncated, _ = env.step(action)
-            pictures.append(Image.fromarray(env.render()).resize(SIZE))
+            pictures.append(ImageOps.contain(Image.fromarray(env.render()), SIZE))
             if terminated or truncated or len(pictures) == PICTURES:
                 return _gif(pictures, env.metadata["render_fps"])
     finally:
@@ -76,6 +80,7 @@ def _actions(env: Any, planner: Any) -> Any:
     """Yield the action of the best of many futures, which the next step starts from again."""
     rng = np.random.default_rng(0)
     space = env.action_space
+    space.seed(0)
     best = np.stack([space.sample() for _ in range(HORIZON)])
     while True:
         futures = _futures(rng, space, best)
@@ -99,7 +104,11 @@ def _futures(rng: np.random.Generator, space: Any, best: Any) -> Any:
 
 def _gif(pictures: list[Any], fps: float) -> bytes:
     file = io.BytesIO()
-    first, *rest = (one.quantize(32) for one in pictures)
+    first, *rest = (one.quantize(16, dither=Image.Dither.NONE) for one in pictures)
     delay = max(int(1000 / fps), 20)  # viewers slow down what is faster
     first.save(file, "gif", save_all=True, append_images=rest, duration=delay, loop=0)
     return file.getvalue()
+
+
+if __name__ == "__main__":
+    Path(sys.argv[2]).write_bytes(_animation(sys.argv[1], {}))

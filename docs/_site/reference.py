@@ -9,11 +9,19 @@ from mkdocs.structure.files import File, Files
 import fmugym
 
 PAGES: Final = {
-    "Environments": ("FMUEnv", "FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "EnvConfig", "register"),
+    "Environments": (
+        "FMUEnv",
+        "FMI1CSEnv",
+        "FMI2CSEnv",
+        "FMI3CSEnv",
+        *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
+        "EnvConfig",
+        "register",
+    ),
     "Many environments": ("FMUVectorEnv",),
     "Task files": ("load", "Task", "TaskEnv"),
     "Distributions": ("Uniform", "Normal", "LogUniform", "Choice"),
-    "Thinking ahead": ("Snapshot", "derivatives", "linearize", "LinearModel"),
+    "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
     "Recordings": ("Recorder", "Recording", "replay"),
     "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
     "Rigs": ("Backend", "Paced"),

@@ -299,7 +299,7 @@ class Pool(ABC):
         """
         return False
 
-    def start_of_play(self) -> Callable[..., int]:
+    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes outside of a step; see ``NativePool``.
 
         Raises:

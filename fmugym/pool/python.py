@@ -62,7 +62,7 @@ class PythonPool(SavingPool):
         mark: Mark | None = None,
     ) -> None:
         self.num_instances = num_instances
-        self._spec = spec
+        self._spec = spec = spec.fitting(fmu.description)
         # One row per instance, so that the FMU reads and writes this memory without a copy.
         input_rows = np.zeros((num_instances, len(spec.inputs)))
         output_rows = np.zeros((num_instances, len(spec.outputs)))
@@ -196,6 +196,10 @@ class PythonPool(SavingPool):
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
         return self._slots[index].record
+
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        self._slots[index].replace_record(record)
 
     def _keep_records(self) -> None:
         for slot in self._slots:

@@ -70,7 +70,8 @@ class Snapshot:
 
     Attributes:
         method: ``"state"`` if the FMU has serialized its state. ``"replay"`` if the inputs of the
-            episode were kept: restoring such a snapshot plays the episode again.
+            episode were kept: restoring such a snapshot plays the episode again. ``"copy"`` if they
+            were kept, and the FMU has a copy of its state for the environment that has saved.
         step_count: Steps since the reset of each environment, shape (M,).
     """
 

@@ -23,7 +23,7 @@ from fmugym.tools.options import (
 )
 from fmugym.tools.progress import progress
 from fmugym.tools.targets import maker_of, scenarios_of
-from fmugym.tools.tracking import TRACKERS, open_tracker
+from fmugym.tools.tracking import TRACKERS, tracker_for
 from fmugym.tools.training import Plan, Watch, arguments_of, facts_of, train
 from fmugym.tools.tuning import tune
 
@@ -75,20 +75,15 @@ def add_train(commands: Commands) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    plan = _plan_of(arguments)
+    plan, begin_tracker = _plan_of(arguments), None
+    if arguments.track is not None:
+        facts = {"task": arguments.task, "steps": plan.steps, **plan.facts()}
+        begin_tracker = tracker_for(arguments.track, facts, plan.folder)
     if arguments.tune is not None:
         plan = _tuned(plan, arguments)
     with progress(plan.steps, "train") as advance:
-        tracker = None
-        if arguments.track is not None:
-            facts = {"task": arguments.task, "steps": plan.steps, **plan.facts()}
-            tracker = open_tracker(arguments.track, facts, plan.folder)
-        try:
-            watch = Watch(tell, advance, tracker=tracker)
-            scores = train(plan, resume=arguments.resume, watch=watch)
-        finally:
-            if tracker is not None:
-                tracker.close()
+        watch = Watch(tell, advance, begin_tracker=begin_tracker)
+        scores = train(plan, resume=arguments.resume, watch=watch)
     _show(plan, scores, arguments)
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from fmugym.series.store import imported
 
-__all__ = ["TRACKERS", "Tracker", "open_tracker"]
+__all__ = ["TRACKERS", "Tracker", "tracker_for"]
 
 
 class Tracker:
@@ -25,15 +28,9 @@ class Tracker:
         self._log, self._end = log, end
 
     def log(self, numbers: Mapping[str, Any], step: int) -> None:
-        """Log what is a number."""
-        kept = {n: float(v) for n, v in numbers.items() if isinstance(v, int | float)}
+        """Log what is a number, of Python or of numpy."""
+        kept = {n: float(v) for n, v in numbers.items() if isinstance(v, int | float | np.number)}
         self._log(kept, step)
-
-    def write(
-        self, key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], step: int = 0
-    ) -> None:
-        """Log what Stable-Baselines3 logs; its loggers call this."""
-        self.log({n: getattr(v, "item", lambda v=v: v)() for n, v in key_values.items()}, step)
 
     def close(self) -> None:
         """End the log; more than one call is fine."""
@@ -41,28 +38,27 @@ class Tracker:
         end()
 
 
-def open_tracker(kind: str, facts: Mapping[str, Any], folder: Path) -> Tracker:
-    """Begin a run. Where it is logged to, environment variables of the library tell.
+def tracker_for(kind: str, facts: Mapping[str, Any], folder: Path) -> Callable[[], Tracker]:
+    """Make a function that begins a run. Environment variables of the library tell where.
 
     Args:
         kind: A key of ``TRACKERS``.
         facts: What the run is: task, algorithm, arguments.
-        folder: That of the training; its name is that of the run.
+        folder: That of the training, which is there when the run begins; its name is the run's.
 
     Raises:
         ConfigError: If the library is missing.
     """
-    return TRACKERS[kind](facts, folder)
+    library = imported(kind, kind)
+    return partial(TRACKERS[kind], library, facts, folder)
 
 
-def _of_wandb(facts: Mapping[str, Any], folder: Path) -> Tracker:
-    wandb: Any = imported("wandb", "wandb")
+def _of_wandb(wandb: Any, facts: Mapping[str, Any], folder: Path) -> Tracker:
     run = wandb.init(project="fmugym", name=folder.name, config=dict(facts), dir=str(folder))
     return Tracker(lambda numbers, step: run.log(dict(numbers), step=step), run.finish)
 
 
-def _of_mlflow(facts: Mapping[str, Any], folder: Path) -> Tracker:
-    mlflow: Any = imported("mlflow", "mlflow")
+def _of_mlflow(mlflow: Any, facts: Mapping[str, Any], folder: Path) -> Tracker:
     mlflow.start_run(run_name=folder.name)
     mlflow.log_params({name: str(value) for name, value in facts.items()})
 
@@ -72,8 +68,8 @@ def _of_mlflow(facts: Mapping[str, Any], folder: Path) -> Tracker:
     return Tracker(log, mlflow.end_run)
 
 
-TRACKERS: Final[Mapping[str, Callable[[Mapping[str, Any], Path], Tracker]]] = {
+TRACKERS: Final[Mapping[str, Callable[[Any, Mapping[str, Any], Path], Tracker]]] = {
     "mlflow": _of_mlflow,
     "wandb": _of_wandb,
 }
-"""The logs by name."""
+"""The logs by name, which are those of their modules and extras."""

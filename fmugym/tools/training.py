@@ -6,6 +6,7 @@ import csv
 import json
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -116,13 +117,13 @@ class Watch:
         advance: Is told of steps.
         evaluated: Gets the steps and the mean reward of each evaluation. An exception of it ends
             the training.
-        tracker: Gets all numbers; None for nobody.
+        begin_tracker: Makes what gets all numbers, when the folder is there; None for nobody.
     """
 
     tell: Callable[[str], None] = lambda line: None
     advance: Advance = no_progress
     evaluated: Callable[[int, float], None] = lambda steps, mean: None
-    tracker: Tracker | None = None
+    begin_tracker: Callable[[], Tracker] | None = None
 
 
 def train(
@@ -163,8 +164,8 @@ def train(
     try:
         if plan.normalize and isinstance(venv.observation_space, spaces.Box):
             venv = import_module("stable_baselines3.common.vec_env").VecNormalize(venv)
-        training = _Training(plan, venv, watch or Watch(tell), resume)
-        training.run()
+        with closing(_Training(plan, venv, watch or Watch(tell), resume)) as training:
+            training.run()
         return training.scores
     finally:
         venv.close()
@@ -240,6 +241,7 @@ class _Training:
             plan.folder.mkdir(parents=True, exist_ok=True)
         facts = {"schema": 1, "steps": plan.steps, **plan.facts()}
         (plan.folder / TRAINING).write_text(json.dumps(facts), encoding="utf-8")
+        self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
         self._begin = self._told = self._steps
         self._saved_at = monotonic()
 
@@ -271,7 +273,12 @@ class _Training:
         except KeyboardInterrupt:
             self.evaluate()
             raise
-        finally:
+
+    def close(self) -> None:
+        """Close all logs."""
+        if self._tracker is not None:
+            self._tracker.close()
+        if hasattr(self._model, "_logger"):
             self._model.logger.close()
 
     def _log_to(self) -> None:
@@ -280,8 +287,8 @@ class _Training:
         kinds = ["csv", *(["tensorboard"] if find_spec("tensorboard") else [])]
         folder = str(self._plan.folder)
         formats = [logger.make_output_format(kind, folder, suffix) for kind in kinds]
-        if self._watch.tracker is not None:
-            formats.append(self._watch.tracker)
+        if self._tracker is not None:
+            formats.append(_writer_to(self._tracker, logger.KVWriter))
         self._model.set_logger(logger.Logger(folder=folder, output_formats=formats))
 
     def _callback(self) -> Any:
@@ -341,15 +348,24 @@ class _Training:
             if is_new:
                 writer.writerow(["steps", "reward", *names])
             writer.writerow([steps, mean, *(score.mean for score in self.scores)])
-        if self._watch.tracker is not None:
+        if self._tracker is not None:
             each = {f"evaluation/{score.name}": score.mean for score in self.scores}
-            self._watch.tracker.log({"evaluation/reward": mean, **each}, steps)
+            self._tracker.log({"evaluation/reward": mean, **each}, steps)
 
     def _keep_if_best(self, steps: int, mean: float) -> None:
         if mean > self._progress["best"]:
             self._progress["best"] = mean
             facts = {"algorithm": self._plan.algorithm, "steps": steps, "reward": mean}
             save(self._plan.folder, self._model, self._normalization(), facts)
+
+
+def _writer_to(tracker: Tracker, base: Any) -> Any:
+    """What writes the log of Stable-Baselines3 to a tracker; it must be one of its own classes."""
+    methods = {
+        "write": lambda self, values, excluded, step=0: tracker.log(values, step),
+        "close": lambda self: tracker.close(),
+    }
+    return type("Writer", (base,), methods)()
 
 
 def _drop_rows(path: Path, steps: int) -> None:

@@ -15,23 +15,25 @@ from fmugym.errors import ConfigError, FMULoadError, LicenceError, SimulationErr
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
+from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
 from fmugym.pool.mark import Mark, Remains, remains_of
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
-from fmugym.pool.saving import SavingPool, offers_states
+from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
-from fmugym.trial.resuming import do_states_work, known_to_work
+from fmugym.trial.resuming import method_that_works
 from fmugym.trial.trial import (
     Candidate,
     examine,
     is_known_to_harm,
+    known_resuming,
     locks_of,
     marks_of,
     note_harm,
@@ -39,6 +41,7 @@ from fmugym.trial.trial import (
     state_files,
 )
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
+from fmugym.wine.prefix import Wine
 
 __all__ = ["make_pool"]
 
@@ -102,11 +105,8 @@ def make_pool(
             raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
         return BackendPool(fmu, spec, num_instances, backend)
     native = _is_native(backend)
-    if isolation not in (None, *ISOLATIONS):
-        raise unknown_name("isolation", isolation, ISOLATIONS)
-    if reset_method not in (None, *ResetMethod):
-        raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
+    plan = plan.checked(fmu, backend)
     spec = _with_locks(fmu, spec)
 
     def attempt() -> Pool:
@@ -124,12 +124,39 @@ def make_pool(
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)
             pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
-        pool.trust_states_if(trust.do_states_work)
+        pool.save_by(trust.method_that_works)
         if rehearse and reset_method is None:
             _rehearse(pool, fmu, actual, starts, verdict, completed, log)
         return pool
 
     return Patience(spec.licence_wait, log).call(attempt)
+
+
+def _prepare_wine(
+    fmu: FMU, backend: str, private_libraries: bool | None, isolation: str | None
+) -> None:
+    """Refuse what is not possible in Wine, and make ready what every worker needs.
+
+    Raises:
+        FMULoadError: If Wine or something else is missing, or a wish cannot be granted.
+    """
+    wishes = {
+        "backend='python'": backend == "python",
+        "private_libraries": private_libraries,
+        "isolation='none'": isolation == "none",
+        "preload": fmu.preload,
+    }
+    refused = [wish for wish, is_given in wishes.items() if is_given]
+    try:
+        if refused:
+            raise FMULoadError(
+                f"{fmu.path.name} has libraries for Windows only, which run here in worker "
+                f"processes in Wine, but this leaves no choice for: {', '.join(refused)}"
+            )
+        Wine.ready()
+    except BaseException:
+        fmu.close()
+        raise
 
 
 def _with_locks(fmu: FMU, spec: PoolSpec) -> PoolSpec:
@@ -242,11 +269,11 @@ class _Trust:
 
     Attributes:
         spec: What the pool does; records are kept until it is known that states work.
-        do_states_work: Finds it out.
+        method_that_works: Finds it out.
     """
 
     spec: PoolSpec
-    do_states_work: Callable[[], bool]
+    method_that_works: Callable[[], SaveMethod]
 
     @classmethod
     def of(
@@ -254,16 +281,18 @@ class _Trust:
     ) -> _Trust:
         """Look up what earlier trials have shown; without a spare instance there is no other."""
         candidate, tried = Candidate.of(fmu), _tried(spec)
-        if not offers_states(fmu.description, replace(spec, reset_method=plan.method)):
-            return cls(spec, bool)
-        known: bool | None = is_bundled(fmu.path)
-        if not known:
-            known = False if candidate.exempt else known_to_work(candidate, tried, starts)
-            known = False if known is None and not spare else known
-        if known is not None:
-            return cls(replace(spec, records=not known), partial(bool, known))
-        ask = partial(do_states_work, candidate, tried, starts)
-        return cls(replace(spec, records=True), ask)
+        method = offered_method(fmu.description, replace(spec, reset_method=plan.method))
+        if method is SaveMethod.REPLAY:
+            return cls(spec, lambda: method)
+        known: SaveMethod | None = SaveMethod.REPLAY
+        if is_bundled(fmu.path):
+            known = method
+        elif not candidate.exempt:
+            known = known_resuming(candidate, tried, starts)
+            known = SaveMethod.REPLAY if known is None and not spare else known
+        ask = partial(method_that_works, candidate, tried, starts)
+        records = known is not SaveMethod.STATE
+        return cls(replace(spec, records=records), ask if known is None else lambda: known)
 
 
 def _tried(spec: PoolSpec) -> PoolSpec:
@@ -294,6 +323,17 @@ class _Plan:
     one_initialization: bool = False
     state_files: str = ""
     own_files: bool = False
+
+    def checked(self, fmu: FMU, backend: str) -> _Plan:
+        """Refuse unknown names; in Wine, refuse what is not possible there."""
+        if self.isolation not in (None, *ISOLATIONS):
+            raise unknown_name("isolation", self.isolation, ISOLATIONS)
+        if self.reset_method not in (None, *ResetMethod):
+            raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
+        if not fmu.in_wine:
+            return self
+        _prepare_wine(fmu, backend, self.private_libraries, self.isolation)
+        return replace(self, native=True, threads=1, private_libraries=None, isolation="process")
 
     @property
     def method(self) -> ResetMethod:

@@ -217,7 +217,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
-        self._open_pool("reset")
+        if self.closed or self._background.is_pending:
+            self._open_pool("reset")
         remaining, mask = split_options(options, self.num_envs)
         if not self._is_ready and not mask.all():
             when = "reset after an exception" if self._started else "first reset"
@@ -249,7 +250,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        if not self._is_ready or self.closed or self._background.is_pending or self._waits:
+        if not self._is_ready or self.closed or self._background.is_pending:
+            self._refuse_step("step")
+        if self._waits and self._engine.any_ended:
             self._require_ready("step")
         return self._step(actions)
 

@@ -47,5 +47,7 @@ def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
         raise ConfigError(f"there is no environment {env_id!r}: {error}") from None
     creator = load_env_creator(creator) if isinstance(creator, str) else creator
     if isinstance(creator, type) and not issubclass(creator, FMUEnv):
-        raise ConfigError(f"{name} is not an environment of fmugym; use the library itself")
+        raise ConfigError(
+            f"{name} is not an environment of fmugym; make it by the functions of the library"
+        )
     return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)

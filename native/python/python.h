@@ -103,6 +103,7 @@ PyObject *py_adopt(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_keep_records(PyObject *object, PyObject *unused);
+PyObject *py_replace_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_record_of(PyObject *object, PyObject *index);
 PyObject *py_uses_states(PyObject *object, PyObject *unused);
 

@@ -352,6 +352,15 @@ class ProcessPool(SavingPool):
             record: Record | None = replies.get(supervisor)
             return record
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        with self._lock:
+            supervisor = self._crew.of(index)
+            within = index - supervisor.block.start
+            self._crew.run(
+                "a change", [supervisor], lambda s: s.tell("replace_record", within, record)
+            )
+
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
         with self._lock:

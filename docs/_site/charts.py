@@ -1,13 +1,13 @@
-"""The page about speed: the README's tables, with bars of what is in them."""
+"""Bars of what is in the tables of the page about speed."""
 
 import re
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-README: Final = Path(__file__).resolve().parents[2] / "README.md"
+PAGE: Final = "speed.md"
 FACTORS: Final = {"": 1.0, "k": 1e3, "M": 1e6}
 RATE: Final = re.compile(r"([\d.]+) ([kM]?) ?")
 CHARTS: Final = {"64": "64 environments", "1024": "1,024 environments"}
@@ -15,19 +15,26 @@ WIDTH, LABEL, ROW = 860, 270, 30  # of a chart, of its labels and rows, in pixel
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the page and its charts."""
-    section = README.read_text(encoding="utf-8").split("## Speed\n")[1].split("\n## ")[0]
-    table = next(t for t in _tables(section) if t[0][0] == "environments")
-    text = ["# Speed"]
-    for column, title in CHARTS.items():
+    """Add the charts."""
+    text = (Path(config.docs_dir) / PAGE).read_text(encoding="utf-8")
+    table = next(table for table in _tables(text) if table[0][0] == "environments")
+    for column in CHARTS:
         place = table[0].index(column)
         rates = {row[0]: rate for row in table[1:] if (rate := _rate(row[place])) is not None}
-        picture = f"performance/{column}.svg"
-        files.append(File.generated(config, picture, content=_chart(rates)))
-        text.append(f"## {title}\n\n![{title}: transitions per second]({picture})")
-    text.append(f"## All figures\n{section}")
-    files.append(File.generated(config, "performance.md", content="\n\n".join(text)))
+        files.append(File.generated(config, f"performance/{column}.svg", content=_chart(rates)))
     return files
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Put the charts above the figures."""
+    if page.file.src_uri != PAGE:
+        return markdown
+    charts = [
+        f"## {title}\n\n![{title}: transitions per second](performance/{column}.svg)"
+        for column, title in CHARTS.items()
+    ]
+    title, figures = markdown.split("\n", 1)
+    return "\n\n".join([title, *charts, "## All figures", figures])
 
 
 def _tables(text: str) -> list[list[list[str]]]:
