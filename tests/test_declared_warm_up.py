@@ -259,6 +259,22 @@ class TestCache:
         assert again.health["steps"] == 2 * STEPS
         again.close()
 
+    def test_without_states_every_episode_has_its_warm_up(self, caplog):
+        task = {
+            "fmu": {"bundled": "Pendulum", "fmi_version": "1.0"},
+            "time_step": "50ms",
+            "variables": {"tau": {"min": -1, "max": 1}},
+            "agent": {"actions": ["tau"], "observations": ["q"]},
+            "reward": "q",
+            "warm_up": {"period": "1s", "controller": 0.01, "cache": True},
+        }
+        env = fmugym.load(task)
+        first, again = env.reset(seed=0)[0], env.reset(seed=0)[0]
+        np.testing.assert_array_equal(first, again)
+        assert env.health["steps"] == 40
+        assert caplog.text.count("cannot be serialized") == 1
+        env.close()
+
     def test_another_controller_is_another_state(self):
         task = self.task()
         cold = task | {"warm_up": task["warm_up"] | {"controller": 0}}

@@ -138,6 +138,7 @@ class WarmUps:
         self._prefix: str | None = None
         self._scope = b""
         self._keys: dict[int, bytes] = {}
+        self._has_told = False
 
     # States that are known
 
@@ -159,7 +160,7 @@ class WarmUps:
             indices: The environments.
         """
         self._keys = {}
-        if not self._warm_up.caches or pool.save_method is not SaveMethod.STATE:
+        if not self._warm_up.caches or not self._can_keep(pool):
             return {}
         names = repr([variable.name for variable in variables]).encode()
         found = {}
@@ -173,6 +174,17 @@ class WarmUps:
             else:
                 found[index] = warmed
         return found
+
+    def _can_keep(self, pool: Pool) -> bool:
+        """Whether the FMU's states can be kept; says so once if they cannot."""
+        can = pool.save_method is SaveMethod.STATE
+        if not can and not self._has_told:
+            self._has_told = True
+            self._env.logger.warning(
+                "%s: no state is kept after the warm-up, because its states cannot be serialized",
+                self._env.fmu.path.name,
+            )
+        return can
 
     def _key(self, parts: Iterable[bytes]) -> bytes:
         if self._prefix is None:
