@@ -221,6 +221,10 @@ class NativePool(SavingPool):
             raise SimulationError(f"{name} cannot get and set its state")
         if self._watch is not None:
             self._watch.has_snapshots = True
+        return self._copy_all()
+
+    def _copy_all(self) -> _native.Snapshot:
+        """See ``SavingPool._copy_all``."""
         snapshot = self._open_pool().save()
         if isinstance(snapshot, int):
             raise SimulationError(self.failure(snapshot))

@@ -145,6 +145,10 @@ class PythonPool(SavingPool):
         """See ``Pool.save``."""
         if self._watch is not None:
             self._watch.has_snapshots = True
+        return self._copy_all()
+
+    def _copy_all(self) -> list[Snapshot]:
+        """See ``SavingPool._copy_all``."""
         try:
             with fmu_calls:
                 return [slot.save() for slot in self._slots]
