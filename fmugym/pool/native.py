@@ -343,10 +343,6 @@ class NativePool(SavingPool):
         self._spec = replace(self._spec, reset_method=method)
         return True
 
-    def renew(self) -> None:
-        """See ``Pool.renew``."""
-        self._open_pool().renew()
-
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""
         self._open_pool().recycle()
