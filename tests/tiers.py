@@ -49,6 +49,8 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_declared_sensors": 5,
+    "test_declared_warm_up": 5,
     "test_copies": 2,
     "test_examples_planners": 4,
     "test_quirks": 4,
