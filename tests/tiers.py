@@ -56,6 +56,8 @@ these occurs with others in turn.
 """
 
 SLOW_TESTS = (
+    "test_baselines_tuning.py::test_it_finds",
+    "test_baselines_tuning.py::test_the_same",
     "test_cli.py::TestSkeleton::test_runs_for",
     "test_cloud_pendulum.py::TestExits",
     "test_crashes.py::test_a_",
