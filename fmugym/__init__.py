@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fmugym.config import EnvConfig
     from fmugym.declared import Task, TaskEnv, load
     from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-    from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMUEnv
+    from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI2MEEnv, FMI3CSEnv, FMUEnv
     from fmugym.errors import (
         ConfigError,
         ContractError,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fmugym.task.snapshot import Snapshot
     from fmugym.vector import FMUVectorEnv
     from fmugym.vector.sensitivities import derivatives
+    from fmugym.vector.trajectories import linearize_along
 
 __all__ = [
     "FMU",
@@ -45,6 +46,7 @@ __all__ = [
     "EnvConfig",
     "FMI1CSEnv",
     "FMI2CSEnv",
+    "FMI2MEEnv",
     "FMI3CSEnv",
     "FMUEnv",
     "FMUGymError",
@@ -68,6 +70,7 @@ __all__ = [
     "derivatives",
     "envs",
     "linearize",
+    "linearize_along",
     "load",
     "register",
     "replay",
@@ -80,7 +83,7 @@ _MODULES = {
     "config": ["EnvConfig"],
     "declared": ["Task", "TaskEnv", "load"],
     "distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
-    "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"],
+    "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI2MEEnv", "FMI3CSEnv", "FMUEnv"],
     "errors": [
         *("ConfigError", "ContractError", "FMUGymError"),
         *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),
@@ -92,6 +95,7 @@ _MODULES = {
     "linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
     "vector.sensitivities": ["derivatives"],
+    "vector.trajectories": ["linearize_along"],
 }
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),

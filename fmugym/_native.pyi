@@ -75,6 +75,17 @@ def echo_to(memory: Array, /) -> None:
         memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
     """
 
+def claim_initialization(last: Array, interval: float, /) -> float:
+    """Take the next moment at which an instance may be made or initialized.
+
+    Args:
+        last: The latest such moment that is taken, in ns, int64, of shape (1,); 0 for none.
+        interval: Seconds between two of them.
+
+    Returns:
+        The seconds until then.
+    """
+
 @final
 class Access:
     """A list of variables of one FMI version.
@@ -83,9 +94,12 @@ class Access:
         version: 1, 2 or 3.
         types: One byte for each variable, the number of its C type; see ``fmi.h``.
         references: Their value references, as bytes of native 32-bit integers.
+        is_exchange: Whether the FMU is run by model exchange.
     """
 
-    def __new__(cls, version: int, types: bytes, references: bytes, /) -> Access: ...
+    def __new__(
+        cls, version: int, types: bytes, references: bytes, is_exchange: bool = False, /
+    ) -> Access: ...
 
 @final
 class Draws:
@@ -146,6 +160,7 @@ class Library(TypedDict):
     states: bool
     categories: tuple[bytes, ...]
     mark: Mark | None
+    solving: tuple[Any, ...] | None
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -161,7 +176,7 @@ class Experiment(TypedDict):
     rebuilds: bool
     reloads: bool
     one_initialization: bool
-    pace: tuple[float, int, int]
+    pace: float
     start_outputs: bytes | None
 
 class Variables(TypedDict):
@@ -174,13 +189,18 @@ class Variables(TypedDict):
     sampling: bytes
 
 class Arrays(TypedDict):
-    """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
+    """The pool's own arrays.
+
+    ``health`` is int64, see ``fmugym.pool.health``, and so is ``last_initialization``, of shape
+    (1,), see ``fmugym.pool.pacing``.
+    """
 
     inputs: Array
     outputs: Array
     statuses: Array
     observations: Array
     health: Array
+    last_initialization: Array
 
 Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
 """An episode: types and references of the start variables, start values, first outputs, and rows of
@@ -314,7 +334,7 @@ class Pool:
     def actions_of_single(self) -> tuple[Any, Any]:
         """The actions of the last step and of the one before."""
 
-    def start(self, mask: Array, observations: Array, drawn: Array, /) -> int:
+    def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
     def save(self) -> Snapshot | int:
@@ -432,8 +452,16 @@ class Pool:
             None if the episode is not known as a whole.
         """
 
-    def costs(self) -> tuple[float, float, float]:
-        """The measured ns per instance of ``step``, ``reset``, ``step_or_reset``; 0 if unknown."""
+    def replace_record(
+        self, index: int, start: Access, starts: bytes, inputs: bytes, steps: int, /
+    ) -> None:
+        """Let an episode count as the one with these start values and inputs."""
+
+    def costs(self) -> tuple[float, float, float, float, float]:
+        """The measured ns per instance of some methods; 0 if unknown.
+
+        They are ``step``, ``reset``, ``step_or_reset`` and ``play``, and the first ``reset``.
+        """
 
     def uses_states(self) -> bool:
         """Whether resets restore saved initial states, as far as is known by now."""

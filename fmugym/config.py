@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.description import INTERFACES
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import (
@@ -29,6 +30,7 @@ from fmugym.pool.spec import (
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,
     SAMPLINGS,
+    SOLVERS,
     ResetMethod,
 )
 
@@ -45,6 +47,7 @@ _POSITIVE: Final = (
     "probe_timeout",
     "call_timeout",
     "tolerance",
+    "max_step",
     "max_initializations_per_second",
 )
 _NAMES: Final = ("model_input_names", "model_output_names", "monitor_names", "preload")
@@ -66,7 +69,8 @@ class EnvConfig:
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         start_time: First communication point; by default the FMU's own default start time.
         stop_time: Given to the FMU unless it is None; the episode is truncated there.
-        tolerance: For the FMU's solver; by default that of the FMU's default experiment.
+        tolerance: For the solver of the FMU, or the one that integrates it in model exchange; by
+            default that of the FMU's default experiment.
         substeps: Communication steps within one ``step``.
         warm_up: Time simulated at each reset before the first observation, a multiple of
             ``time_step``, with the inputs at their start values.
@@ -97,10 +101,10 @@ class EnvConfig:
             ``fmugym.trial.opening.make_pool``.
         call_timeout: Seconds of real time that a call of an FMU may take in a worker process. A
             reset or an instantiation may take ten times as long. None for no limit.
-        max_instances: How many instances may exist at once, for FMUs with licences: each instance
-            may take a seat. None for no limit.
+        max_instances: How many instances of the FMU may exist at once on this machine, for FMUs
+            with licences: each instance may take a seat. None for no limit.
         max_initializations_per_second: How many instantiations and initializations may begin in a
-            second of real time, counted together; None for no limit.
+            second of real time on this machine, counted together; None for no limit.
         keep_initial_states: Whether to keep the state after initialization and warm-up, for other
             instances and on disk, where this gives the same results to the last bit. For models
             that take long to initialize.
@@ -109,6 +113,12 @@ class EnvConfig:
         samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
             default), or the ``"mean"``, ``"integral"`` over time, ``"min"`` or ``"max"`` of the
             values after each substep. After a reset an integral is 0.
+        interface: How the FMU is run: ``"co_simulation"`` or ``"model_exchange"``; by default
+            co-simulation where the FMU offers it, or as the class says.
+        solver: The method of integration for model exchange: ``"dormand_prince"``, ``"euler"``,
+            ``"rk4"``, or ``"rosenbrock"`` for stiff models.
+        max_step: The longest step of this solver; by default a step of ``"euler"`` and ``"rk4"``
+            is the FMU's own default step size, and the others choose their steps by the tolerance.
 
     Raises:
         ConfigError: For a value of the wrong type or range.
@@ -145,6 +155,9 @@ class EnvConfig:
     keep_initial_states: bool = False
     licence_wait: float = 0.0
     samplings: Mapping[str, str] = field(default_factory=dict)
+    interface: str | None = None
+    solver: str = SOLVERS[0]
+    max_step: float | None = None
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any] | EnvConfig) -> EnvConfig:
@@ -182,6 +195,9 @@ class EnvConfig:
         self._set("on_fault", check_option("on_fault policy", self.on_fault, ON_FAULT))
         if self.isolation is not None:
             self._set("isolation", check_option("isolation", self.isolation, ISOLATIONS))
+        if self.interface is not None:
+            self._set("interface", check_option("interface", self.interface, INTERFACES))
+        self._set("solver", check_option("solver", self.solver, SOLVERS))
         self._set("rehearsals", check_flag("rehearsals", self.rehearsals))
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))

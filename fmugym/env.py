@@ -22,15 +22,16 @@ from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
 from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
-from fmugym.task.episode import Episode
+from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import output_variable
 from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
 from fmugym.task.waiting import Waiting
+from fmugym.task.warm_up import WarmUps, rows_of_one
 
-__all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"]
+__all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI2MEEnv", "FMI3CSEnv", "FMUEnv"]
 
 _INTEGERS: Final = frozenset({int, np.int64})
 _WARNING: Final = int(Status.WARNING)
@@ -46,13 +47,13 @@ Result = tuple[Any, float, bool, bool, dict[str, Any]]
 
 
 class FMUEnv(Constructed):
-    """A co-simulation FMU as a Gymnasium environment.
+    """An FMU as a Gymnasium environment.
 
-    A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv`` and supplies
-    ``_is_done``; every other hook of ``fmugym.task.hooks.Hooks`` has a default. A step calls the
-    hooks once each, in the order in which they stand there. All but ``_get_inputs`` and ``_update``
-    must be free of side effects. None may draw random numbers; random values are distributions in
-    the config.
+    A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv``, or from
+    ``FMI2MEEnv`` for model exchange, and supplies ``_is_done``; every other hook of
+    ``fmugym.task.hooks.Hooks`` has a default. A step calls the hooks once each, in the order in
+    which they stand there. All but ``_get_inputs`` and ``_update`` must be free of side effects.
+    None may draw random numbers; random values are distributions in the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.
@@ -101,6 +102,10 @@ class FMUEnv(Constructed):
 
     fmi_version: ClassVar[int | None] = None
     """The FMI version that the FMU must have; None for any."""
+
+    fmi_interface: ClassVar[str | None] = None
+    """How the FMU is run, ``"co_simulation"`` or ``"model_exchange"``; None for as the config says.
+    """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
 
@@ -170,10 +175,11 @@ class FMUEnv(Constructed):
         episode = plan.draw(self.np_random if generator is None else generator)
         self._ended = True  # there is no episode if the FMU fails
         try:
-            pool.reset(plan.model_variables, episode.start_values)
-            if pool.statuses.item(0) > Status.WARNING:
-                raise failed_reset(pool.failure(0))
-            self._begin_episode(episode)
+            if self._warm_ups is None:
+                self._reset_pool(pool, plan, episode)
+                self._begin_episode(episode)
+            else:
+                self._begin_with_warm_up(self._warm_ups, pool, plan, episode)
             observation, info = self._observation_and_info()
         except BaseException:
             self._ended = True
@@ -183,6 +189,33 @@ class FMUEnv(Constructed):
         if self.render_mode == "human":
             self.render()
         return observation, info
+
+    @staticmethod
+    def _reset_pool(pool: Pool, plan: EpisodePlan, episode: Episode) -> None:
+        pool.reset(plan.model_variables, episode.start_values)
+        if pool.statuses.item(0) > Status.WARNING:
+            raise failed_reset(pool.failure(0))
+
+    def _begin_with_warm_up(
+        self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
+    ) -> None:
+        """Begin an episode with a warm-up, or in the state that an earlier one has led to."""
+        starts = episode.start_values
+        rows = {name: np.asarray(v)[..., None] for name, v in episode.variables.items()}
+        found = warm_ups.find(pool, plan.model_variables, starts, rows, [0])
+        if not found:
+            self._reset_pool(pool, plan, episode)
+        self._begin_episode(episode)
+        if found:
+            warm_ups.restore(pool, found)
+            variables = found[0].variables
+        else:
+            written = warm_ups.run(pool, rows_of_one(self), np.zeros(1, np.int64))
+            variables = {name: row[..., 0] for name, row in written.items()}
+        self.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
+        self.inputs = tuple(self._input_row.tolist())
+        self._values = tuple(self._output_row.tolist())
+        self.state = self.previous_state = self._values[: self._output_count]
 
     def _prepare_player(self, pool: Pool) -> None:
         """Prepare to compile the hooks, where that may be possible."""
@@ -398,7 +431,7 @@ class FMUEnv(Constructed):
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
-        steps = self._spec.warm_up_steps + self.step_count
+        steps = self._warm_up_steps + self.step_count
         return self._spec.communication_point(steps * self._spec.substeps)
 
     def _fault_of_hooks(
@@ -584,18 +617,31 @@ class FMI1CSEnv(FMUEnv):
     """Base class for FMUs of FMI 1.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 1
+    fmi_interface = "co_simulation"
 
 
 class FMI2CSEnv(FMUEnv):
     """Base class for FMUs of FMI 2.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 2
+    fmi_interface = "co_simulation"
+
+
+class FMI2MEEnv(FMUEnv):
+    """Base class for FMUs of FMI 2.0 model exchange; see ``FMUEnv``.
+
+    The equations are integrated by the ``solver`` of the config, one of fmugym's own.
+    """
+
+    fmi_version = 2
+    fmi_interface = "model_exchange"
 
 
 class FMI3CSEnv(FMUEnv):
     """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
 
     fmi_version = 3
+    fmi_interface = "co_simulation"
 
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:

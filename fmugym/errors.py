@@ -95,7 +95,10 @@ class SimulationError(FMUGymError):
 
 
 class LicenceError(SimulationError, FMULoadError):
-    """An FMU got no licence, by its own words, when it was instantiated or initialized."""
+    """An FMU got no licence when it was instantiated or initialized, by its own words.
+
+    Or other environments have all instances that the config key ``max_instances`` allows.
+    """
 
 
 class ContractError(FMUGymError):

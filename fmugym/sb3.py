@@ -7,22 +7,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from importlib import import_module
 from itertools import repeat
 from typing import Any
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
 from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError
 from fmugym.pool.base import MaskArray
-from fmugym.vector import FMUVectorEnv, vectorized
+from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
+from fmugym.vector.libraries import make_vector_env
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -68,31 +66,11 @@ def make_sb3_env(
     """
     seed = check_seed(seed)
     kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
-    if isinstance(env, str):
-        vector_env = _registered(env, num_envs, kwargs)
-    elif callable(env):
-        vector_env = vectorized(env)(num_envs, **kwargs)
-    else:
-        raise ConfigError(f"env must be a registered id or a class, got {shown(env)}")
-    venv = FMUVecEnv(vector_env, overlap)
+    venv = FMUVecEnv(make_vector_env(env, num_envs, kwargs), overlap)
     if seed is not None:
         venv.seed(seed)
         venv.action_space.seed(seed)
     return VecMonitor(venv) if monitor else venv
-
-
-def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
-    module, _, name = env_id.rpartition(":")
-    try:
-        if module:
-            import_module(module)
-        creator: Any = gymnasium.spec(name).entry_point
-    except (ImportError, ValueError, gymnasium.error.Error) as error:
-        raise ConfigError(f"there is no environment {env_id!r}: {error}") from None
-    creator = load_env_creator(creator) if isinstance(creator, str) else creator
-    if isinstance(creator, type) and not issubclass(creator, FMUEnv):
-        raise ConfigError(f"{name} is not an environment of fmugym; use SB3's make_vec_env for it")
-    return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)
 
 
 class FMUVecEnv(VecEnv):

@@ -92,10 +92,8 @@ size_t pool_start(Pool *pool, const Call *call, bool *outside) {
         *outside = verdict.outside;
         return troubled + verdict.troubled;
     }
-    for (size_t i = 0; i < pool->settings.count; i++) {
-        if (call->mask.data != NULL && !is_in(call->mask, i)) {
-            write_observation(pool, i, call->observations);
-        }
+    if (call->mask.data != NULL) {
+        write_all_observations(pool, call->observations);
     }
     return troubled;
 }

@@ -4,10 +4,12 @@
 
 #if defined __linux__
 
+#include <dlfcn.h>
 #include <errno.h>
 #include <signal.h>
 #include <stddef.h>
 #include <stdlib.h>
+#include <string.h>
 #include <unistd.h>
 
 #include "inside.h"
@@ -19,7 +21,30 @@ enum { SIGNALS = sizeof signals / sizeof *signals };
 static struct sigaction earlier[SIGNALS];
 static Mutex lock = MUTEX_INITIALIZER;
 
+/* Where glibc leaves the reason before it aborts; debuggers read it. NULL in other C libraries. */
+typedef struct {
+    unsigned size;
+    char text[];
+} AbortMessage;
+static AbortMessage **abort_message;
+
 /* The functions of this part run in signal handlers. They neither lock nor allocate. */
+
+/* What the C library said if it has aborted because the heap is damaged, or NULL. */
+static const char *heap_damage(void) {
+    static const char *const beginnings[] = {"free(): ",       "malloc(): ",    "realloc(): ",
+                                             "malloc_consol",  "munmap_chunk()", "mremap_chunk()",
+                                             "corrupted ",     "double free or", "tcache_thread",
+                                             "unaligned tcac", "unaligned fast", "sysmalloc"};
+    const AbortMessage *said = abort_message == NULL ? NULL : *abort_message;
+
+    for (size_t i = 0; said != NULL && i < sizeof beginnings / sizeof *beginnings; i++) {
+        if (strncmp(said->text, beginnings[i], strlen(beginnings[i])) == 0) {
+            return said->text;
+        }
+    }
+    return NULL;
+}
 
 static void strike(unsigned char what) {
     const Mark *mark = inside_mark();
@@ -63,7 +88,11 @@ static void on_signal(int number, siginfo_t *info, void *context) {
     const int error = errno;
 
     if (comes_from_here(info)) {
+        const char *damage = number == SIGABRT && inside_mark() == NULL ? heap_damage() : NULL;
         strike((unsigned char)number);
+        if (damage != NULL) {
+            mark_all(number, damage);
+        }
     }
     errno = error;
     pass_on(number, info, context);
@@ -102,6 +131,7 @@ void crash_watch(void) {
 
     mutex_lock(&lock);
     if (!prepared) {
+        abort_message = (AbortMessage **)dlsym(RTLD_DEFAULT, "__abort_msg");
         atexit(on_exit_of_process);
     }
     install(!prepared);

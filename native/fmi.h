@@ -1,4 +1,4 @@
-/* One table of functions for all FMI versions: what the pool needs for co-simulation. */
+/* One table of functions for all FMI versions and interfaces: what the pool needs for steps. */
 
 #ifndef FMUGYM_FMI_H
 #define FMUGYM_FMI_H
@@ -45,6 +45,8 @@ typedef struct {
     const char *resources; /* a URI, in FMI 3.0 a path */
     uint64_t environment;  /* the same name as a number, for FMI 3.0 */
     bool logging;          /* whether the FMU logs everything, not only what it thinks necessary */
+    const struct Solving *solving; /* of model exchange; see methods.h */
+    const Floats *floats;          /* the environment in which the solver computes */
 } Identity;
 
 typedef struct {
@@ -129,7 +131,8 @@ typedef struct Fmi {
                           void **state);
 } Fmi;
 
-extern const Fmi fmi1, fmi2, fmi3;
+/* Of co-simulation and of model exchange. */
+extern const Fmi fmi1, fmi2, fmi3, exchange2;
 
 static inline bool has_outputs(Outcome outcome) {
     return outcome.stage == DOING_STEP &&

@@ -77,7 +77,7 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     if (status > STATUS_WARNING) {
         return status;
     }
-    pace_wait(&pool->pace);
+    pace_wait(&pool->settings.pace);
     instance_begin_turn(pool);
     atomic_add(&initializations, 1);
     begin_call(CALL_INITIALIZE);

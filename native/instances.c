@@ -24,9 +24,10 @@ static bool build(Pool *pool, Instance *me, bool logging) {
     const Settings *s = &pool->settings;
     const size_t index = index_of(pool, me);
     const Identity identity = {name_of(pool, index), s->token, s->resources,
-                               log_environment(&pool->log, index), logging};
+                               log_environment(&pool->log, index), logging,
+                               &s->solving, &pool->floats};
 
-    pace_wait(&pool->pace);
+    pace_wait(&pool->settings.pace);
     mutex_lock(pool->making);
     begin_call(CALL_INSTANTIATE);
     me->component = s->fmi->instantiate(me->library, &identity);

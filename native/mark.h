@@ -9,7 +9,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* What a thread inside a pool asks the FMU for. fmugym/trial/marks.py has names in this order. */
+/* What a thread inside a pool asks the FMU for. fmugym/pool/mark.py has names in this order. */
 typedef enum {
     CALL_STEP, /* also setting its inputs and reading its outputs */
     CALL_LOAD,
@@ -20,6 +20,7 @@ typedef enum {
     CALL_SAVE,
     CALL_RESTORE,
     CALL_FREE,
+    NO_CALL, /* the process has ended elsewhere, because its heap was damaged */
     NUMBER_OF_CALLS
 } FmuCall;
 
@@ -28,6 +29,7 @@ typedef struct {
     int64_t owner;                /* the process; a fork must not write the page */
 } Mark;
 
+enum { MARK_TEXT = 96 }; /* the place of what the C library said, a text of at most this length */
 enum { MARK_EXIT = 255 }; /* in the place of a signal: the FMU has ended the process by exit */
 
 /* Maps a page of an open file, and prepares this thread. Returns whether that
@@ -41,6 +43,10 @@ void mark_prepare_thread(void);
 
 /* Whether a signal has left a mark in this process. */
 extern volatile int mark_struck;
+
+/* Does the same to all open marks of this process; for signal handlers. The heap does not tell who
+ * has damaged it. */
+void mark_all(int number, const char *text);
 
 /* Takes a mark back, because the process has survived the signal. */
 void mark_forgive(const Mark *mark);

@@ -115,9 +115,6 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     mutex_reset(&pool->own_making);
     pool->making = settings->one_initialization ? &shared_making : &pool->own_making;
     pool->settings = *settings;
-    pool->pace.interval = (uint64_t)(settings->pace_interval * 1e9);
-    pool->pace.turn = (uint64_t)settings->turn;
-    pool->pace.turns = (uint64_t)settings->turns;
     pool->step_size = settings->time_step / (double)settings->substeps;
     pool->no_return = !settings->restores && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 &&

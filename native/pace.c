@@ -1,18 +1,17 @@
 #include "pace.h"
 
-static uint64_t claim(Pace *pace) {
-    uint64_t next = atomic_get(&pace->next), slot;
+uint64_t pace_claim(const Pace *pace) {
+    uint64_t last = atomic_get(pace->last), next;
 
     do {
-        const uint64_t now = clock_now() / pace->interval + 1;
-        slot = next > now ? next : now;
-        slot += (pace->turn + pace->turns - slot % pace->turns) % pace->turns;
-    } while (!atomic_replace(&pace->next, &next, slot + 1));
-    return slot;
+        const uint64_t now = clock_now();
+        next = last == 0 || last + pace->interval < now ? now : last + pace->interval;
+    } while (!atomic_replace(pace->last, &last, next));
+    return next;
 }
 
-void pace_wait(Pace *pace) {
+void pace_wait(const Pace *pace) {
     if (pace->interval > 0) {
-        clock_sleep_until(claim(pace) * pace->interval);
+        clock_sleep_until(pace_claim(pace));
     }
 }

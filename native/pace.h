@@ -1,5 +1,5 @@
 /* The pace at which instances are made and initialized, for licences that limit it.
- * fmugym/pool/pacing.py explains it and does the same in Python. */
+ * fmugym/pool/pacing.py explains it. */
 
 #ifndef FMUGYM_PACE_H
 #define FMUGYM_PACE_H
@@ -7,12 +7,14 @@
 #include "platform.h"
 
 typedef struct {
-    uint64_t interval; /* length of a slot in ns; 0 for no limit */
-    uint64_t turn, turns; /* of turns processes, this one has the slots whose remainder is turn */
-    Atomic next; /* the first slot that is free */
+    uint64_t interval; /* from one call to the next in ns; 0 for no limit */
+    Atomic *last;      /* when the last call began; several processes may share this memory */
 } Pace;
 
-/* Waits for the next free slot. */
-void pace_wait(Pace *pace);
+/* Returns when the next call may begin, which is then taken. The clock is that of clock_now. */
+uint64_t pace_claim(const Pace *pace);
+
+/* Waits until a call may begin. */
+void pace_wait(const Pace *pace);
 
 #endif

@@ -4,6 +4,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "halves.h"
 #include "platform.h"
 
 enum { DONE, TRUNCATED, REWARD };
@@ -18,17 +19,20 @@ WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t low
     return outside != 0;
 }
 
-#define ANY_NAN(Type, name)                                                                        \
+#define ANY_NAN(Type, name, is_nan)                                                                \
     WIDE static bool name(const Type *values, size_t count) {                                      \
         size_t number = 0;                                                                         \
         for (size_t i = 0; i < count; i++) {                                                       \
-            number += values[i] != values[i];                                                      \
+            number += is_nan(values[i]);                                                           \
         }                                                                                          \
         return number > 0;                                                                         \
     }
 
-ANY_NAN(double, is_any_nan)
-ANY_NAN(float, is_any_nan32)
+#define DIFFERS(value) ((value) != (value))
+
+ANY_NAN(double, is_any_nan, DIFFERS)
+ANY_NAN(float, is_any_nan32, DIFFERS)
+ANY_NAN(Half, is_any_nan16, half_is_nan)
 
 bool play_has_bad_action(const Turn *turn) {
     const Actions *a = &turn->play->actions;
@@ -42,6 +46,8 @@ bool play_has_bad_action(const Turn *turn) {
         return is_any_nan(actions, count);
     case ACTIONS_FLOAT32:
         return is_any_nan32(actions, count);
+    case ACTIONS_FLOAT16:
+        return is_any_nan16(actions, count);
     default:
         return false;
     }

@@ -11,7 +11,13 @@
 #include "program.h"
 
 /* What step() refuses: integers outside of a range, or floats that are NaN. */
-typedef enum { ACTIONS_ANY, ACTIONS_IN_RANGE, ACTIONS_FLOAT64, ACTIONS_FLOAT32 } ActionCheck;
+typedef enum {
+    ACTIONS_ANY,
+    ACTIONS_IN_RANGE,
+    ACTIONS_FLOAT64,
+    ACTIONS_FLOAT32,
+    ACTIONS_FLOAT16
+} ActionCheck;
 
 /* The actions of one environment follow each other in memory. */
 typedef struct {

@@ -13,6 +13,7 @@
 #include "fmi.h"
 #include "log.h"
 #include "mark.h"
+#include "methods.h"
 #include "pace.h"
 #include "platform.h"
 #include "play.h"
@@ -45,8 +46,7 @@ typedef struct {
     bool reloads;  /* whether a new instance also reloads its private library */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
-    double pace_interval;    /* see pace.h; in seconds */
-    int64_t turn, turns;
+    Pace pace;
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -63,6 +63,7 @@ typedef struct {
     int8_t *status;
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
     const Mark *mark; /* where a crash is noted, or NULL */
+    Solving solving;    /* the method is NULL in co-simulation */
     const char *start_outputs; /* doubles in the place of outputs that the FMU does not tell before
                                 * the first step, or NULL */
 } Settings;
@@ -155,7 +156,8 @@ enum { SAMPLES = 8 };
 /* The measured cost of an operation: a low quantile of the last samples. Other load on the
  * machine makes some samples much too high, but none too low. */
 typedef struct {
-    double low; /* ns per instance; 0 until it is known */
+    double low;   /* ns per instance; 0 until it is known */
+    double first; /* the first sample: later resets may restore states */
     double samples[SAMPLES];
     uint32_t taken;
     uint32_t calls;
@@ -172,7 +174,6 @@ typedef struct Pool {
     Mutex lock;
     Floats floats; /* environment of the thread inside, which FMUs must find */
     Mutex own_making;
-    Pace pace;
     Mutex *making; /* held while an instance is made or freed: FMUs may keep lists of them */
     bool open;
     Log log;

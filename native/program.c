@@ -5,7 +5,9 @@
 #include <string.h>
 
 #include "fmi.h"
+#include "halves.h"
 #include "platform.h"
+#include "quick.h"
 
 #define NAME_IT(operation, name) [operation] = name,
 const char *const operation_names[NUMBER_OF_OPERATIONS] = {EACH_OPERATION(NAME_IT)};
@@ -26,6 +28,7 @@ static size_t number_of_operands(const Program *program, Instruction i) {
     case CALL:
         return program->calls[i.extra].inputs;
     case CALL_SQUARE:
+    case CALL_REMAINDER:
         return 2;
     case STORE_ROW:
     case STORE_SEEN:
@@ -66,7 +69,9 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
     case CALL:
         return i.extra < program->number_of_calls;
     case CALL_SQUARE:
-        return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2;
+    case CALL_REMAINDER:
+        return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2 &&
+               program->calls[i.extra].values == 3;
     case CAST:
         return i.extra < VALUE_TYPES * VALUE_TYPES;
     case TAKE:
@@ -245,7 +250,7 @@ static void load_stopped(const Source *s, size_t begin, size_t count, uint8_t *t
     }
 }
 
-static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1};
+static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1, 2};
 
 /* The first loop looks whether there is any such value; nearly always there is none. */
 #define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
@@ -261,6 +266,12 @@ static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 
 
 NOTE_NOT_FINITE(double, note_not_finite, int64_t, fabs, DBL_MAX)
 NOTE_NOT_FINITE(float, note_not_finite32, int32_t, fabsf, FLT_MAX)
+
+static void note_not_finite16(const Half *values, size_t count, Notes *notes) {
+    for (size_t j = 0; j < count; j++) {
+        notes->not_finite[j] |= !half_is_finite(values[j]);
+    }
+}
 
 void program_clear_seen(const Program *program, char *const *seen, size_t index) {
     for (size_t i = 0; i < program->number_of_slots; i++) {
@@ -280,21 +291,35 @@ static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t c
         note_not_finite(from, count, notes);
     } else if (slot->type == VALUE_FLOAT) {
         note_not_finite32(from, count, notes);
+    } else if (slot->type == VALUE_HALF) {
+        note_not_finite16(from, count, notes);
     }
 }
 
 /* Operations of numpy */
 
+WIDE static bool is_any_set(const uint8_t *flags, size_t lanes) {
+    uint8_t any = 0;
+
+    for (size_t j = 0; j < lanes / PROGRAM_BLOCK * PROGRAM_BLOCK; j++) {
+        any |= flags[j];
+    }
+    return any != 0;
+}
+
 /* The casts drop const: a loop of numpy does not write to its inputs. */
 static void call(const Called *called, size_t count, size_t lanes, const Registers *registers,
                  Instruction i) {
     const void *const *places = registers->places;
-    char *data[CALL_INPUTS + 1] = {(char *)places[i.a], (char *)places[i.b], (char *)places[i.c]};
+    char *data[CALL_VALUES] = {(char *)places[i.a], (char *)places[i.b], (char *)places[i.c]};
     const ptrdiff_t length = (ptrdiff_t)count;
+    Register other; /* the result that another instruction keeps */
 
-    data[called->inputs] = (char *)registers->own[i.to].bytes;
+    for (size_t k = called->inputs; k < called->values; k++) {
+        data[k] = (char *)(k == called->kept ? registers->own[i.to].bytes : other.bytes);
+    }
     called->loop(called->context, data, &length, called->sizes, called->auxiliary);
-    clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->inputs]);
+    clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->kept]);
 }
 
 /* Computing the end from the blocks shows the compiler that no value is left over. */
@@ -303,46 +328,40 @@ static void call(const Called *called, size_t count, size_t lanes, const Registe
         statement;                                                                                 \
     }
 
-/* The power of 2, by a loop whose error is less than 0.55 units in the last place. Dekker's product
- * gives the error of the rounded square. Where it is less than 0.45 units, no such loop can round
- * in the other direction. Below a power of two the units are half as long; the loop handles those,
- * and numbers whose product might not be exact. */
-static inline uint8_t square_one(double x, double *square) {
-    const double shifted = x * 134217729.0, high = shifted - (shifted - x), low = x - high;
-    const double rounded = x * x;
-    const double error = ((high * high - rounded) + 2.0 * high * low) + low * low;
-    uint64_t bits, leading;
-    double power;
-
-    memcpy(&bits, &rounded, sizeof bits);
-    leading = bits & UINT64_C(0x7ff) << 52;
-    memcpy(&power, &leading, sizeof power);
-    *square = rounded;
-    return !((fabs(error) <= 0.45 * DBL_EPSILON * power) & (bits != leading) &
-             (rounded > 1e-250) & (rounded < 1e250));
-}
-
-WIDE static void square(const double *restrict x, size_t blocks, double *restrict to,
-                        uint8_t *restrict doubtful) {
-    EACH_LANE(doubtful[j] = square_one(x[j], &to[j]));
-}
-
-static void call_square(const Called *called, size_t count, size_t lanes, const double *x,
-                        const void *exponent, double *to) {
-    uint8_t doubtful[PROGRAM_WIDTH], places[PROGRAM_WIDTH];
-    double bases[PROGRAM_WIDTH], powers[PROGRAM_WIDTH];
+/* Calls the loop for the values that are doubtful. */
+static void call_where(const Called *called, size_t count, const uint8_t *doubtful,
+                       const double *x, const double *y, double *to) {
+    double first[PROGRAM_WIDTH], second[PROGRAM_WIDTH], found[PROGRAM_WIDTH];
+    uint8_t places[PROGRAM_WIDTH];
     ptrdiff_t number = 0;
 
-    square(x, lanes / PROGRAM_BLOCK, to, doubtful);
     for (size_t j = 0; j < count; j++) {
         places[number] = (uint8_t)j;
-        bases[number] = x[j];
+        first[number] = x[j];
+        second[number] = y[j];
         number += doubtful[j];
     }
-    char *data[] = {(char *)bases, (char *)exponent, (char *)powers};
-    called->loop(called->context, data, &number, called->sizes, called->auxiliary);
+    char *data[] = {(char *)first, (char *)second, (char *)found};
+    if (number > 0) {
+        called->loop(called->context, data, &number, called->sizes, called->auxiliary);
+    }
     for (ptrdiff_t k = 0; k < number; k++) {
-        to[places[k]] = powers[k];
+        to[places[k]] = found[k];
+    }
+}
+
+static void call_quick(const Called *called, size_t count, size_t lanes, uint16_t operation,
+                       const double *x, const double *y, Register *to) {
+    const size_t blocks = lanes / PROGRAM_BLOCK;
+    _Alignas(64) uint8_t doubtful[PROGRAM_WIDTH];
+
+    if (operation == CALL_SQUARE) {
+        quick_square(x, blocks, to->doubles, doubtful);
+    } else {
+        quick_remainder(x, y, blocks, to->doubles, doubtful);
+    }
+    if (is_any_set(doubtful, lanes)) {
+        call_where(called, count, doubtful, x, y, to->doubles);
     }
 }
 
@@ -371,10 +390,9 @@ static void call_square(const Called *called, size_t count, size_t lanes, const 
         }                                                                                          \
         break;
 
-WIDE static void cast(uint16_t types, const void *from, size_t blocks, void *to) {
-    const int to_type = types % VALUE_TYPES;
-
-    switch (types / VALUE_TYPES) {
+WIDE static void cast_numbers(int from_type, int to_type, const void *from, size_t blocks,
+                              void *to) {
+    switch (from_type) {
         CASTS_FROM(0, double)
         CASTS_FROM(1, float)
         CASTS_FROM(2, int64_t)
@@ -386,6 +404,39 @@ WIDE static void cast(uint16_t types, const void *from, size_t blocks, void *to)
         CASTS_FROM(8, uint16_t)
         CASTS_FROM(9, uint8_t)
         CASTS_FROM(10, Flag)
+    }
+}
+
+/* A half becomes a float first, as in numpy. */
+static void cast_halves(const Half *from, int to_type, size_t blocks, void *to) {
+    Register floats;
+
+    EACH_LANE(floats.floats[j] = half_to_float(from[j]));
+    cast_numbers(VALUE_FLOAT, to_type, floats.floats, blocks, to);
+}
+
+/* Integers become floats first, as in numpy. */
+static void cast_to_halves(int from_type, const void *from, size_t blocks, Half *to) {
+    const double *doubles = from;
+    Register floats;
+
+    if (from_type == VALUE_DOUBLE) {
+        EACH_LANE(to[j] = half_of(doubles[j]));
+        return;
+    }
+    cast_numbers(from_type, VALUE_FLOAT, from, blocks, floats.floats);
+    EACH_LANE(to[j] = half_of(floats.floats[j]));
+}
+
+static void cast(uint16_t types, const void *from, size_t blocks, void *to) {
+    const int from_type = types / VALUE_TYPES, to_type = types % VALUE_TYPES;
+
+    if (from_type == VALUE_HALF) {
+        cast_halves(from, to_type, blocks, to);
+    } else if (to_type == VALUE_HALF) {
+        cast_to_halves(from_type, from, blocks, to);
+    } else {
+        cast_numbers(from_type, to_type, from, blocks, to);
     }
 }
 
@@ -651,8 +702,9 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
             call(&program->calls[i.extra], count, lanes, registers, i);
             break;
         case CALL_SQUARE:
-            call_square(&program->calls[i.extra], count, lanes, places[i.a], places[i.b],
-                        to->doubles);
+        case CALL_REMAINDER:
+            call_quick(&program->calls[i.extra], count, lanes, i.operation, places[i.a],
+                       places[i.b], to);
             break;
         case CAST:
             cast(i.extra, places[i.a], lanes / PROGRAM_BLOCK, to);

@@ -13,7 +13,7 @@ enum {
     PROGRAM_BLOCK = 16,      /* operations compute a multiple of this many values */
     PROGRAM_REGISTERS = 256, /* maximum number of registers */
     PROGRAM_RESULTS = 3,     /* maximum number of results */
-    CALL_INPUTS = 3          /* maximum number of inputs of a loop of numpy */
+    CALL_VALUES = 4          /* maximum number of inputs and outputs of a loop of numpy */
 };
 
 /* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
@@ -29,6 +29,7 @@ enum {
     X(STORE_SEEN, "store_seen")                                                                    \
     X(CALL, "call")                                                                                \
     X(CALL_SQUARE, "call_square")                                                                  \
+    X(CALL_REMAINDER, "call_remainder")                                                            \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \
@@ -98,10 +99,11 @@ extern const char *const operation_names[NUMBER_OF_OPERATIONS];
     X(uint32_t, 'I')                                                                               \
     X(uint16_t, 'H')                                                                               \
     X(uint8_t, 'B')                                                                                \
-    X(Flag, '?')
+    X(Flag, '?')                                                                                   \
+    X(Half, 'e')
 
 enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
-enum { VALUE_TYPES = 11, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_INT64 = 2, VALUE_FLAG = 10 };
+enum { VALUE_TYPES = 12, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_HALF = 11 };
 
 /* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a
  * slot, a call, a table or a pair of types, as the operation needs it. */
@@ -132,8 +134,8 @@ typedef int Loop(void *context, char *const *data, const ptrdiff_t *dimensions,
 typedef struct {
     Loop *loop;
     void *context, *auxiliary;
-    uint16_t inputs;                  /* number of inputs */
-    ptrdiff_t sizes[CALL_INPUTS + 1]; /* bytes of each input, then of the output */
+    uint16_t inputs, values, kept; /* number of inputs; of these and outputs; which one is kept */
+    ptrdiff_t sizes[CALL_VALUES];  /* bytes of each input, then of each output */
 } Called;
 
 /* One value for each instance. */

@@ -20,3 +20,15 @@ void write_observation(const Pool *pool, size_t index, float *observations) {
         row[i] = (float)*value;
     }
 }
+
+void write_all_observations(const Pool *pool, float *observations) {
+    const Settings *s = &pool->settings;
+    const double *values = s->output_values;
+    const size_t count = s->count, width = s->num_observed;
+
+    for (size_t i = 0; i < width; i++, values += count) {
+        for (size_t j = 0; j < count; j++) {
+            observations[j * width + i] = (float)values[j];
+        }
+    }
+}

@@ -28,5 +28,6 @@ size_t note_status(Task *task, size_t index, Status status);
 
 /* Writes the first outputs of an instance. */
 void write_observation(const Pool *pool, size_t index, float *observations);
+void write_all_observations(const Pool *pool, float *observations);
 
 #endif

@@ -42,7 +42,19 @@ def die_in_a_fork():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def damage_the_heap():
+    """As an FMU may do in a step: the C library notices it at a later call of anybody."""
+    library = ctypes.CDLL(None)
+    library.malloc.restype = ctypes.c_void_p
+    library.malloc.argtypes = [ctypes.c_size_t]
+    library.free.argtypes = [ctypes.c_void_p]
+    place = library.malloc(5000)
+    ctypes.memset(place - 8, 0xFF, 8)
+    library.free(place)
+
+
 DEEDS = {
+    "damage": damage_the_heap,
     "null": die_of_a_null_pointer,
     "abort": os.abort,
     "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),

@@ -1,9 +1,10 @@
 """Compare every FMU of a folder with FMPy: ``python tests/held_out.py FOLDER [--timeout S]``.
 
-Each FMU for co-simulation plays three episodes with inputs that move: in a single environment, in a
-vector environment, and in worker processes. FMPy makes the same calls on a fresh instance of a
-fresh copy of the library for each episode. Each of these runs in a process of its own. There is a
-line for each FMU, and the share of right ones among those that FMPy can step at the end.
+Each FMU for co-simulation plays three episodes with inputs that move: in a single environment, in
+vector environments with one and with two threads, and in worker processes. FMPy makes the same
+calls on a fresh instance of a fresh copy of the library for each episode. Each of these runs in a
+process of its own. There is a line for each FMU, and the share of right ones among those that FMPy
+can step at the end.
 
 "same" means equal to the last bit, "close" within ten solver tolerances.
 """
@@ -22,7 +23,7 @@ import numpy as np
 import fmugym
 from fmugym.tools.skeleton import Skeleton
 
-SETTINGS = ("single", "vector", "isolated")
+SETTINGS = ("single", "vector", "threads", "isolated")
 LENGTHS = (20, 40, 20)
 NUM_ENVS = 3
 MOST_OUTPUTS = 50
@@ -118,6 +119,7 @@ def play_single(path, config):
 
 def play_vector(path, config, **options):
     """The episodes of all environments, which end together."""
+    options = {"threads": 1} | options
     envs = fmugym.FMUVectorEnv(
         lambda: HeldOutEnv(path, config), NUM_ENVS, autoreset_mode="Disabled", **options
     )
@@ -139,6 +141,11 @@ def play_vector(path, config, **options):
     return [list(episode) for episode in zip(*episodes, strict=True)]
 
 
+def play_threads(path, config):
+    """The same with two threads."""
+    return play_vector(path, config, threads=2)
+
+
 def play_isolated(path, config):
     """The same in worker processes."""
     return play_vector(path, config, isolation="process")
@@ -148,6 +155,7 @@ PLAYERS = {
     "fmpy": play_fmpy,
     "single": play_single,
     "vector": play_vector,
+    "threads": play_threads,
     "isolated": play_isolated,
 }
 

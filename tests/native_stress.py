@@ -53,7 +53,7 @@ def constants(*values):
 
 def programs(pool, variables):
     """Programs that use the numbers of the pool, those from before, and a loop of numpy."""
-    sine = loop_of(np.sin, (np.dtype("f8"),) * 2), 1, (8, 8, 0, 0)
+    sine = loop_of(np.sin, (np.dtype("f8"),) * 2), 1, (8, 8), 1
     push = code(
         ("load_action", 0, 1),
         ("cast", 2 * len(TYPES), 2, 1),

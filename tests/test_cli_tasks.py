@@ -207,14 +207,17 @@ class TestSimulate:
         assert "cost 0.5 in 50 steps (1 s), truncated" in out
         with (tmp_path / "run.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
-        assert list(rows[0]) == ["seed", "time", "tau", "q", "costs.effort", "reward", "end"]
+        assert list(rows[0]) == [
+            *("episode", "step", "time [s]", "tau [N.m]", "q [rad]", "reward", "cost"),
+            *("costs.effort", "terminated", "truncated", "fault"),
+        ]
         assert len(rows) == 51
-        assert rows[-1]["end"] == "truncated"
+        assert rows[-1]["truncated"] == "1"
         env = fmugym.load(tmp_path / "a.toml")
         env.reset(seed=0)
         for row in rows[1:]:
             reward = env.step([np.float32(0.01)])[1]
-            assert (float(row["q"]), float(row["reward"])) == (env.out["q"], reward)
+            assert (float(row["q [rad]"]), float(row["reward"])) == (env.out["q"], reward)
         env.close()
 
     @pytest.mark.parametrize("action", ["0.5", "0,0", "left", "nan"])

@@ -122,6 +122,19 @@ def test_other_configs_of_the_fmu_are_isolated_too(place):
     assert place.is_isolated("time_step=0.125")
 
 
+@pytest.mark.parametrize("backend", ["native", "python"])
+def test_a_damaged_heap_that_ends_the_process_elsewhere(place, backend):
+    answer, code, errors = place.run("do=damage", f"backend={backend}")
+    assert answer is None
+    assert code == -signal.SIGABRT
+    assert place.marks
+    answer, *_ = place.run(f"backend={backend}")
+    assert answer["isolated"]
+    said = next(line for line in errors.splitlines() if "()" in line)
+    assert f"outside of its calls because the heap was damaged ({said})" in answer["warnings"][0]
+    assert place.marks == []
+
+
 def test_helper_threads_and_exhausted_stacks(place):
     place.run("vector", "fault=overflow")
     assert place.is_isolated()

@@ -15,12 +15,16 @@ from gymnasium.envs.registration import EnvSpec
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
-from fmugym.declared.declarations import AGENT_KEYS, BUILT_IN, SETPOINTS
+from fmugym.declared.declarations import AGENT_KEYS, BUILT_IN
+from fmugym.declared.devices import DEVICE_KEYS
 from fmugym.declared.expressions import CONSTANTS
 from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.kpis import KPIS
 from fmugym.declared.series import DATA_KEYS
+from fmugym.declared.setpoints import SETPOINTS
 from fmugym.declared.task import KEYS
 from fmugym.declared.variables import VARIABLE_KEYS
+from fmugym.declared.warming import WARM_UP_KEYS
 from fmugym.errors import TaskError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -503,8 +507,11 @@ def merged(base, own):
     [
         ("Keys", KEYS),
         ("Variables", [*VARIABLE_KEYS]),
+        ("Sensors and actuators", DEVICE_KEYS),
         ("Agent", AGENT_KEYS),
         ("Data and set points", [*DATA_KEYS, *SETPOINTS]),
+        ("Warm-up", WARM_UP_KEYS),
+        ("Figures of an episode", KPIS),
         ("Expressions", [*FUNCTIONS, "previous", *BUILT_IN, *CONSTANTS]),
     ],
 )

@@ -141,8 +141,8 @@ def test_mistakes_are_placed(variable, fact):
         fmugym.load(PLAIN | {"variables": {"u": variable}})
 
 
-def test_observations_have_no_rate():
-    variables = {"u": {"name": "tau"}, "q": {"rate": 1}}
+def test_observations_have_no_delta():
+    variables = {"u": {"name": "tau"}, "q": {"delta": 1}}
     with pytest.raises(TaskError, match=r"variables\.q.*observed"):
         fmugym.load(PLAIN | {"variables": variables})
 

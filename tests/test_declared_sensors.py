@@ -86,9 +86,170 @@ def test_values_come_late():
     env.close()
 
 
-def test_a_history_holds_what_was_measured():
+def test_saturation_clips():
+    env = fmugym.load(task(saturation=[7, 12]))
+    observed, true, _ = episode(env, 0)
+    assert true.min() < 7
+    assert true.max() > 12
+    np.testing.assert_allclose(observed, np.clip(true, 7, 12), rtol=1e-6)
+    env.close()
+
+
+def test_a_constant_bias_is_added():
+    env = fmugym.load(task(bias=-7.5))
+    observed, true, _ = episode(env, 0)
+    np.testing.assert_allclose(observed, true - 7.5, rtol=1e-5)
+    env.close()
+
+
+BIASES = {
+    "uniform": ({"distribution": "uniform", "low": -4, "high": 8}, 2.0, 12 / np.sqrt(12)),
+    "normal": ({"distribution": "normal", "mean": 1, "std": 3}, 1.0, 3.0),
+}
+
+
+@pytest.mark.parametrize("kind", BIASES)
+def test_a_drawn_bias_is_one_number_in_each_episode(kind):
+    bias, mean, std = BIASES[kind]
+    env, biases = fmugym.load(task(bias=bias)), []
+    for index in range(150):
+        observed, true, _ = episode(env, 1 if index == 0 else None, steps=3)
+        assert np.ptp(observed - true) < 1e-4
+        biases.append(observed[0] - true[0])
+    assert np.mean(biases) == pytest.approx(mean, abs=4 * std / np.sqrt(150))
+    assert np.std(biases) == pytest.approx(std, rel=0.2)
+    env.close()
+
+
+def test_a_drop_out_holds_the_last_value():
+    env = fmugym.load(task(drop_out=0.25))
+    held = []
+    for index in range(40):
+        observed, true, _ = episode(env, 1 if index == 0 else None)
+        assert observed[0] == np.float32(true[0])
+        for step in range(1, 21):
+            fresh = np.float32(true[step])
+            held.append(observed[step] != fresh)
+            assert observed[step] == (observed[step - 1] if held[-1] else fresh)
+    assert np.mean(held) == pytest.approx(0.25, abs=0.06)
+    env.close()
+
+
+def test_a_drop_out_gives_what_the_task_says():
+    env = fmugym.load(task(drop_out={"probability": 0.5, "value": -99}, delay="0.1s"))
+    observed, true, _ = episode(env, 3)
+    late = np.float32([true[0], true[0], *true[:-2]])
+    is_lost = observed == -99
+    assert 4 < is_lost.sum() < 17
+    np.testing.assert_array_equal(observed[~is_lost], late[~is_lost])
+    env.close()
+
+
+def test_a_sensor_may_follow_slowly():
+    env = fmugym.load(task(rate=40))
+    observed, true, _ = episode(env, 0)
+    expected = [true[0]]
+    for value in true[1:]:
+        expected.append(np.clip(value, expected[-1] - 2, expected[-1] + 2))
+    np.testing.assert_allclose(observed, expected, rtol=1e-6)
+    env.close()
+
+
+ALL_RANDOM = {
+    "noise": 1.0,
+    "drop_out": 0.2,
+    "bias": {"distribution": "uniform", "low": 0, "high": 1},
+}
+
+
+def test_nothing_random_in_devices_changes_a_draw():
+    noisy_task = task(**ALL_RANDOM)
+    noisy_task["variables"]["tau"] = {"noise": 0.001, "drop_out": 0.1}
+    noisy, calm = fmugym.load(noisy_task), fmugym.load(task())
+    for seed in (5, None, None):
+        drawn = noisy.reset(seed=seed)[1]["drawn"]
+        drawn.pop("noise key")
+        assert drawn == calm.reset(seed=seed)[1]["drawn"]
+    noisy.close()
+    calm.close()
+
+
+def torques(steps=12, seed=1, agent=None, **actuator):
+    """The actions that were chosen, and the torques that reached the FMU, in N.mm."""
+    declared = task()
+    unit = {"name": "tau", "unit": "N.mm", "min": -20, "max": 20}
+    declared["variables"] |= {"torque": unit | actuator}
+    declared["agent"] = declared["agent"] | {"actions": ["torque"]} | (agent or {})
+    env = fmugym.load(declared | {"episode_length": "100s"})
+    env.reset(seed=seed)
+    chosen = np.random.default_rng(0).uniform(-20, 20, steps).astype(np.float32)
+    reached = []
+    for action in chosen:
+        env.step([action])
+        reached.append(env.inputs[0] * 1000)
+    env.close()
+    return chosen.astype(float), np.array(reached)
+
+
+class TestActuators:
+    def test_are_late(self):
+        chosen, reached = torques(delay="0.15s")
+        np.testing.assert_allclose(reached, [0, 0, 0, *chosen[:-3]])
+
+    def test_have_a_bias_limits_and_steps(self):
+        chosen, reached = torques(bias=3, saturation=[-8, 12], quantum=0.5)
+        expected = 0.5 * np.round(np.clip(chosen + 3, -8, 12) / 0.5)
+        np.testing.assert_allclose(reached, expected, atol=1e-9)
+
+    def test_are_noisy(self):
+        chosen, reached = torques(steps=400, noise=2.0)
+        noise = reached - chosen
+        assert noise.mean() == pytest.approx(0, abs=0.4)
+        assert noise.std() == pytest.approx(2.0, rel=0.15)
+        assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.2
+
+    def test_drop_out(self):
+        chosen, reached = torques(steps=200, drop_out=0.3)
+        before = [0, *reached[:-1]]
+        is_lost = np.abs(reached - chosen) > 1e-9
+        assert is_lost.mean() == pytest.approx(0.3, abs=0.1)
+        np.testing.assert_allclose(reached[is_lost], np.array(before)[is_lost], rtol=1e-9)
+
+    def test_have_a_rate_after_all_else(self):
+        chosen, reached = torques(rate=40, delay="0.05s")
+        expected = [0.0]
+        for value in [0.0, *chosen[:-1]]:
+            expected.append(np.clip(value, expected[-1] - 2, expected[-1] + 2))
+        np.testing.assert_allclose(reached, expected[1:], atol=1e-9)
+
+    def test_changes_come_late(self):
+        chosen, reached = torques(delta=5, delay="0.1s", steps=8)
+        expected = [0.0, 0.0]
+        for change in chosen[:-2]:
+            expected.append(np.clip(expected[-1] + change, -20, 20))
+        np.testing.assert_allclose(reached, expected, atol=1e-9)
+
+    def test_are_for_inputs_of_actions(self):
+        variables = {"tau": {"noise": 1}, "angle": {"name": "q"}, "gain": {"min": 0, "max": 1}}
+        agent = {"actions": ["gain"], "observations": ["angle"]}
+        wrong = task() | {"variables": variables, "agent": agent, "inputs": {"tau": "0 * gain"}}
+        with pytest.raises(TaskError, match=r"^variables\.tau: .*'tau'"):
+            fmugym.load(wrong)
+
+
+ACTUATORS = {
+    "": {},
+    "late": {"delay": "0.15s", "bias": 0.001, "noise": 0.001},
+    "lost": {"drop_out": 0.3, "quantum": 0.0005, "saturation": [-0.005, 0.005]},
+    "slow": {"rate": 0.02, "bias": {"distribution": "uniform", "low": -1, "high": 1}},
+    "changes": {"delta": 0.002, "delay": "0.1s"},
+}
+
+
+@pytest.mark.parametrize("more", [{"quantum": 0.5}, {"drop_out": 0.4}, {"rate": 30}])
+def test_a_history_holds_what_was_measured(more):
     history = {"of": "angle", "length": "0.1s"}
-    env = fmugym.load(task(noise=2.0, delay="0.1s", quantum=0.5, history=history))
+    env = fmugym.load(task(noise=2.0, delay="0.1s", history=history, **more))
     seen = [env.reset(seed=3)[0]]
     seen += [env.step([0.01])[0] for _ in range(10)]
     for now, before, earlier in zip(seen[2:], seen[1:], seen, strict=False):
@@ -99,16 +260,30 @@ def test_a_history_holds_what_was_measured():
 SENSORS = {
     "noise": {"noise": 2.0},
     "all": {"noise": 2.0, "quantum": 0.1, "delay": "0.1s"},
+    "drop-outs": {"drop_out": 0.4, "noise": 2.0, "delay": "0.1s"},
+    "rate": {"rate": 40, "bias": {"distribution": "normal", "mean": 1, "std": 3}},
+    "limits": {
+        "saturation": [-30, 30],
+        "drop_out": {"probability": 0.3, "value": -99},
+        "bias": {"distribution": "uniform", "low": -5, "high": 5},
+    },
 }
 
 
+COMBINATIONS = [(sensors, "") for sensors in SENSORS]
+COMBINATIONS += [("noise", actuators) for actuators in ACTUATORS if actuators]
+COMBINATIONS += [("drop-outs", "late"), ("rate", "lost")]
+
+
 @pytest.mark.parametrize("parameters", [DRAWN, {}], ids=["drawn", "constant"])
-@pytest.mark.parametrize("sensors", SENSORS)
+@pytest.mark.parametrize(("sensors", "actuators"), COMBINATIONS)
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_many_environments_equal_single_ones(parameters, sensors, hooks, mode):
+def test_many_environments_equal_single_ones(parameters, sensors, actuators, hooks, mode):
     history = {"of": ["angle", "tau"], "length": "0.1s"}
-    make = partial(fmugym.load, task(parameters, history, **SENSORS[sensors]))
+    declared = task(parameters, history, **SENSORS[sensors])
+    declared["variables"]["tau"] = {"min": -0.01, "max": 0.01} | ACTUATORS[actuators]
+    make = partial(fmugym.load, declared)
     envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
     if hooks == "compiled":
         assert envs._engine._task.left == {}
@@ -142,7 +317,15 @@ def test_many_environments_equal_single_ones(parameters, sensors, hooks, mode):
     [
         ({"angle": {"name": "q", "delay": "0.07s"}}, r"0\.07 s.*0\.05"),
         ({"angle": {"name": "q", "noise": 0}}, "positive"),
-        ({"angle": {"name": "q"}, "tau": {"noise": 1}}, "read from the FMU"),
+        ({"angle": {"name": "q"}, "tau": {"sample": "mean"}}, "read from the FMU"),
+        ({"angle": {"name": "q", "drop_out": 1.5}}, r"1\.5"),
+        ({"angle": {"name": "q", "drop_out": {"probability": 0.1, "value": "nan"}}}, "nan"),
+        ({"angle": {"name": "q", "drop_out": {"probabilty": 0.1}}}, "'probability'"),
+        ({"angle": {"name": "q", "saturation": [3, 1]}}, r"\[3, 1\]"),
+        ({"angle": {"name": "q", "saturation": 3}}, "list"),
+        ({"angle": {"name": "q", "rate": -1}}, "positive"),
+        ({"angle": {"name": "q", "bias": {"distribution": "choice", "values": [1]}}}, "uniform"),
+        ({"angle": {"name": "q"}, "tau": {"delay": "0.07s"}}, r"0\.07 s.*0\.05"),
         ({"angle": {"name": "q"}, "theta": {"noise": 1}}, "'theta' is not in its observations"),
     ],
 )

@@ -23,6 +23,14 @@ TASKS = {
     "seasons": test_declared_seasons.TASK | {"clock": {"from": "10-01", "to": "04-15"}},
     "random steps": test_declared_sensors.RANDOM,
     "sensors": test_declared_sensors.task(noise=2.0, quantum=0.1, delay="0.1s"),
+    "drop-outs": test_declared_sensors.task(drop_out=0.4, rate=40, bias=1.0, delay="0.1s"),
+    "actuators": test_declared_sensors.task()
+    | {
+        "variables": {
+            "angle": {"name": "q"},
+            "tau": {"noise": 0.001, "drop_out": 0.3, "delay": "0.1s", "rate": 0.1},
+        }
+    },
     "cart-pole": str(test_declared.EXAMPLES / "cart_pole.toml"),
     "pendulum": str(test_declared.EXAMPLES / "pendulum.toml"),
 }

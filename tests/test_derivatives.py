@@ -13,28 +13,33 @@ M, L, B, G, DT = 0.06, 0.1, 1e-3, 9.81, 0.02
 HORIZON = 12
 
 
-class Precise(fmugym.FMI2CSEnv):
+class Precise(fmugym.FMUEnv):
     """The point mass by explicit Euler, one internal step for each step, seen as float64."""
+
+    version = "2.0"
+    parameters = {  # noqa: RUF012
+        "m": M,
+        "l": L,
+        "b": B,
+        "g": G,
+        "body": 1,
+        "solver": 1,
+        "max_step": 1.0,
+        "q_0": 0.4,
+        "q_dot_0": 0.0,
+    }
 
     def __init__(self, **changes):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
-            "model_parameters": {
-                "m": M,
-                "l": L,
-                "b": B,
-                "g": G,
-                "body": 1,
-                "solver": 1,
-                "max_step": 1.0,
-                "q_0": 0.4,
-                "q_dot_0": 0.0,
-            },
+            "model_parameters": self.parameters,
             "bounds": {"tau": (-0.02, 0.02)},
             "time_step": DT,
         }
-        super().__init__(fmugym.bundled_fmu("Pendulum"), config | changes)
+        isolation = changes.pop("isolation", None)
+        fmu = fmugym.bundled_fmu("Pendulum", self.version)
+        super().__init__(fmu, config | changes, isolation=isolation)
 
     def _get_observation_space(self):
         return gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)

@@ -39,6 +39,8 @@ def test_a_folder(tmp_path, version):
     )
     *rows, shares = done.stdout.splitlines()
     lines = dict(row.split(" | ", 1) for row in rows)
-    assert lines["Pendulum.fmu"] == "fmpy: steps | single: same | vector: same | isolated: same"
+    assert lines["Pendulum.fmu"] == (
+        "fmpy: steps | single: same | vector: same | threads: same | isolated: same"
+    )
     assert lines["broken.fmu"].startswith("fmpy: exit status 1: ")
     assert shares == "FMPy steps 1; right in all settings: 1"

@@ -20,7 +20,8 @@ STOREYS = [
     {"task"},
     {"env"},
     {"vector", "lab", "identification", "linearization"},
-    {"registration", "recording", "single", "testing", "sb3", "declared", "baselines"},
+    {"baselines"},
+    {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
     {"envs", "tools"},
     {"__init__", "__main__", "clock"},
 ]

@@ -336,12 +336,24 @@ class TestInitializations:
         assert trial.is_frugal
         assert trial.grade("restore") == "bitwise"
 
-    def test_each_environment_counts_its_own_instances(self, folder, seats):
-        """As docs/foreign-fmus.md says."""
+    def test_trials_keep_to_the_limit_as_well(self, folder, seats):
+        """The other environment needs a trial of its own; no more than one instance exists."""
         seats.limit(2)
         path = make_fmu(folder, "licensed")
-        envs = [DemandingEnv(path, max_instances=1) for _ in range(2)]
-        assert [play(env) for env in envs] == [EXPECTED] * 2
-        assert seats.taken == 2
-        for env in envs:
-            env.close()
+        env = DemandingEnv(path, max_instances=1)
+        with pytest.raises(LicenceError, match=r"for a trial.*1 by this process for an env"):
+            DemandingEnv(path, max_instances=1, time_step=0.1)
+        assert play(env) == EXPECTED
+        env.close()
+        DemandingEnv(path, max_instances=1, time_step=0.1).close()
+        assert seats.most == 1
+
+    def test_without_a_trial_two_instances_are_compared_within_the_limit(self, folder, seats):
+        seats.limit(3)
+        make = functools.partial(
+            DemandingEnv, make_fmu(folder, "licensed"), max_instances=2, probe_timeout=None
+        )
+        env = make()
+        with pytest.raises(LicenceError, match=r"needs 2 more instance.* for a trial"):
+            fmugym.FMUVectorEnv(make, 2)
+        env.close()

@@ -17,6 +17,7 @@ from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.health import no_counts
+from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
@@ -169,7 +170,7 @@ class TestPrograms:
             ("store_row", 0, 0, 1),
             ("store_seen", 0, 0, 1),
             ("call", 0, 1),
-            ("cast", 121, 1),
+            ("cast", 144, 1),
             ("take", 0, 1),
             ("interpolate", 0, 1),
             ("add d", 1, 1),
@@ -223,7 +224,29 @@ class TestPrograms:
 
     def test_loops_that_are_none(self, cart_poles):
         with pytest.raises(ValueError, match="PyCapsule"):
-            prepare(cart_poles, program(ACTION, calls=((object(), 1, (8, 8, 0, 0)),)))
+            prepare(cart_poles, program(ACTION, calls=((object(), 1, (8, 8), 1),)))
+
+    @pytest.mark.parametrize(
+        ("inputs", "sizes", "kept"),
+        [
+            (1, (8, 8), 0),
+            (1, (8, 8), 2),
+            (0, (8, 8), 1),
+            (4, (8, 8, 8, 8), 3),
+            (1, (8,) * 5, 4),
+            (1, (16, 8), 1),
+            (1, (-8, 8), 1),
+        ],
+    )
+    def test_loops_with_other_values(self, cart_poles, inputs, sizes, kept):
+        loop = loop_of(np.sin, (np.dtype(np.float64),) * 2)
+        with pytest.raises(ValueError, match="a loop cannot be called"):
+            prepare(cart_poles, program(ACTION, calls=((loop, inputs, sizes, kept),)))
+
+    def test_sizes_that_are_no_numbers(self, cart_poles):
+        loop = loop_of(np.sin, (np.dtype(np.float64),) * 2)
+        with pytest.raises(TypeError):
+            prepare(cart_poles, program(ACTION, calls=((loop, 1, ("x", 8), 1),)))
 
     @pytest.mark.parametrize(
         "actions",

@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from versions import versions
 
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 
@@ -20,27 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(
     ".*", "__pycache__", "*.egg-info", "*.py[cod]", "build", "dist", "results"
 )
+STEP_EVERY_ENV = ROOT / "tests" / "step_every_env.py"
 HAS_BUILD_BACKEND = int(version("setuptools").split(".")[0]) >= 77
-
-STEP_EVERY_ENV = """
-import json
-
-import gymnasium
-
-import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
-
-steps = []
-own = {name for name in gymnasium.registry if name.startswith("fmugym/")}
-for env_id in sorted(own - {"fmugym/FMU-v0"}):  # which needs a task
-    for fmi_version in FMI_VERSIONS[env_id == "fmugym/House-v0" :]:  # not for FMI 1.0
-        env = gymnasium.make(env_id, fmi_version=fmi_version)
-        env.reset(seed=0)
-        observation, *_ = env.step(env.action_space.sample())
-        steps.append([env_id, fmi_version, env.observation_space.contains(observation)])
-        env.close()
-print(json.dumps({"file": fmugym.__file__, "steps": steps}))
-"""
 
 
 def run(*command, **options):
@@ -118,7 +100,7 @@ def editable_python(tree, tmp_path_factory):
 
 def step_every_env(python, folder):
     """Step every registered id in an isolated interpreter that starts in another directory."""
-    stdout, _ = run(python, "-I", "-c", STEP_EVERY_ENV, cwd=folder)
+    stdout, _ = run(python, "-I", STEP_EVERY_ENV, cwd=folder)
     report = json.loads(stdout.splitlines()[-1])
     return Path(report["file"]).resolve(), report["steps"]
 
@@ -188,3 +170,9 @@ def test_every_package_folder_is_listed_in_pyproject():
     folders = {Path(name).parent for name in sources("fmugym") if name.endswith(".py")}
     packages = {".".join(folder.parts) for folder in folders}
     assert packages == set(setuptools["packages"]) - elsewhere
+
+
+def test_the_places_that_give_the_version_agree():
+    assert len(set(versions().values())) == 1
+    assert versions("v9.9")["the tag"] == "9.9"
+    assert versions("v9.9")["CHANGELOG.md"] == "Unreleased"

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 
 import model_tools
 import numpy as np
@@ -33,6 +34,7 @@ def often(monkeypatch, tmp_path):
     """Rehearse after a few episodes, and let the trial cache what it finds."""
     monkeypatch.setattr(tape, "_FIRST_RESETS", 16)
     monkeypatch.setattr(tape, "_FIRST_STEPS", 32)
+    monkeypatch.setattr(tape, "_SHARE", float("inf"))
     monkeypatch.delenv("FMUGYM_PROBE", raising=False)
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
 
@@ -200,23 +202,123 @@ class TestWhoRehearses:
         env.close()
 
 
-def test_how_often(monkeypatch):
-    """The bound on the cost: starts and steps of all rehearsals so far, per thousand."""
+class CountedPool:
+    """Stands in for a pool: its steps and resets take a fixed time, and each episode 100 steps."""
+
+    num_instances = 8
+
+    def __init__(self, step, reset=0.0):
+        self.step, self.reset = step, reset
+        self.steps = self.due_resets = self.due_steps = 0
+        self.asked = 0
+
+    def record(self, resets, steps):
+        self.due_resets, self.due_steps = resets, steps
+
+    def begin_by(self, method):
+        raise AssertionError("every method is right here")
+
+    def effort(self):
+        self.asked += 1
+        resets = self.steps // 100
+        return tape.Effort(
+            total=8 * (self.steps * self.step + resets * self.reset),
+            episode=self.reset + tape.TAPE_ROWS * self.step,
+            steps=self.steps,
+        )
+
+    def go_on(self):
+        """Until a recording is done."""
+        self.steps = 100 * max(self.steps // 100 + self.due_resets, -(-self.due_steps // 100))
+
+
+@pytest.mark.parametrize("start", [0.015, 0.45])
+@pytest.mark.parametrize(
+    ("step", "reset"), [(5e-8, 1e-7), (1e-6, 0.0), (1e-5, 1e-3), (1e-2, 0.5), (1e-6, 200.0)]
+)
+def test_rehearsals_take_less_than_a_hundredth(monkeypatch, step, reset, start):
+    """From the first one on, and however long the FMU's steps and resets take."""
     monkeypatch.undo()
+    pool, now, cost = CountedPool(step, reset), [0.0], [start]
+    taken = []
 
-    class Pool:
-        num_instances = 8
+    def judge(recording, begin_by):
+        taken.append(cost[0] + 2 * (reset + tape.TAPE_ROWS * step))
+        cost[0] = 0.015
+        now[0] += taken[-1]
+        assert sum(taken) <= 0.01 * 8 * (pool.steps * step + pool.steps // 100 * reset)
+        return True
 
-    pool = Pool()
-    rehearsals = Rehearsals(pool, lambda *_: True)
-    resets = 0
-    for count in range(1, 12):
-        more, steps = rehearsals.next()
-        resets += 8 * more
-        assert count <= 1e-3 * resets
+    rehearsals = Rehearsals(pool, judge, clock=lambda: now[0])
+    pool.record(*rehearsals.next())
+    while len(taken) < 8:
+        pool.go_on()
+        rehearsals.receive(None)
+    assert rehearsals.count == len(taken)
+    assert pool.asked < 50  # rehearsals that are put off cost nothing either
+
+
+def test_how_often_at_most(monkeypatch):
+    """Even if steps take long, there are so many between two rehearsals."""
+    monkeypatch.undo()
+    pool = CountedPool(1e-3, 0.5)
+    seen = []
+    rehearsals = Rehearsals(pool, lambda *_: not seen.append(pool.steps), clock=lambda: 0.0)
+    pool.record(*rehearsals.next())
+    while len(seen) < 10:
+        pool.go_on()
+        rehearsals.receive(None)
+    for count, steps in enumerate(seen, 1):
+        assert count <= 1e-3 * 8 * steps / 100
         assert count * 2 * tape.TAPE_ROWS <= 1e-3 * 8 * steps
-        rehearsals.count += 1
-    assert 8 * steps < 11 * 2**26
+    assert 8 * seen[-1] < 11 * 2**26
+
+
+@all_ways
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_a_rehearsal_is_put_off_until_it_is_earned(make_fmu, way, num_envs, monkeypatch):
+    """The pool never claims more time than has passed, and rehearses as soon as this suffices."""
+    path = make_fmu("fine")
+    options = dict(WAYS[way])
+    isolation = options.pop("isolation", None)
+    monkeypatch.setattr(tape, "_SHARE", 1e-12)
+    begin = time.perf_counter()
+    envs = fmugym.FMUVectorEnv(
+        lambda: TiringEnv(path, max_episode_steps=3, **options),
+        num_envs,
+        threads=1,
+        isolation=isolation,
+    )
+    play_all(envs, 200)
+    assert not envs.health["rehearsals"].any()
+    effort = envs._pool.effort()
+    assert 0.0 < effort.total < 2 * (time.perf_counter() - begin)
+    assert effort.episode > 0.0
+    assert effort.steps == envs.health["steps"][0]
+    monkeypatch.setattr(tape, "_SHARE", float("inf"))
+    play_all(envs, 8 * int(effort.steps))
+    assert envs.health["rehearsals"].all()
+    envs.close()
+
+
+def play_all(envs, steps):
+    envs.reset(seed=0)
+    for _ in range(steps):
+        envs.step(np.ones((envs.num_envs, 1), np.float32))
+
+
+def test_a_spare_waits_for_a_seat(make_fmu, caplog):
+    """Another environment has the last seat. Once it is free, rehearsals go on."""
+    path = make_fmu("fine")
+    env = TiringEnv(path, max_instances=2, **WAYS["native"])
+    other = TiringEnv(path, max_instances=2, **WAYS["native"])
+    play(env, 40)
+    assert "no spare instance for now: Tires.fmu needs 1 more instance(s) for a reh" in caplog.text
+    assert "repeats" not in caplog.text
+    other.close()
+    play(env, 100)
+    assert "a fresh instance repeats 3 steps" in caplog.text
+    env.close()
 
 
 def test_a_spare_that_crashes(make_fmu, caplog):

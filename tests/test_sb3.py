@@ -361,7 +361,7 @@ def test_pictures(make):
 
 
 def test_only_vector_environments_of_fmugym_in_the_right_mode_are_taken():
-    with pytest.raises(ConfigError, match="make_vec_env"):
+    with pytest.raises(ConfigError, match="CartPole-v1"):
         make_sb3_env("CartPole-v1")
     with pytest.raises(ConfigError, match="got SyncVectorEnv"):
         FMUVecEnv(gym.make_vec("fmugym/CartPole-v0", 2, vectorization_mode="sync"))

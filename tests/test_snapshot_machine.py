@@ -33,13 +33,17 @@ class Machine(RuleBasedStateMachine):
 
     options: dict = {}  # noqa: RUF012  (of subclasses)
     version = "2.0"
+    make = Track
 
     @initialize(seed=st.integers(0, 5))
     def start(self, seed):
         self.envs = fmugym.FMUVectorEnv(
-            lambda: Track(fmi_version=self.version), N, autoreset_mode="Disabled", **self.options
+            lambda: self.make(fmi_version=self.version),
+            N,
+            autoreset_mode="Disabled",
+            **self.options,
         )
-        self.single = Track(fmi_version=self.version)
+        self.single = self.make(fmi_version=self.version)
         self.histories = [[] for _ in range(N)]
         self.results = [[] for _ in range(N)]
         self.saved = []

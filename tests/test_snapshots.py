@@ -1,6 +1,7 @@
 """Snapshots: episodes that go on from one are equal to the original, bit by bit."""
 
 import copy
+import hashlib
 import pickle
 import subprocess
 import sys
@@ -30,7 +31,7 @@ ACTIONS = np.random.default_rng(5).uniform(-1, 1, (60, 1)).astype(np.float32)
 class Track(fmugym.FMI2CSEnv):
     """Follow a target that moves; an integral, a history, drawn values and short episodes."""
 
-    def __init__(self, fmi_version="2.0", backend=None, hooks="auto", **changes):
+    def __init__(self, fmi_version="2.0", backend=None, hooks="auto", isolation=None, **changes):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
@@ -46,7 +47,8 @@ class Track(fmugym.FMI2CSEnv):
             "max_episode_steps": 12,
         }
         fmu = fmugym.bundled_fmu("Pendulum", fmi_version)
-        super().__init__(fmu, config | changes, backend=backend, hooks=hooks)
+        options = {"backend": backend, "hooks": hooks, "isolation": isolation}
+        super().__init__(fmu, config | changes, **options)
 
     fmi_version = None
 
@@ -395,6 +397,27 @@ class TestRefusals:
                 other.restore_state(snapshot)
         with Track(on_fault="raise", leak_limit=None) as other:  # no state depends on these
             other.restore_state(snapshot)
+
+    def test_say_what_differs_and_no_more(self, halfway):
+        env = halfway()
+        snapshot = env.save_state()
+        with Track(fmi_version="3.0") as other, pytest.raises(ConfigError) as refusal:
+            other.restore_state(snapshot)
+        said = str(refusal.value)
+        assert "Pendulum of FMI 2.0" in said
+        assert "Pendulum of FMI 3.0" in said
+        for path in (env.fmu.path, fmugym.bundled_fmu("Pendulum", "3.0")):
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            assert content[:8] in said
+            assert content[:12] not in said
+        with Track(model_parameters={"m": 0.1, "q_0": fmugym.Normal(0, 0.3)}) as other:
+            with pytest.raises(ConfigError, match=r"'m': 0\.1") as refusal:
+                other.restore_state(snapshot)
+            assert "q_0" not in str(refusal.value)
+        with Track(model_parameters={"m": fmugym.Uniform(0.05, 0.07)}) as other:
+            with pytest.raises(ConfigError, match="q_0") as refusal:
+                other.restore_state(snapshot)
+            assert "'m'" not in str(refusal.value)
 
     def test_of_what_is_no_snapshot_or_of_several(self, halfway):
         env = halfway()

@@ -38,7 +38,7 @@ class Branching(Drawing):
 
     def _reward_policy(self):
         q, q_dot = self.state
-        ranks = np.sort(np.stack([q, q_dot]), axis=0)
+        ranks = np.partition(np.stack([q, q_dot]), 0, axis=0)
         return -ranks[0] + float(len(self.state)) // 2
 
 
@@ -108,10 +108,9 @@ def test_compiled_arithmetic_is_that_of_numbers(cls, mode, backend, hooks):
 
 
 NOT_COMPILED = {
-    "it uses numpy.sort": lambda env: np.sort(env.state, axis=0)[0],
+    "it uses numpy.partition": lambda env: np.partition(env.state, 0, axis=0)[0],
     "it multiplies large matrices": lambda env: np.sum(np.ones((600, 2)) @ env.state, axis=0),
-    "which has two results": lambda env: np.frexp(env.state[0])[0],
-    "it computes with float16": lambda env: env.state[0] * np.float16(0.5),
+    "it computes with complex128": lambda env: np.abs(np.exp(1j * env.state[0])),
     "it uses numpy.linalg.norm without one axis": lambda env: np.linalg.norm(env.state),
 }
 
@@ -137,7 +136,7 @@ def test_why_hooks_are_not_compiled_stands_in_the_log(caplog):
     (record,) = (r for r in caplog.records if "cannot be compiled" in r.getMessage())
     assert record.levelname == "INFO"
     assert "_reward_policy, line" in record.getMessage()
-    assert "numpy.sort" in record.getMessage()
+    assert "numpy.partition" in record.getMessage()
 
 
 CHANGES = {

@@ -111,6 +111,12 @@ UNARY = (
     *("np.clip({}, -0.5, 0.5)", "np.interp({}, [-1.0, 0.0, 2.0], [3.0, -1.0, 1.0])", "+({})"),
     *("np.sum([1.0 * ({}), self.state[1]], axis=0)", "np.round(1.0 * ({}), 2)"),
     *("np.linalg.norm(np.array([1.0 * ({}), self.state[0]]), axis=0)", "np.deg2rad({})"),
+    *("np.frexp({})[0]", "np.frexp({})[1]", "np.ldexp({}, 2)", "np.modf({})[1]", "np.float16({})"),
+    *(
+        "np.median([1.0 * ({}), self.state[1], self.state[0]], axis=0)",
+        "np.nansum(np.array([1.0 * ({}), self.state[1]]), axis=0)",
+        "np.quantile(np.array([1.0 * ({}), self.state[1], 0.5 * self.state[0]]), 0.3, axis=0)",
+    ),
 )
 BINARY = (
     *("({}) + ({})", "({}) - ({})", "({}) * ({})", "({}) / ({})", "({}) % ({})", "({}) // ({})"),
@@ -162,7 +168,7 @@ def task_of(reward, observed, variable):
     return Generated
 
 
-NOT_TRACED = ("float16", "self.done before there is one", "power that is not a constant")
+NOT_TRACED = ("self.done before there is one", "power that is not a constant")
 """The only reasons that generated expressions may have. They are documented."""
 
 
@@ -219,6 +225,7 @@ def test_no_warnings_of_numpy_come_from_compiled_code():
 
 SPACES = {
     "float64": gym.spaces.Box(-1.0, 1.0, (2, 3), np.float64),
+    "float16": gym.spaces.Box(-1.0, 1.0, (2,), np.float16),
     "int32": gym.spaces.Box(-5, 5, (2,), np.int32),
     "uint8": gym.spaces.Box(0, 255, (2,), np.uint8),
     "discrete": gym.spaces.Discrete(4, start=-1),
@@ -267,12 +274,15 @@ def test_minus_zero_is_zero_for_integers():
     envs.close()
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("bad", [np.nan, "x"])
-def test_bad_actions_are_refused(bad):
-    envs = FMUVectorEnv(Task, 3, hooks="compiled")
+def test_bad_actions_are_refused(bad, dtype):
+    cls = type("Acting", (Task,), {"space": gym.spaces.Box(-1.0, 1.0, (2,), dtype)})
+    envs = FMUVectorEnv(cls, 3, hooks="compiled")
     envs.reset(seed=0)
     for actions in ([[0.0, bad]] * 3, np.zeros((3, 3)), np.zeros(3)):
+        given = np.array(actions)
         with pytest.raises(ConfigError, match="action"):
-            envs.step(np.array(actions))
+            envs.step(given if bad == "x" else given.astype(dtype))
     envs.step(np.zeros((3, 2)))  # a float64 is converted, as on arrays
     envs.close()

@@ -311,7 +311,6 @@ def test_a_table_is_the_array_that_it_stands_for():
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        ("np.frexp(self.state[0])[0]", "two results"),
         ("np.sqrt(self.state[0], where=self.state[0] > 0)", "without out"),
         ("np.sum(self.state[0][self.state[0] > 0])", "use numpy.where"),
         ("self.state[0][self.state[0] > 0] + self.state[1]", "with whole arrays"),

@@ -8,9 +8,12 @@ in the default run: of a test with many combinations of parameters, it takes eve
 SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
+    "test_cli_docs",
+    "test_copies",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
+    "test_examples_planners",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
@@ -45,6 +48,8 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_copies": 2,
+    "test_examples_planners": 4,
     "test_quirks": 4,
     "test_words": 5,
     "test_zoo": 5,
@@ -59,6 +64,9 @@ SLOW_TESTS = (
     "test_baselines_tuning.py::test_it_finds",
     "test_baselines_tuning.py::test_the_same",
     "test_cli.py::TestSkeleton::test_runs_for",
+    "test_cli_playing.py::TestBench::test_a_table",
+    "test_cli_playing.py::TestRecord::test_a_report",
+    "test_cli_playing.py::TestRecord::test_several",
     "test_cloud_pendulum.py::TestExits",
     "test_crashes.py::test_a_",
     "test_crashes.py::test_faulthandler",
@@ -91,12 +99,17 @@ SLOW_TESTS = (
     "test_lab_recording.py::test_temporary_videos",
     "test_lab_sessions.py::TestNothingLeaks",
     "test_licences.py::TestInitializations::test_of_a_vector_environment",
+    "test_licences.py::TestInitializations::test_trials_keep",
+    "test_licences.py::TestInitializations::test_without_a_trial",
     "test_licences.py::TestPace::test_of_several",
     "test_licences.py::TestRefusal::test_in_a_later_reset",
     "test_licences.py::TestSeats::test_the_trial_says",
     "test_licences.py::TestWaiting::test_ends_when_another",
     "test_licences.py::TestWaiting::test_in_a_reset",
     "test_lifecycle.py::TestManyLives",
+    "test_model_exchange.py::TestEnvironments::test_a_solver",
+    "test_model_exchange.py::TestPools",
+    "test_model_exchange.py::TestSolvers::test_the_stiff",
     "test_native_guards.py::test_want_of_memory",
     "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
@@ -107,11 +120,21 @@ SLOW_TESTS = (
     "test_process_pool.py::TestEndOfParent",
     "test_quirks.py::TestVerdict::test_a_damaged_cache",
     "test_rehearsals.py::test_a_spare",
+    "test_rehearsals.py::test_a_rehearsal_is_put_off",
     "test_rehearsals.py::test_a_step_that_fails",
     "test_rehearsals.py::test_a_vector_environment",
     "test_rehearsals.py::test_what_a_pool_cannot",
     "test_resources.py::test_linux_libraries",
     "test_rollouts.py::TestValues::test_of_many_candidates",
+    "test_seats.py::TestSeats::test_are_waited",
+    "test_seats.py::TestSeats::test_of_a_process",
+    "test_seats.py::TestSeats::test_of_a_vector",
+    "test_seats.py::TestSeats::test_waiting_ends",
+    "test_seats.py::test_pace_of_two",
+    "test_series.py::TestFiles::test_memory",
+    "test_series.py::TestPictures::test_files",
+    "test_series.py::TestPictures::test_long",
+    "test_series.py::TestReport::test_it_is_one",
     "test_single_compiled.py::TestWays::test_worker_processes",
     "test_single_compiled.py::test_generated_expressions",
     "test_slow_models.py::TestProgress::test_is_not",
@@ -134,6 +157,9 @@ SLOW_TESTS = (
 )
 """Others, by the beginning of their node ids."""
 
+EXHAUSTIVE_TESTS = ("test_model_exchange.py::TestEvents::test_time_does_not",)
+"""Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
+
 
 def is_slow(node_id, number):
     """Whether the default run leaves out a test.
@@ -143,7 +169,7 @@ def is_slow(node_id, number):
         number: How many combinations of the same test came before.
     """
     module = node_id.partition(".py")[0]
-    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS):
+    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS + EXHAUSTIVE_TESTS):
         return True
     return number % EVERY.get(module, EVERY_OF_OTHERS) > 0
 
@@ -151,4 +177,6 @@ def is_slow(node_id, number):
 def is_exhaustive(node_id, number):
     """Whether a slow test is left to ``.ci/full``; the arguments are those of ``is_slow``."""
     module = node_id.partition(".py")[0]
+    if node_id.startswith(EXHAUSTIVE_TESTS):
+        return True
     return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0

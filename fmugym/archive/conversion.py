@@ -10,7 +10,14 @@ from typing import Any, Final
 
 from fmpy.validation import validate_model_description
 
-from fmugym.archive.description import Capabilities, ModelDescription, Unit, Variable
+from fmugym.archive.description import (
+    INTERFACES,
+    Capabilities,
+    ModelDescription,
+    ModelExchange,
+    Unit,
+    Variable,
+)
 from fmugym.errors import FMULoadError, reason
 
 __all__ = ["convert"]
@@ -25,30 +32,29 @@ _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
 
-def convert(source: Any, root: Any) -> ModelDescription:
+_ELEMENTS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
+
+
+def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescription:
     """Make a model description.
 
     Args:
         source: What FMPy has read.
         root: The root of the XML.
+        interface: One of ``INTERFACES``; None for the first of them that the FMU offers.
 
     Raises:
-        FMULoadError: If the FMU has no co-simulation interface, or a value that cannot be used.
+        FMULoadError: If the FMU does not have the interface, or has a value that cannot be used.
         Exception: FMPy's objects may lack anything in a malformed file.
     """
-    co_simulation = source.coSimulation
-    if co_simulation is None:
-        raise FMULoadError(
-            f"{source.modelName} has no co-simulation interface; "
-            "export the model for co-simulation (model exchange is not supported)"
-        )
+    interface, offer = _choose(source, interface)
     experiment = source.defaultExperiment
     _read_unsigned_limits(source, root)
     variables = {v.name: _convert_variable(v) for v in source.modelVariables}
     return ModelDescription(
         fmi_version=source.fmiVersion,
         model_name=source.modelName or "",
-        model_identifier=_identifier(source, co_simulation.modelIdentifier),
+        model_identifier=_identifier(source, offer.modelIdentifier),
         instantiation_token=source.guid or "",
         interfaces=_interfaces(source),
         description=source.description or "",
@@ -57,14 +63,56 @@ def convert(source: Any, root: Any) -> ModelDescription:
         stop_time=_time(experiment, "stopTime"),
         tolerance=_time(experiment, "tolerance"),
         step_size=_time(experiment, "stepSize"),
-        fixed_internal_step_size=_time(co_simulation, "fixedInternalStepSize"),
-        capabilities=_capabilities(source, root),
+        fixed_internal_step_size=_time(offer, "fixedInternalStepSize"),
+        capabilities=_capabilities(source, root, interface, offer),
         variables=variables,
         state_derivatives=_state_derivatives(source),
         findings=_findings(source),
         error_categories=_error_categories(root),
         units=_units(root),
+        interface=interface,
+        model_exchange=None if interface == "co_simulation" else _model_exchange(source, root),
     )
+
+
+def _choose(source: Any, interface: str | None) -> tuple[str, Any]:
+    """The interface to use, and FMPy's object for it."""
+    offers = {"co_simulation": source.coSimulation, "model_exchange": source.modelExchange}
+    offered = [name for name in INTERFACES if offers[name] is not None]
+    if interface is None and offered:
+        interface = offered[0]
+    if interface not in offered:
+        wanted = "co-simulation" if interface == "co_simulation" else "model exchange"
+        wanted = wanted if interface else "co-simulation or model exchange"
+        there = ", ".join(_interfaces(source)) or "none"
+        raise FMULoadError(f"{source.modelName} has no interface for {wanted}; it offers: {there}")
+    if interface == "model_exchange" and source.fmiVersion[0] != "2":
+        raise FMULoadError(
+            f"{source.modelName} is for model exchange in FMI {source.fmiVersion}, which fmugym "
+            "runs in FMI 2.0; export it for co-simulation or in FMI 2.0"
+        )
+    return interface, offers[interface]
+
+
+def _model_exchange(source: Any, root: Any) -> ModelExchange:
+    derivatives = [unknown.variable for unknown in source.derivatives]
+    states = [variable.derivative for variable in derivatives]
+    scalar = all(state and not state.shape for state in states)
+    return ModelExchange(
+        source.numberOfContinuousStates,
+        source.numberOfEventIndicators,
+        _needs_completed_step(source, root),
+        tuple(int(state.valueReference) for state in states) if scalar else (),
+        tuple(int(variable.valueReference) for variable in derivatives) if scalar else (),
+    )
+
+
+def _needs_completed_step(source: Any, root: Any) -> bool:
+    """In FMI 3.0 an FMU must ask for it; in the older versions it may do without at most."""
+    element = root.find("ModelExchange")
+    if source.fmiVersion.startswith("3"):
+        return element.get("needsCompletedIntegratorStep") in {"true", "1"}
+    return element is None or element.get("completedIntegratorStepNotNeeded") not in {"true", "1"}
 
 
 def _units(root: Any) -> dict[str, Unit]:
@@ -154,28 +202,27 @@ def _time(source: Any, attribute: str) -> float | None:
     return value if usable else None
 
 
-def _capabilities(source: Any, root: Any) -> Capabilities:
-    interface = source.coSimulation
+def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabilities:
     if source.fmiVersion == "1.0":
-        return _fmi1_capabilities(root)
+        return _fmi1_capabilities(root, interface)
     return Capabilities(
-        interface.canHandleVariableCommunicationStepSize,
-        interface.canGetAndSetFMUstate,
-        interface.canSerializeFMUstate,
-        _provides_directional_derivatives(root),
-        interface.canBeInstantiatedOnlyOncePerProcess,
-        interface.needsExecutionTool,
+        interface == "model_exchange" or offer.canHandleVariableCommunicationStepSize,
+        offer.canGetAndSetFMUstate,
+        offer.canSerializeFMUstate,
+        _provides_directional_derivatives(root, _ELEMENTS[interface]),
+        offer.canBeInstantiatedOnlyOncePerProcess,
+        offer.needsExecutionTool,
     )
 
 
-def _provides_directional_derivatives(root: Any) -> bool:
+def _provides_directional_derivatives(root: Any, element: str) -> bool:
     """Read the flag. FMI 3.0 spells it in the plural, which FMPy does not read."""
-    attributes = root.find("CoSimulation").attrib
+    attributes = root.find(element).attrib
     names = ("providesDirectionalDerivative", "providesDirectionalDerivatives")
     return any(attributes.get(name) in {"true", "1"} for name in names)
 
 
-def _fmi1_capabilities(root: Any) -> Capabilities:
+def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
     """Read the flags of FMI 1.0, which FMPy leaves out. FMI 1.0 has no FMU state."""
     flags = root.find("Implementation/*/Capabilities")
     attributes = {} if flags is None else flags.attrib
@@ -184,7 +231,8 @@ def _fmi1_capabilities(root: Any) -> Capabilities:
         return attributes.get(name) in {"true", "1"}
 
     return Capabilities(
-        can_handle_variable_communication_step_size=flag("canHandleVariableCommunicationStepSize"),
+        can_handle_variable_communication_step_size=interface == "model_exchange"
+        or flag("canHandleVariableCommunicationStepSize"),
         can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
         needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
     )

@@ -15,7 +15,11 @@ import fmpy
 
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["Capabilities", "ModelDescription", "Unit", "Variable"]
+__all__ = ["INTERFACES", "Capabilities", "ModelDescription", "ModelExchange", "Unit", "Variable"]
+
+INTERFACES = ("co_simulation", "model_exchange")
+"""The interfaces by which an FMU may be run, the preferred one first."""
+
 
 _KINDS = {
     "Real": "real",
@@ -110,7 +114,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """The capability flags of a co-simulation FMU, by their FMI 3.0 names in Python's spelling."""
+    """The capability flags of an interface, by their FMI 3.0 names in Python's spelling."""
 
     can_handle_variable_communication_step_size: bool = False
     can_get_and_set_fmu_state: bool = False
@@ -118,6 +122,25 @@ class Capabilities:
     provides_directional_derivatives: bool = False
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
+
+
+@dataclass(frozen=True)
+class ModelExchange:
+    """What a solver needs to know of the equations of an FMU.
+
+    Attributes:
+        number_of_states: Continuous states.
+        number_of_event_indicators: An indicator that changes its sign is an event.
+        needs_completed_integrator_step: Whether the FMU wants to know of each complete step.
+        state_references, derivative_references: The value references of the states and their
+            derivatives in the order of the states; empty if the XML does not tell them.
+    """
+
+    number_of_states: int
+    number_of_event_indicators: int
+    needs_completed_integrator_step: bool
+    state_references: tuple[int, ...] = ()
+    derivative_references: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -144,8 +167,10 @@ class ModelDescription:
     """The part of a model description that an environment needs.
 
     Attributes:
-        model_identifier, capabilities: Those of co-simulation.
+        model_identifier, capabilities: Those of the interface in use.
         interfaces: The interface types that the FMU offers.
+        interface: The one in use, one of ``INTERFACES``.
+        model_exchange: What a solver needs; None in co-simulation.
         start_time, stop_time, step_size, fixed_internal_step_size: In seconds; None where the FMU
             gives no usable value.
         tolerance: Of the default experiment; None where the FMU gives no usable value.
@@ -175,6 +200,8 @@ class ModelDescription:
     findings: tuple[str, ...]
     error_categories: tuple[str, ...] = ()
     units: Mapping[str, Unit] = field(default_factory=dict)
+    interface: str = "co_simulation"
+    model_exchange: ModelExchange | None = None
 
     @cached_property
     def fmi_major_version(self) -> int:

@@ -19,14 +19,14 @@ from typing import Final
 import fmpy
 
 from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import INTERFACES, ModelDescription, Variable
 from fmugym.archive.executable import check_library
 from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
 from fmugym.archive.reading import read_model_description
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
-from fmugym.checks import check_path
+from fmugym.checks import check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 
 __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
@@ -135,6 +135,8 @@ class FMU(LoadableFMU):
             that the system's loader finds.
         probe_timeout: Seconds that a call of an unknown FMU may take in a trial in a process of its
             own; None to do without. See ``fmugym.trial``.
+        interface: ``"co_simulation"`` or ``"model_exchange"``; by default co-simulation where the
+            FMU offers it.
 
     Attributes:
         path: The file's absolute path.
@@ -142,10 +144,11 @@ class FMU(LoadableFMU):
         findings: What breaks rules of the standard in the archive and in the model description,
             as texts.
         limits, preload, probe_timeout: As given; ``preload`` a tuple with absolute paths.
+        interface: As given; ``description.interface`` is the one in use.
 
     Raises:
         ConfigError: If an argument does not fit.
-        FMULoadError: If the file is missing, not a sound FMU archive, or offers no co-simulation.
+        FMULoadError: If the file is missing, not a sound FMU archive, or lacks the interface.
     """
 
     def __init__(
@@ -155,6 +158,7 @@ class FMU(LoadableFMU):
         limits: ArchiveLimits | None = None,
         preload: Sequence[str | os.PathLike[str]] = (),
         probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT,
+        interface: str | None = None,
     ) -> None:
         file = check_path("the path of an FMU", path).absolute()
         self.limits = ArchiveLimits() if limits is None else limits
@@ -162,9 +166,13 @@ class FMU(LoadableFMU):
             raise ConfigError(f"limits must be ArchiveLimits, got {shown(limits)}")
         _check_probe_timeout(probe_timeout)
         self.probe_timeout = probe_timeout
+        if interface is not None:
+            check_option("interface", interface, INTERFACES)
+        self.interface = interface
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
-        super().__init__(file, read_model_description(self._archive, self.limits), libraries)
+        description = read_model_description(self._archive, self.limits, interface)
+        super().__init__(file, description, libraries)
         self._library_place, note = _find_library(list(self._archive.files), self.library)
         self.findings = (*self._archive.notes, *note, *self.description.findings)
         self._folder: Path | None = None
@@ -190,6 +198,7 @@ class FMU(LoadableFMU):
             limits=source.limits,
             preload=source.preload,
             probe_timeout=source.probe_timeout,
+            interface=source.interface,
         )
 
     def variable(self, name: str) -> Variable:

@@ -40,7 +40,9 @@ _ENCODINGS: Final = re.compile(r"utf-?8|(us-)?ascii|iso-?8859-\d+|(windows-|cp)1
 """Encodings in which neither ``<`` nor ``=`` can hide. FMI 2.0 and 3.0 ask for UTF-8."""
 
 
-def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDescription:
+def read_model_description(
+    archive: SafeZip, limits: ArchiveLimits, interface: str | None = None
+) -> ModelDescription:
     """Read the model description of an FMU. Nothing of the FMU is executed or extracted.
 
     FMUs may break rules of the standard, as many do: what FMPy's validation finds is kept in
@@ -49,13 +51,13 @@ def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDesc
     Args:
         archive: The FMU.
         limits: What is too large to be read.
+        interface: One of ``INTERFACES``; None for co-simulation, or else model exchange.
 
     Returns:
         The model description.
 
     Raises:
-        FMULoadError: If the XML is missing, too large, unreadable or not that of a co-simulation
-            FMU.
+        FMULoadError: If the XML is missing, too large or unreadable, or lacks the interface.
     """
     name = archive.path.name
     content = _read_xml(archive, limits.max_xml_bytes)
@@ -64,7 +66,7 @@ def read_model_description(archive: SafeZip, limits: ArchiveLimits) -> ModelDesc
     root = _parse(name, content)
     _check_root(name, root, limits.max_variables)
     try:
-        return convert(_parse_with_fmpy(content), root)
+        return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
         raise FMULoadError(f"{name}: {error}") from None
     except Exception as error:  # FMPy leaks a dozen types of exceptions for malformed files

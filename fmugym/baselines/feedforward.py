@@ -87,9 +87,17 @@ class Schedule(Controller):
         self._steps = np.where(mask, 0.0, self._steps)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
-        time = (self._start + self._steps * self.time_step) % _DAY
+        time = self._start + self._steps * self.time_step
         self._steps = self._steps + 1
-        return self._actions[np.searchsorted(self._times, time, side="right") - 1]
+        return self.at(time)
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """The actions at some times.
+
+        Args:
+            time: In seconds since any midnight.
+        """
+        return self._actions[np.searchsorted(self._times, time % _DAY, side="right") - 1]
 
 
 def _seconds(time: Any) -> float:

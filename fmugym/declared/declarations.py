@@ -10,23 +10,34 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
+from fmugym.checks import check_option
+from fmugym.declared.devices import DEVICE_KEYS
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.functions import FUNCTIONS
-from fmugym.declared.quantities import duration
-from fmugym.declared.series import Series, read_data, read_schedule
-from fmugym.declared.variables import (
-    Record,
-    Records,
-    number,
-    number_or_distribution,
-    start_value,
+from fmugym.declared.kpis import Kpi, read_kpi
+from fmugym.declared.parts import (
+    Derived,
+    Limits,
+    Memory,
+    Term,
+    read_derived,
+    read_expression,
+    read_memory,
+    read_term,
+    section_of,
 )
+from fmugym.declared.series import Series, read_data
+from fmugym.declared.setpoints import Deviation, SetPoints, Steps
+from fmugym.declared.variables import Record, Records, start_value
+from fmugym.declared.warming import WarmUpTable, read_warm_up
 
-__all__ = ["AGENT_KEYS", "BUILT_IN", "SETPOINTS", "Declarations", "Memory", "Term", "is_reserved"]
+__all__ = ["AGENT_KEYS", "BUILT_IN", "Declarations", "is_reserved"]
 
 BUILT_IN: Final = ("time", "clock", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
+
+NORMALIZATIONS: Final = ("limits", "nominal")
 
 AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescale", "normalize"),)
 """The keys of the agent."""
@@ -37,69 +48,6 @@ _RESERVED: Final = frozenset({*BUILT_IN, *CONSTANTS, *FUNCTIONS, "previous"})
 def is_reserved(name: str) -> bool:
     """Whether a name cannot be an alias, because it has a meaning of its own in expressions."""
     return name in _RESERVED or keyword.iskeyword(name)
-
-
-Limits = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Term:
-    """A named reward or cost.
-
-    Attributes:
-        entry: Where it stands.
-        expression: Its value in a step.
-        weight: The factor of a reward.
-        limit: What the costs of an episode may add up to; None for no limit.
-    """
-
-    entry: Entry
-    expression: Expression
-    weight: float = 1.0
-    limit: float | None = None
-
-
-@dataclass(frozen=True)
-class Memory:
-    """A value that the task itself remembers during an episode.
-
-    Attributes:
-        entry: Where it stands.
-        start: Its value at the beginning: a number or a distribution.
-        update: Its value after a step; None to keep it.
-        limits: For the observation space.
-    """
-
-    entry: Entry
-    start: Any
-    update: Expression | None
-    limits: Limits
-
-
-@dataclass(frozen=True)
-class Derived:
-    """A named expression, and its limits for the observation space."""
-
-    entry: Entry
-    expression: Expression
-    limits: Limits
-
-
-@dataclass(frozen=True)
-class Steps:
-    """A set point that jumps to a new random value now and then.
-
-    Attributes:
-        entry: Where it stands.
-        limits: The values lie between these.
-        every: Seconds from one value to the next.
-        channel: Its number, from which its values follow.
-    """
-
-    entry: Entry
-    limits: Limits
-    every: float
-    channel: int
 
 
 @dataclass
@@ -119,6 +67,9 @@ class Declarations:
         observed: The names that the agent sees, and where they stand.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
+        deviations: What the names of deviations from set points stand for.
+        kpis: What tells how good an episode was, by name.
+        warm_up: What happens before an episode begins.
     """
 
     root: Entry
@@ -134,6 +85,9 @@ class Declarations:
     rewards: dict[str, Term] = field(init=False)
     costs: dict[str, Term] = field(init=False)
     flags: dict[str, Expression] = field(init=False)
+    deviations: dict[str, Deviation] = field(init=False)
+    kpis: dict[str, Kpi] = field(init=False)
+    warm_up: WarmUpTable = field(init=False)
 
     @classmethod
     def read(cls, root: Entry, description: ModelDescription) -> Declarations:
@@ -144,21 +98,21 @@ class Declarations:
         """
         declared = cls(root, Records(root, description))
         _check_names(root)
-        declared.memory = {e.name: _memory(e) for e in _section(root, "memory")}
-        declared.derived = {e.name: _derived(e) for e in _section(root, "expressions")}
-        declared.series = {e.name: read_data(e) for e in _section(root, "data")}
-        declared.steps = {}
-        for entry in _section(root, "setpoints"):
-            declared._add_setpoint(entry)
+        declared.memory = {e.name: read_memory(e) for e in section_of(root, "memory")}
+        declared.derived = {e.name: read_derived(e) for e in section_of(root, "expressions")}
+        declared.series = {e.name: read_data(e) for e in section_of(root, "data")}
+        declared._read_setpoints()
         declared.parameters = dict(declared._read_parameters())
         root.required("agent").table(AGENT_KEYS)
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
+        declared.warm_up = read_warm_up(root, declared.actions)
         declared.observed = list(declared._read_observed())
         declared.rewards = _terms(root.child("reward"), ("expr", "weight"))
         declared.costs = _terms(root.child("costs"), ("expr", "limit"))
+        declared.kpis = {e.name: read_kpi(e) for e in section_of(root, "kpis")}
         conditions = [root.child(name) for name in ("terminated", "truncated")]
-        declared.flags = {e.name: parsed(e) for e in conditions if e.value is not None}
+        declared.flags = {e.name: read_expression(e) for e in conditions if e.value is not None}
         return declared
 
     @property
@@ -192,8 +146,14 @@ class Declarations:
         return [entry.text() for entry in entries]
 
     @property
+    def measured(self) -> list[str]:
+        """The names of what the agent observes, and of what it observes the deviation."""
+        names = [name for _, name in self.observed] + self.remembered
+        return names + [self.deviations[name].of for name in names if name in self.deviations]
+
+    @property
     def expressions(self) -> list[Expression]:
-        """All expressions."""
+        """All expressions, and the names that controllers measure."""
         updates = [memory.update for memory in self.memory.values()]
         terms = [*self.rewards.values(), *self.costs.values()]
         return [
@@ -202,6 +162,8 @@ class Declarations:
             *(derived.expression for derived in self.derived.values()),
             *(term.expression for term in terms),
             *self.flags.values(),
+            *(kpi.expression for kpi in self.kpis.values()),
+            *map(Expression.parse, self.warm_up.signals()),
         ]
 
     def is_output(self, name: str) -> bool:
@@ -213,6 +175,10 @@ class Declarations:
 
     def limits_of(self, name: str) -> Limits:
         """The limits of something that the agent observes."""
+        if name in self.deviations:
+            low, high = self.limits_of(self.deviations[name].setpoint)
+            least, most = self.limits_of(self.deviations[name].of)
+            return low - most, high - least
         if name in self.series:
             return self.series[name].low, self.series[name].high
         if name in self.steps:
@@ -232,43 +198,49 @@ class Declarations:
         """
         return self.root.required("agent").required(key)
 
-    def option(self, key: str) -> bool:
-        """Whether an option of the agent is set."""
-        entry = self.root.child("agent").child(key)
+    @property
+    def rescales(self) -> bool:
+        """Whether actions go from -1 to 1."""
+        entry = self.root.child("agent").child("rescale")
         return entry.value is not None and entry.flag()
 
-    def _add_setpoint(self, entry: Entry) -> None:
-        """Add a set point in the form of what the task remembers, a schedule or an expression."""
-        is_table = isinstance(entry.value, Mapping) and "distribution" not in entry.value
-        kinds = [kind for kind in SETPOINTS if is_table and kind in entry.value]
-        if not is_table:
-            self.memory[entry.name] = _memory(entry)
-            return
-        entry.table((*SETPOINTS, "min", "max"))
-        if len(kinds) != 1:
-            raise entry.error(f"give one of {', '.join(SETPOINTS)}")
-        if kinds[0] == "value":
-            start = number_or_distribution(entry.child("value"))
-            self.memory[entry.name] = Memory(entry, start, None, _limits_of(entry))
-        elif kinds[0] == "schedule":
-            self.series[entry.name] = read_schedule(entry.child("schedule"))
-        elif kinds[0] == "steps":
-            self.steps[entry.name] = _steps(entry, len(self.steps))
-        else:
-            self._add_curve(entry, kinds[0])
+    @property
+    def normalization(self) -> str | None:
+        """What observations are normalized by: ``"limits"``, ``"nominal"``; None for nothing."""
+        entry = self.root.child("agent").child("normalize")
+        if isinstance(entry.value, str):
+            return entry.check(check_option, NORMALIZATIONS)
+        return "limits" if entry.value is not None and entry.flag() else None
 
-    def _add_curve(self, entry: Entry, kind: str) -> None:
-        """Add a curve over the time since the reset; its numbers may be drawn in each episode."""
-        name, (formula, defaults) = entry.name, _CURVES[kind]
-        table = entry.child(kind).table(defaults)
-        for key, default in defaults.items():
-            if key not in table and default is None:
-                raise entry.child(kind).error(f"the key {key!r} is missing")
-            value = _of_curve(table[key]) if key in table else default
-            self.memory[f"{name}_{key}"] = Memory(entry, value, None, (-np.inf, np.inf))
-        names = {key: f"{name}_{key}" for key in defaults}
-        expression = Expression.parse(formula.format(**names))
-        self.derived[name] = Derived(entry, expression, _limits_of(entry))
+    def nominal_of(self, name: str) -> float | None:
+        """The usual size of something that the agent observes; None if it is not known.
+
+        That is the larger one of its limits where no nominal value is given.
+        """
+        record = None if name in self.own_names else self.records[name]
+        if record is not None and record.nominal is not None:
+            return record.nominal
+        size = max(map(abs, self.limits_of(name)))
+        return size if 0 < size < np.inf else None
+
+    def _read_setpoints(self) -> None:
+        points = SetPoints()
+        for entry in section_of(self.root, "setpoints"):
+            points.add(entry)
+        own = {entry.name for entry in section_of(self.root, "setpoints")}
+        for name in {*points.memory, *points.derived} - own:
+            if name in {*self.memory, *self.derived, *self.series}:
+                raise self.root.child("setpoints").error(
+                    f"{name!r} is a name that a set point brings with it; rename the other one"
+                )
+        self.memory |= points.memory
+        self.series |= points.series
+        self.derived |= points.derived
+        self.steps, self.deviations = points.steps, points.deviations
+        for deviation in self.deviations.values():
+            entry = self.root.child("setpoints").child(deviation.setpoint).child("of")
+            if deviation.of not in self.own_names:
+                self.records.find(entry, deviation.of, "variable", self.own_names)
 
     def _listed(self, key: str) -> list[Entry]:
         """The names in a list of the agent; a bare name stands for one."""
@@ -283,7 +255,7 @@ class Declarations:
         return names
 
     def _read_parameters(self) -> Iterator[tuple[str, tuple[Record, Any]]]:
-        for entry in _section(self.root, "parameters"):
+        for entry in section_of(self.root, "parameters"):
             record = self.records.find(entry, entry.name, "variable")
             yield entry.name, (record, start_value(record, entry))
 
@@ -294,8 +266,8 @@ class Declarations:
             self.records.check_input(entry, record)
             if record.variable is None and not record.is_direct:
                 raise record.entry.error(
-                    f"{record.alias!r} is no input of the FMU: 'delta', 'rate', 'min_on' and "
-                    "'min_off' are for inputs"
+                    f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
+                    f"{', '.join(map(repr, DEVICE_KEYS))} are for inputs"
                 )
         if len({bool(record.levels) for record in actions}) > 1:
             raise entry.error("either all actions have levels, or none has")
@@ -313,13 +285,15 @@ class Declarations:
             if target.value is not None:
                 unit = series.entry.child("unit")
                 record = self.records.input_of(target, None if unit.value is None else unit.text())
+                _require_plain_input(record)
                 yield record.alias, (record, Expression.parse(name))
-        for entry in _section(self.root, "inputs"):
+        for entry in section_of(self.root, "inputs"):
             record = self.records.find(entry, entry.name, "input")
             if record in self.actions and record.variable is not None:
                 raise entry.error(f"{entry.name!r} is an action already")
             self.records.check_input(entry, record)
-            yield entry.name, (record, parsed(entry))
+            _require_plain_input(record)
+            yield entry.name, (record, read_expression(entry))
 
     def _read_observed(self) -> Iterator[tuple[Entry, str]]:
         for entry in self._listed("observations"):
@@ -331,77 +305,20 @@ class Declarations:
             yield entry, name
 
 
-SETPOINTS: Final = ("value", "schedule", "steps", "ramp", "sine")
-"""The kinds of set points."""
-
-_CURVES: Final[Mapping[str, tuple[str, dict[str, float | None]]]] = {
-    "ramp": (
-        "{from} + ({to} - {from}) * clip((elapsed - {begin}) / {duration}, 0, 1)",
-        {"from": None, "to": None, "begin": 0.0, "duration": None},
-    ),
-    "sine": (
-        "{mean} + {amplitude} * sin(2 * pi * elapsed / {period} + {phase})",
-        {"mean": 0.0, "amplitude": None, "period": None, "phase": 0.0},
-    ),
-}
-"""Formulas of set points that follow a curve, and the defaults of their numbers."""
-
-_TIMES_OF_CURVES: Final = ("begin", "duration", "period")
-
-
-_CHANNELS_OF_STEPS: Final = 20_000
-
-
-def _steps(entry: Entry, number_of_steps: int) -> Steps:
-    table = entry.child("steps")
-    table.table(("low", "high", "every"))
-    limits = number(table.required("low")), number(table.required("high"))
-    every = table.required("every").check(duration)
-    if not limits[0] < limits[1]:
-        raise table.error(f"low must be below high, got {limits[0]:g} and {limits[1]:g}")
-    return Steps(entry, limits, every, _CHANNELS_OF_STEPS + number_of_steps)
-
-
-def _of_curve(entry: Entry) -> Any:
-    """A number of a curve, which may be a duration, or a distribution."""
-    if entry.name in _TIMES_OF_CURVES and not isinstance(entry.value, Mapping):
-        return entry.check(duration)
-    return number_or_distribution(entry)
-
-
-def _section(root: Entry, name: str) -> list[Entry]:
-    section = root.child(name)
-    return [] if section.value is None else list(section.items().values())
-
-
-def parsed(entry: Entry) -> Expression:
-    """The expression in an entry."""
-    with entry.placing():
-        return Expression.parse(entry.value)
-
-
-def _memory(entry: Entry) -> Memory:
-    is_table = isinstance(entry.value, Mapping) and "distribution" not in entry.value
-    if not is_table:
-        return Memory(entry, number_or_distribution(entry), None, (-np.inf, np.inf))
-    table = entry.table(("start", "update", "min", "max"))
-    start = number_or_distribution(entry.required("start"))
-    update = parsed(table["update"]) if "update" in table else None
-    return Memory(entry, start, update, _limits_of(entry))
-
-
-def _derived(entry: Entry) -> Derived:
-    if not isinstance(entry.value, Mapping):
-        return Derived(entry, parsed(entry), (-np.inf, np.inf))
-    entry.table(("expr", "min", "max"))
-    return Derived(entry, parsed(entry.required("expr")), _limits_of(entry))
+def _require_plain_input(record: Record) -> None:
+    """Refuse keys of actuators for an input that no action writes: they would do nothing."""
+    if not record.is_direct or record.levels:
+        raise record.entry.error(
+            f"{record.alias!r} is written by an expression, not by an action: only 'name', 'unit', "
+            "'min' and 'max' are for it"
+        )
 
 
 def _check_names(root: Entry) -> None:
     """A name must mean one thing. Aliases may hide names of the FMU."""
     seen: set[str] = set()
     for section in ("variables", "memory", "expressions", "data", "setpoints"):
-        for entry in _section(root, section):
+        for entry in section_of(root, section):
             if entry.name in seen:
                 raise entry.error(f"the name {entry.name!r} is given twice")
             if is_reserved(entry.name):
@@ -418,25 +335,5 @@ def _terms(entry: Entry, keys: tuple[str, ...]) -> dict[str, Term]:
     if entry.value is None:
         return {}
     if entry.name == "reward" and not isinstance(entry.value, Mapping):
-        return {"": Term(entry, parsed(entry))}
-    return {name: _term(term, keys) for name, term in entry.items().items()}
-
-
-def _term(entry: Entry, keys: tuple[str, ...]) -> Term:
-    if not isinstance(entry.value, Mapping):
-        return Term(entry, parsed(entry))
-    table = entry.table(keys)
-    weight = number(table["weight"]) if "weight" in table else 1.0
-    limit = number(table["limit"]) if "limit" in table else None
-    return Term(entry, parsed(entry.required("expr")), weight, limit)
-
-
-def _limits_of(entry: Entry) -> Limits:
-    low, high = entry.child("min"), entry.child("max")
-    limits = (
-        -np.inf if low.value is None else number(low),
-        np.inf if high.value is None else number(high),
-    )
-    if not limits[0] < limits[1]:
-        raise entry.error(f"min must be below max, got {limits[0]} and {limits[1]}")
-    return limits
+        return {"": Term(entry, read_expression(entry))}
+    return {name: read_term(term, keys) for name, term in entry.items().items()}

@@ -66,7 +66,13 @@ class TaskEnv(FMUEnv):
         path = fmu_path(self.task)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
-        self.cost_limits = plan.cost_limits
+        self._quantities_of_task = plan.quantities
+        self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
+        if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
+            raise self.task.root.child("warm_up").error(
+                f"{type(self).__name__} has a _get_inputs of its own, so that the file cannot say "
+                "what happens in the warm-up"
+            )
         self._observation_names, self._masks = plan.observation_names, plan.action_masks
         for name, function in plan.hooks.items():
             if name not in _own_hooks(type(self)):

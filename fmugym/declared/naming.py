@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
 from typing import Any, Final
@@ -10,12 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.declared.declarations import BUILT_IN, Declarations
+from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Code, Expression, Names, code_of_number
 from fmugym.declared.variables import Record, converted
 from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["CLOCK", "NOISE", "Moment", "Naming", "switch_names"]
+__all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 
 
 class Moment(Enum):
@@ -32,9 +33,6 @@ class Moment(Enum):
 _OVER: Final = (Moment.AFTER, Moment.JUDGED, Moment.UPDATED)
 """The moments in which a value that holds for a while is that of the step that has just ended."""
 
-NOISE: Final = "noise key"
-"""The episode variable from which the noise and the random steps of an episode follow."""
-
 CLOCK: Final = "clock"
 """The episode variable with the time of data at the beginning of an episode."""
 
@@ -47,9 +45,20 @@ So the rounding of times does not matter.
 """
 
 
+NO_NAMES: Final[Mapping[str, str]] = {}
+
+_CHANNELS_OF_ACTUATORS: Final = 5_000
+_LONGEST_DELAY: Final = 2000
+
+
 def switch_names(record: Record) -> tuple[str, str]:
     """The episode variables that know whether an action is on, and for how many steps."""
     return f"{record.alias} is on", f"steps since {record.alias} was switched"
+
+
+def queue_name(record: Record) -> str:
+    """The episode variable with the latest choices for an action with a delay."""
+    return f"choices of {record.alias}"
 
 
 class Naming:
@@ -58,15 +67,18 @@ class Naming:
     Args:
         declared: The task.
         time_step: Length of a step in seconds.
+        warm_steps: The steps of a warm-up with moving inputs.
 
     Attributes:
         outputs: The names of the values in ``state``, in their order.
         monitors: The names of other values that are read from the FMU.
+        first_step: The step count after the first step, which may be one of the warm-up.
         constants: Tables that code reads by name.
     """
 
-    def __init__(self, declared: Declarations, time_step: float) -> None:
-        self._declared, self._time_step = declared, time_step
+    def __init__(self, declared: Declarations, time_step: float, warm_steps: int = 0) -> None:
+        self._declared, self._time_step, self._warm_steps = declared, time_step, warm_steps
+        self.first_step = 1 - warm_steps
         self._open: list[str] = []
         self._ahead = 0.0
         self.constants: dict[str, Any] = {}
@@ -75,7 +87,7 @@ class Naming:
     def _read_names(self) -> tuple[list[str], list[str]]:
         """Observed variables come first, and next those whose previous values are needed."""
         declared, expressions = self._declared, self._declared.expressions
-        observed = [name for _, name in declared.observed] + declared.remembered
+        observed = declared.measured
         previous = sorted(set().union(*(e.previous_names for e in expressions)))
         used = sorted(set().union(*(e.names for e in expressions)))
         wanted = dict.fromkeys(filter(declared.is_output, observed + previous))
@@ -97,20 +109,35 @@ class Naming:
                     "read in one way only; write one as an expression of the other"
                 )
 
-    def code(self, entry: Entry, expression: Expression, moment: Moment) -> Code:
+    def code(
+        self,
+        entry: Entry,
+        expression: Expression,
+        moment: Moment,
+        others: Mapping[str, str] = NO_NAMES,
+    ) -> Code:
         """Make code of an expression.
+
+        Args:
+            entry: Where it stands.
+            expression: The expression.
+            moment: When it is evaluated.
+            others: The code of more names.
 
         Raises:
             ConfigError: If it has unknown names, or names that have no value at this moment.
         """
         with entry.placing():
-            return expression.code(self._names(moment))
+            return expression.code(self._names(moment, others))
 
-    def _names(self, moment: Moment) -> Names:
+    def _names(self, moment: Moment, others: Mapping[str, str]) -> Names:
+        def find(name: str) -> Code | None:
+            return Code(others[name]) if name in others else self.code_of(name, moment)
+
         return Names(
-            lambda name: self.code_of(name, moment),
+            find,
             (lambda name: None) if moment is Moment.BEFORE else self._previous_code_of,
-            self._known,
+            lambda: [*others, *self._known()],
         )
 
     def _known(self) -> list[str]:
@@ -164,7 +191,7 @@ class Naming:
         series, shift = self._declared.series[name], self._ahead
         if series.is_stepped:
             shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
-        now, shift = self._clock(), shift - series.start
+        now, shift = self.clock_code(), shift - series.start
         place = f"remainder(({now} + {shift!r}), {series.period!r})"
         self.constants[f"times_{name}"] = series.times
         self.constants[f"values_{name}"] = series.values
@@ -189,7 +216,7 @@ class Naming:
             case "time":
                 return Code(f"(env.time + {self._ahead!r})" if self._ahead else "env.time")
             case "clock":
-                return Code(f"({self._clock()} + {self._ahead!r})")
+                return Code(f"({self.clock_code()} + {self._ahead!r})")
             case "elapsed":
                 return Code(f"(env.step_count * {self._time_step!r} + {self._ahead!r})")
             case "step":
@@ -200,7 +227,7 @@ class Naming:
                 return code_of_number(self._time_step)
         return code_of_number(self._time_step / _SECONDS_PER_HOUR)
 
-    def _clock(self) -> str:
+    def clock_code(self) -> str:
         """Code for the time of data now; that of the FMU if the task sets no other clock."""
         if self._declared.root.child("clock").value is None:
             return "env.time"
@@ -265,7 +292,7 @@ class Naming:
         place, is_one = declared.actions.index(record), len(declared.actions) == 1
         if not record.levels:
             element = f"float64(env.{attribute}[{place}])"
-            return self._rescaled(record, element) if declared.option("rescale") else element
+            return self._rescaled(record, element) if declared.rescales else element
         self.constants[f"levels_{place}"] = np.array(record.levels)
         element = f"env.{attribute}" if is_one else f"env.{attribute}[{place}]"
         return f"take(levels_{place}, {element})"
@@ -275,17 +302,63 @@ class Naming:
         chosen = self.action_code(record, "action")
         if record.is_direct:
             return chosen
-        now = converted(
-            record.conversion, f"env.inputs[{self._declared.written.index(record.alias)}]"
-        )
+        now = self.present_code(record)
+        if record.device.delay:
+            chosen = self._late(record)
         if record.delta:
             chosen = f"fn_clip(({now} + {chosen}), {record.low!r}, {record.high!r})"
-        if record.rate < np.inf:
-            most = record.rate * self._time_step
-            chosen = f"fn_clip({chosen}, ({now} - {most!r}), ({now} + {most!r}))"
+        device, channel = record.device, _CHANNELS_OF_ACTUATORS + self._place_of(record)
+        chosen = device.distorted(chosen, "env.step_count", channel)
+        chosen = device.following(chosen, now, "env.step_count", channel, self._time_step)
         if record.is_switched:
             chosen = f"where({self.blocked_code(record, chosen)}, {now}, {chosen})"
         return chosen
+
+    def _place_of(self, record: Record) -> int:
+        return self._declared.actions.index(record)
+
+    def delay_of(self, record: Record) -> int:
+        """By how many steps a sensor or an actuator is late.
+
+        Raises:
+            ConfigError: If the delay is no multiple of the time step.
+        """
+        delay = record.device.delay
+        count = whole_number_of_steps(delay, self._time_step) if delay else 0
+        if delay and (not count or count > _LONGEST_DELAY):
+            raise record.entry.child("delay").error(
+                f"{delay:g} s is no multiple of the step of {self._time_step:g} s, or more than "
+                f"{_LONGEST_DELAY} steps"
+            )
+        return count or 0
+
+    def _late(self, record: Record) -> str:
+        """Code for what the agent chose some steps ago."""
+        count, queue = self.delay_of(record), f"env.variables[{queue_name(record)!r}]"
+        first = float(count - self._warm_steps)
+        return (
+            f"where((env.step_count < {first!r}), {self.start_code(record)}, {queue}[{count - 1}])"
+        )
+
+    def start_code(self, record: Record) -> str:
+        """Code for what counts as chosen before the first action; no change for changes."""
+        if record.delta:
+            return "(env.step_count * 0.0)"
+        return self._start_of_input(record)
+
+    def _start_of_input(self, record: Record) -> str:
+        if record.variable is None:
+            return "(env.step_count * 0.0)"
+        if record.alias in self._declared.parameters:
+            start = f"env.parameters[{record.fmu_name!r}]"
+        else:
+            start = f"(env.step_count * 0.0 + {record.variable.start_number!r})"
+        return converted(record.conversion, start)
+
+    def present_code(self, record: Record) -> str:
+        """Code for the value that an input has now, in the unit of the task."""
+        place = self._declared.written.index(record.alias)
+        return converted(record.conversion, f"env.inputs[{place}]")
 
     def blocked_code(self, record: Record, chosen: str) -> str:
         """Code for whether it is too early to switch to a value.
@@ -329,8 +402,4 @@ class Naming:
         now = self._code_of_record(name, record, Moment.AFTER)
         if record.variable is None:
             return now, self.action_code(record, "previous_action")
-        if name in declared.parameters:
-            start = f"env.parameters[{record.fmu_name!r}]"
-        else:
-            start = f"(env.step_count * 0.0 + {record.variable.start_number!r})"
-        return now, converted(record.conversion, start)
+        return now, self._start_of_input(record)

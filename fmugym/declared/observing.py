@@ -10,10 +10,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.declared.declarations import Declarations
+from fmugym.declared.devices import DEVICE_KEYS, NOISE
 from fmugym.declared.entries import Entry
-from fmugym.declared.naming import NOISE, Moment, Naming
+from fmugym.declared.naming import Moment, Naming, queue_name
 from fmugym.declared.quantities import duration
-from fmugym.declared.variables import number
+from fmugym.declared.values import number
+from fmugym.declared.variables import Record
 from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = [
@@ -25,6 +27,7 @@ __all__ = [
     "normalized",
     "observed_values",
     "remember",
+    "scaled",
 ]
 
 
@@ -105,12 +108,22 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     entry = declared.root.child("agent").child("history")
     length = _count(entry.required("length"), time_step) if declared.remembered else 0
     lengths = dict.fromkeys(declared.remembered, length)
-    for _, name in declared.observed:
-        delay = _delay(declared, name, time_step)
-        if delay or name in lengths:
-            lengths[name] = lengths.get(name, 0) + delay
+    for name in declared.measured:
+        record = _sensor_of(declared, name)
+        late = 0 if record is None else naming.delay_of(record) + record.device.remembers
+        if late or name in lengths:
+            lengths[name] = lengths.get(name, 0) + late
     of_variables = {name: n for name, n in lengths.items() if name not in declared.series}
-    return [_history(entry, naming, name, count) for name, count in of_variables.items()]
+    kept = [_history(entry, naming, name, count) for name, count in of_variables.items()]
+    late_ones = [record for record in declared.actions if record.device.delay]
+    return [*kept, *(_queue(naming, record) for record in late_ones)]
+
+
+def _queue(naming: Naming, record: Record) -> History:
+    """What the agent has chosen for an action with a delay."""
+    name, start = queue_name(record), naming.start_code(record)
+    chosen = naming.action_code(record, "action")
+    return History(name, name, naming.delay_of(record), chosen, start, start)
 
 
 def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
@@ -123,39 +136,49 @@ def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
     return History(name, f"history of {name}", length, *codes, present.text)
 
 
-def _delay(declared: Declarations, name: str, time_step: float) -> int:
-    """By how many steps the agent observes a name late."""
-    record = declared.records.get(name) if declared.is_output(name) else None
-    if record is None or not record.delay:
-        return 0
-    return _count(record.entry.child("delay"), time_step)
+def _sensor_of(declared: Declarations, name: str) -> Record | None:
+    """The record of what is measured; None for what the agent knows without a sensor."""
+    return declared.records.get(name) if declared.is_output(name) else None
 
 
 def observed_values(
-    declared: Declarations, naming: Naming, kept: list[History], time_step: float
-) -> list[Seen]:
-    """The numbers that the agent observes, in their order.
+    declared: Declarations,
+    naming: Naming,
+    kept: list[History],
+    time_step: float,
+    are_filled: bool = False,
+) -> tuple[list[Seen], list[History]]:
+    """The numbers that the agent observes, in their order, and what sensors remember.
+
+    Args:
+        declared: The task.
+        naming: Gives names their code.
+        kept: The histories.
+        time_step: Length of a step in seconds.
+        are_filled: Whether a warm-up has filled the histories when an episode begins.
 
     Raises:
         ConfigError: If one is a constant, or there is no forecast or history of it.
     """
     _check_sensors(declared)
-    past = _Past(declared, naming, kept, time_step)
-    return [
+    past = _Past(declared, naming, kept, time_step, are_filled)
+    seen = [
         *_present(declared, past),
         *_forecasts(declared, naming, time_step),
         *_remembered(declared, past, time_step),
     ]
+    return seen, past.memories
 
 
 def _check_sensors(declared: Declarations) -> None:
     """Refuse a sensor of what the agent does not observe: it would do nothing."""
-    seen = {name for _, name in declared.observed} | set(declared.remembered)
+    seen = set(declared.measured)
     for record in declared.records.declared():
-        if record.is_measured and record.alias not in seen:
+        is_used = record.alias in seen or record in declared.actions
+        if not record.device.is_ideal and not is_used:
             raise record.entry.error(
-                f"'noise', 'quantum' and 'delay' are for what the agent observes, and "
-                f"{record.alias!r} is not in its observations"
+                f"{', '.join(map(repr, DEVICE_KEYS))} are for actions and for what the agent "
+                f"observes, and {record.alias!r} is not in its observations"
             )
 
 
@@ -163,26 +186,62 @@ class _Past:
     """Gives values now and some steps ago, as the agent measures them."""
 
     def __init__(
-        self, declared: Declarations, naming: Naming, kept: list[History], time_step: float
+        self,
+        declared: Declarations,
+        naming: Naming,
+        kept: list[History],
+        time_step: float,
+        are_filled: bool,
     ) -> None:
         self._declared, self._naming, self._time_step = declared, naming, time_step
+        self._are_filled = are_filled
+        self._measured: dict[str, History] = {}
         self._histories = {history.name: history for history in kept}
 
     def measured(self, entry: Entry, name: str, ago: int) -> str:
         """Code for what the agent measured some steps ago."""
-        delay = _delay(self._declared, name, self._time_step)
-        code = self._true(entry, name, ago + delay)
-        record = self._declared.records.get(name) if self._declared.is_output(name) else None
+        record = _sensor_of(self._declared, name)
+        deviation = self._declared.deviations.get(name)
+        if deviation is not None:
+            setpoint, of = (self.measured(entry, one, ago) for one in deviation)
+            return f"({setpoint} - {of})"
         if record is None:
-            return code
-        if record.noise:
-            channel = self._naming.outputs.index(name)
-            count = f"(env.step_count - {ago})"
-            noise = f"noise(env.variables[{NOISE!r}], {count}, {channel})"
-            code = f"({code} + {record.noise!r} * {noise})"
-        if record.quantum:
-            code = f"({record.quantum!r} * fn_round(({code} / {record.quantum!r})))"
-        return code
+            return self._true(entry, name, ago)
+        fresh = self._fresh(entry, record, ago)
+        if not record.device.remembers:
+            return fresh
+        past = f"env.variables[{self._kept(entry, record, ago)!r}][{ago}]"
+        return past if self._are_filled else f"where(env.step_count == 0, {fresh}, {past})"
+
+    def _fresh(self, entry: Entry, record: Record, ago: int) -> str:
+        """Code for a measurement, whatever was measured before."""
+        name, device = record.alias, record.device
+        code = self._true(entry, name, ago + self._naming.delay_of(record))
+        return device.distorted(code, f"(env.step_count - {ago})", self._channel(name))
+
+    def _channel(self, name: str) -> int:
+        return self._naming.outputs.index(name)
+
+    def _kept(self, entry: Entry, record: Record, ago: int) -> str:
+        """The variable with what a sensor with a memory has given, the latest first."""
+        name, variable = record.alias, f"measured {record.alias}"
+        length = max(ago + 1, self._measured[name].length if name in self._measured else 0)
+        first = self._fresh(entry, record, 0)
+        is_first = f"(env.step_count == {self._naming.first_step})"
+        before = (
+            f"where({is_first}, {self._fresh(entry, record, 1)}, env.variables[{variable!r}][0])"
+        )
+        now = record.device.following(
+            first, before, "env.step_count", self._channel(name), self._time_step
+        )
+        fill = self._fresh(entry, record, 1)
+        self._measured[name] = History(name, variable, length, now, fill, first)
+        return variable
+
+    @property
+    def memories(self) -> list[History]:
+        """What sensors with a memory have given; to be updated after the histories."""
+        return list(self._measured.values())
 
     def _true(self, entry: Entry, name: str, ago: int) -> str:
         if ago == 0:
@@ -193,6 +252,8 @@ class _Past:
         if name in self._histories:
             history = self._histories[name]
             past = f"env.variables[{history.variable!r}][{ago - 1}]"
+            if self._are_filled:
+                return past
             return f"where(env.step_count == 0, {history.first}, {past})"
         return self._naming.forecast(entry, name, -ago * self._time_step)
 
@@ -262,8 +323,22 @@ def _count(entry: Entry, step: float) -> int:
     return count
 
 
-def normalized(seen: Seen) -> str:
-    """Code for a value that lies between -1 and 1 where it is within its limits.
+def normalized(seen: Seen, nominal: float | None) -> Seen:
+    """Normalize a value by its usual size.
+
+    Raises:
+        ConfigError: If that is not known.
+    """
+    if nominal is None:
+        raise seen.entry.error(
+            f"{seen.name!r} has no nominal value: give it 'nominal', or 'min' and 'max'"
+        )
+    code, low, high = f"({seen.code} / {nominal!r})", seen.low / nominal, seen.high / nominal
+    return seen._replace(code=code, low=low, high=high)
+
+
+def scaled(seen: Seen) -> Seen:
+    """Scale a value so that it lies between -1 and 1 where it is within its limits.
 
     Raises:
         ConfigError: If a limit is infinite.
@@ -273,11 +348,14 @@ def normalized(seen: Seen) -> str:
             f"{seen.name!r} needs 'min' and 'max' so that observations can be normalized"
         )
     middle, half = (seen.low + seen.high) / 2, (seen.high - seen.low) / 2
-    return f"(({seen.code} - {middle!r}) / {half!r})"
+    return seen._replace(code=f"(({seen.code} - {middle!r}) / {half!r})", low=-1.0, high=1.0)
 
 
 def remember(
-    kept: list[History], values: Callable[[Any], Any], fills: Callable[[Any], Any]
+    kept: list[History],
+    values: Callable[[Any], Any],
+    fills: Callable[[Any], Any],
+    first_step: int = 1,
 ) -> Callable[[Any], None]:
     """Make a function of the environment that adds the latest values to histories.
 
@@ -285,11 +363,12 @@ def remember(
         kept: The histories.
         values: Gives the values to add.
         fills: Gives the other values in the first step.
+        first_step: The step count after the first step; negative if there is a warm-up.
     """
     names = [history.variable for history in kept]
 
     def update(env: Any) -> None:
-        is_first, variables = env.step_count == 1, env.variables
+        is_first, variables = env.step_count == first_step, env.variables
         for name, value, fill in zip(names, values(env), fills(env), strict=True):
             variables[name] = _pushed(variables[name], value, fill, is_first)
 

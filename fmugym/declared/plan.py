@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
 from functools import cached_property
 from typing import Any, Final
@@ -12,18 +12,26 @@ from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
 from fmugym.config import EnvConfig
-from fmugym.declared.declarations import Declarations, Term
+from fmugym.declared.declarations import Declarations
+from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
-from fmugym.declared.naming import CLOCK, NOISE, Moment, Naming, switch_names
+from fmugym.declared.kpis import kpi_name
+from fmugym.declared.named import named_values
+from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
 from fmugym.declared.observing import (
+    History,
     NoiseKey,
+    Seen,
     has_errors,
     histories,
     normalized,
     observed_values,
     remember,
+    scaled,
 )
+from fmugym.declared.parts import Term
+from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
 from fmugym.declared.quantities import duration
 from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
@@ -31,6 +39,7 @@ from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
+from fmugym.task.quantity import Quantities
 
 __all__ = ["Plan"]
 
@@ -67,6 +76,7 @@ class Plan:
         observation_names: The names of the elements of the observation.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if the actions have no levels.
+        warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
         cost_limits: What the costs of an episode may add up to, by name.
 
     Raises:
@@ -81,17 +91,54 @@ class Plan:
         if needs_reward and not declared.rewards:
             raise task.root.error('the task has no reward; say one, for example: reward = "1"')
         self._time_step = _time_step(task.root, description)
-        self._naming = Naming(declared, self._time_step)
+        self._warm_steps = self._steps_of_warm_up()
+        self._naming = Naming(declared, self._time_step, self._warm_steps)
         for name in declared.derived:
             self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
         self._kept = histories(declared, self._naming, self._time_step)
-        self._seen = observed_values(declared, self._naming, self._kept, self._time_step)
+        self._seen, self._sensors = observed_values(
+            declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
+        )
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
+        self.warm_up = self._make_warm_up() if self._warm_steps else None
         self.action_masks = self._action_masks()
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
+
+    def quantities(self) -> Quantities:
+        """Everything in the task that has a name and a value, and a function that reads it."""
+        found = named_values(self._declared, self._naming)
+        read = self._function(_tuple(code for _, code in found.values()))
+        return Quantities([quantity for quantity, _ in found.values()], read)
+
+    # The warm-up.
+
+    def _steps_of_warm_up(self) -> int:
+        """The steps of a warm-up with moving inputs; 0 if there is none."""
+        table, step = self._declared.warm_up, self._time_step
+        if not (table.controllers or table.caches or self._declared.inputs):
+            return 0
+        count = whole_number_of_steps(table.period, step)
+        if count is None:
+            raise table.entry.error(
+                f"the warm-up must be a multiple of the time step of {step:g} s, got "
+                f"{table.period:g} s"
+            )
+        return count
+
+    def _make_warm_up(self) -> DeclaredWarmUp:
+        switches = dict(self._switch_codes())
+        maker = WarmUpMaker(self._declared, self._naming, self._time_step, self._function)
+        return maker.make(
+            self._warm_steps,
+            self._input_codes(self._declared.warm_up.controllers),
+            [*self._updates_of_histories(), *self._updates_of_switches()],
+            [*self._kept, *self._sensors],
+            switches,
+            self.config["episode_variables"],
+        )
 
     # The config.
 
@@ -111,19 +158,21 @@ class Plan:
 
     def _variables(self) -> dict[str, Any]:
         remembered = {name: memory.start for name, memory in self._declared.memory.items()}
-        histories = {one.variable: np.zeros(one.length) for one in self._kept}
+        kept = [*self._kept, *self._sensors]
+        histories = {one.variable: np.zeros(one.length) for one in kept}
         switches: dict[str, float] = {}
         for record in self._switched:
             state, since = switch_names(record)
             switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
-        variables = remembered | self._clock() | histories | switches | worst
+        kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
+        variables = remembered | self._clock() | histories | switches | worst | kpis
         return variables | self._noise(variables)
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
         """The key of noise, which is drawn last."""
-        records = [self._declared.records[name] for name in self._naming.outputs]
-        is_noisy = any(record.noise for record in records) or has_errors(self._declared)
+        devices = [record.device for record in self._declared.records.declared()]
+        is_noisy = any(one.is_random for one in devices) or has_errors(self._declared)
         if not is_noisy and not self._declared.steps:
             return {}
         parameters = [value for _, value in self._declared.parameters.values()]
@@ -171,9 +220,10 @@ class Plan:
             raise start.error(
                 "start_time is one time; 'clock' takes lists, seasons and what is drawn"
             )
-        for key in ("warm_up", "start_time"):
-            if self._root.child(key).value is not None:
-                times[key] = self._root.child(key).check(duration)
+        if self._declared.warm_up.period:
+            times["warm_up"] = self._declared.warm_up.period
+        if start.value is not None:
+            times["start_time"] = start.check(duration)
         if self._root.child("substeps").value is not None:
             times["substeps"] = self._root.child("substeps").value
         if self._root.child("episode_length").value is not None:
@@ -218,7 +268,7 @@ class Plan:
         """The action space; None if it is that of the inputs as they are."""
         records = self._declared.actions
         are_inputs = all(r.variable is not None and is_plain(r) for r in records)
-        rescales = self._declared.option("rescale")
+        rescales = self._declared.rescales
         if are_inputs and not self._declared.inputs and not rescales:
             return None
         if not records[0].levels:
@@ -229,21 +279,32 @@ class Plan:
 
     def _inputs(self) -> Hook:
         """Write the FMU's inputs, in their units."""
-        declared = self._declared
-        codes = [
-            inverted(record.conversion, self._naming.input_code(record))
-            for record in declared.actions
-            if record.variable is not None
-        ]
+        codes = self._input_codes()
+        return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+
+    def _input_codes(self, acting: Collection[str] | None = None) -> list[str]:
+        """Code for the FMU's inputs, in their units.
+
+        Args:
+            acting: The aliases of the actions that are chosen, the others keep their values; None
+                for all.
+        """
+        declared, codes = self._declared, list[str]()
+        for record in declared.actions:
+            if record.variable is None:
+                continue
+            code = inverted(record.conversion, self._naming.input_code(record))
+            is_kept = acting is not None and record.alias not in acting
+            codes.append(f"env.inputs[{len(codes)}]" if is_kept else code)
         for name, (record, expression) in declared.inputs.items():
             entry = self._root.child("inputs").child(name)
-            code = self._naming.code(entry, expression, Moment.BEFORE)
-            codes.append(inverted(record.conversion, code.number.text))
+            value = self._naming.code(entry, expression, Moment.BEFORE).number.text
+            codes.append(inverted(record.conversion, value))
         if not codes:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
             )
-        return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+        return codes
 
     def _action_masks(self) -> Hook | None:
         codes = []
@@ -259,16 +320,27 @@ class Plan:
     def _observation_space(self) -> spaces.Space[Any] | None:
         """The observation space; None if it is that of the outputs as they are."""
         names, records = [seen.name for seen in self._seen], self._declared.records
-        if self._declared.option("normalize"):
-            return _box([(-1.0, 1.0)] * len(names))
-        if names == self._naming.outputs and all(is_plain(records[name]) for name in names):
+        if (
+            self._declared.normalization is None
+            and names == self._naming.outputs
+            and all(is_plain(records[name]) for name in names)
+        ):
             return None
-        return _box([(seen.low, seen.high) for seen in self._seen])
+        return _box([(seen.low, seen.high) for seen in self._normalized])
+
+    @cached_property
+    def _normalized(self) -> list[Seen]:
+        """What the agent observes, in the form of its observations."""
+        declared = self._declared
+        match declared.normalization:
+            case "limits":
+                return [scaled(seen) for seen in self._seen]
+            case "nominal":
+                return [normalized(seen, declared.nominal_of(seen.name)) for seen in self._seen]
+        return self._seen
 
     def _observation(self) -> Hook:
-        normalizes = self._declared.option("normalize")
-        codes = [normalized(seen) if normalizes else seen.code for seen in self._seen]
-        values = self._function(_tuple(codes))
+        values = self._function(_tuple(seen.code for seen in self._normalized))
         return lambda env: np.array(values(env), dtype=np.float32)
 
     # What follows a step.
@@ -280,6 +352,7 @@ class Plan:
             *self._updates_of_histories(),
             *self._updates_of_switches(),
             *self._updates_of_worst(),
+            *self._updates_of_kpis(),
         ]
         if updates:
             hooks["_update"] = _in_turn(updates)
@@ -290,27 +363,59 @@ class Plan:
         if declared.rewards:
             hooks["_reward_policy"] = self._function(_sum(self._terms(declared.rewards)))
             hooks["_fault_reward"] = self._fault_reward()
-        if declared.costs or declared.has_reward_terms:
+        if declared.costs or declared.has_reward_terms or declared.kpis:
             hooks["_get_info"] = self._function(self._info())
         return hooks
 
     def _updates_of_histories(self) -> list[Hook]:
-        if not self._kept:
-            return []
-        values, fills = ([history.now for history in self._kept], [h.fill for h in self._kept])
-        return [remember(self._kept, self._function(_tuple(values)), self._function(_tuple(fills)))]
+        """The sensors follow what they measure."""
+        return [self._remembering(kept) for kept in (self._kept, self._sensors) if kept]
+
+    def _remembering(self, kept: list[History]) -> Hook:
+        values = self._function(_tuple(history.now for history in kept))
+        fills = self._function(_tuple(history.fill for history in kept))
+        return remember(kept, values, fills, self._naming.first_step)
 
     def _updates_of_switches(self) -> list[Hook]:
-        codes: dict[str, str] = {}
+        return self._assignments(dict(self._switch_codes()))
+
+    def _switch_codes(self) -> Iterator[tuple[str, str]]:
         for record in self._switched:
-            codes |= zip(switch_names(record), self._naming.switch_codes(record), strict=True)
-        return self._assignments(codes)
+            yield from zip(switch_names(record), self._naming.switch_codes(record), strict=True)
 
     def _updates_of_worst(self) -> list[Hook]:
         if not self._has_worst:
             return []
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
         return self._assignments({WORST: f"fn_min(env.variables[{WORST!r}], {reward})"})
+
+    def _updates_of_kpis(self) -> list[Hook]:
+        terms, codes = self._term_codes(Moment.UPDATED), dict[str, str]()
+        for name, kpi in self._declared.kpis.items():
+            if kpi.how is not None:
+                value = self._naming.code(kpi.entry, kpi.expression, Moment.UPDATED, terms)
+                codes[kpi_name(name)] = kpi.updated(value.number.text)
+        return self._assignments(codes)
+
+    def _kpi_codes(self) -> dict[str, str]:
+        """Code for the figures of the episode until now."""
+        kpis = self._declared.kpis
+        known = {name: kpi.present for name, kpi in kpis.items() if kpi.how is not None}
+        names = self._term_codes(Moment.JUDGED) | known
+        others = {
+            name: self._naming.code(kpi.entry, kpi.expression, Moment.JUDGED, names).number.text
+            for name, kpi in kpis.items()
+            if kpi.how is None
+        }
+        return {name: (known | others)[name] for name in kpis}
+
+    def _term_codes(self, moment: Moment) -> dict[str, str]:
+        """Code for rewards and costs by their names, for the figures that use them."""
+        declared = self._declared
+        if not declared.kpis:
+            return {}
+        terms = {**declared.rewards, **declared.costs}
+        return {name: code for name, code in self._terms(terms, moment).items() if name}
 
     def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""
@@ -359,7 +464,7 @@ class Plan:
         return codes
 
     def _info(self) -> str:
-        """Code for the info: terms of the reward, and costs."""
+        """Code for the info: terms of the reward, costs, and figures of the episode."""
         rewards, costs = self._terms(self._declared.rewards), self._terms(self._declared.costs)
         parts: dict[str, str] = {}
         if self._declared.has_reward_terms:
@@ -367,6 +472,8 @@ class Plan:
         if costs:
             parts["cost"] = _in_steps(_sum(costs))
             parts["costs"] = _dict({name: _in_steps(code) for name, code in costs.items()})
+        if self._declared.kpis:
+            parts["kpis"] = _dict({n: _in_steps(code) for n, code in self._kpi_codes().items()})
         return _dict(parts)
 
     def _function(self, text: str) -> Hook:

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
-from fmugym.declared.variables import number_or_distribution
+from fmugym.declared.values import number_or_distribution
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 

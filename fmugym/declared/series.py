@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fmugym.checks import check_option, check_path
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
-from fmugym.declared.variables import number
+from fmugym.declared.values import number
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]

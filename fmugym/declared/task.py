@@ -29,8 +29,9 @@ KEYS: Final = (
     *("version", "extends", "description", "fmu", "class", "arguments"),
     *("time_step", "substeps", "episode_length", "warm_up", "start_time", "clock", "scenarios"),
     *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
+    "controllers",
     "agent",
-    *("reward", "costs", "terminated", "truncated", "config"),
+    *("reward", "costs", "kpis", "terminated", "truncated", "config"),
 )
 """The keys of a task."""
 

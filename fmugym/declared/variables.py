@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.checks import check_mapping, check_option, number_of
+from fmugym.checks import check_option
+from fmugym.declared.devices import DEVICE_KEYS, IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression
 from fmugym.declared.quantities import IDENTITY, Conversion, conversion_between, duration
-from fmugym.distributions import Choice, Normal, Uniform, as_distribution, is_distribution
+from fmugym.declared.values import number, number_or_distribution
+from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import SAMPLINGS
 from fmugym.task.interface import checked, input_variable, output_variable
@@ -24,33 +25,19 @@ __all__ = [
     "converted",
     "inverted",
     "is_plain",
-    "number",
-    "number_or_distribution",
     "start_value",
 ]
 
 VARIABLE_KEYS: Final = (
-    *("name", "unit", "min", "max", "levels", "delta", "rate", "min_on", "min_off", "sample"),
-    *("noise", "quantum", "delay", "description"),
+    *("name", "unit", "min", "max", "nominal", "levels", "delta", "min_on", "min_off", "sample"),
+    *DEVICE_KEYS,
+    "description",
 )
 """The keys of a variable."""
 
 
-_OF_ACTUATOR: Final = ("delta", "rate", "min_on", "min_off")
-_OF_SENSOR: Final = ("noise", "quantum", "delay")
-_DURATIONS: Final = ("min_on", "min_off", "delay")
-
-
-def number(entry: Entry) -> float:
-    """A number of a task: a number, or a text with an expression of constants, such as ``pi / 2``.
-
-    Raises:
-        ConfigError: If it is neither.
-    """
-    with entry.placing():
-        if isinstance(entry.value, str):
-            return Expression.parse(entry.value).constant()
-        return number_of(entry.name, entry.value)
+_OF_ACTUATOR: Final = ("delta", "min_on", "min_off")
+_DURATIONS: Final = ("min_on", "min_off")
 
 
 @dataclass(frozen=True)
@@ -64,14 +51,12 @@ class Record:
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
         low, high: The limits in the unit of the task; infinite where there are none.
+        nominal: The usual size of its values; None if neither the task nor the FMU says it.
         levels: The values that an action chooses from; empty for a continuous one.
         sample: What a step gives of the values after each substep, one of ``SAMPLINGS``.
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
             value itself.
-        rate: The largest change in a second; infinite for no limit.
-        noise: The standard deviation of what the agent observes.
-        quantum: The agent observes multiples of it; 0 for the value itself.
-        delay: By how many seconds the agent observes it late.
+        device: The sensor of what the agent observes, or the actuator of an action.
         min_on, min_off: How many seconds an action stays other than 0, and stays 0, at least.
     """
 
@@ -84,23 +69,16 @@ class Record:
     high: float
     levels: tuple[float, ...] = ()
     sample: str = "last"
+    nominal: float | None = None
     delta: float = 0.0
-    rate: float = math.inf
     min_on: float = 0.0
     min_off: float = 0.0
-    noise: float = 0.0
-    quantum: float = 0.0
-    delay: float = 0.0
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether the agent observes another value than the true one."""
-        return bool(self.noise or self.quantum or self.delay)
+    device: Device = IDEAL
 
     @property
     def is_direct(self) -> bool:
         """Whether an action reaches the FMU as the agent has chosen it."""
-        return not self.delta and self.rate == math.inf and not self.is_switched
+        return not self.delta and self.device.is_ideal and not self.is_switched
 
     @property
     def is_switched(self) -> bool:
@@ -203,11 +181,8 @@ class Records:
         Raises:
             ConfigError: If it cannot.
         """
-        if record.sample != "last" or record.is_measured:
-            raise record.entry.error(
-                "'sample', 'noise', 'quantum' and 'delay' are for variables that are read from the "
-                "FMU"
-            )
+        if record.sample != "last":
+            raise record.entry.error("'sample' is for variables that are read from the FMU")
         if record.variable is not None:
             with entry.placing():
                 input_variable(self._description, record.fmu_name)
@@ -218,7 +193,7 @@ class Records:
         Raises:
             ConfigError: If it cannot.
         """
-        if not self[name].is_direct or self[name].levels:
+        if self[name].delta or self[name].is_switched or self[name].levels:
             raise self[name].entry.error(f"{name!r} is observed, not an action: it has no such key")
         with entry.placing():
             output_variable(self._description, self[name].fmu_name)
@@ -241,9 +216,13 @@ class Records:
             conversion = conversion_between(own, wanted, self._description.units)
         limited = None if sample == "integral" else variable
         low, high = _limits(entry, limited, conversion)
-        levels, limits = _levels(entry), _of_device(entry)
+        levels, limits = _levels(entry), _of_actuator(entry)
+        device = read_device(entry)
         return Record(
-            alias, entry, variable, wanted, conversion, low, high, levels, sample, **limits
+            *(alias, entry, variable, wanted, conversion, low, high, levels, sample),
+            nominal=_nominal(entry, limited, conversion),
+            device=device,
+            **limits,
         )
 
 
@@ -269,10 +248,22 @@ def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[floa
     return low, high
 
 
-def _of_device(entry: Entry) -> dict[str, float]:
-    """How fast an action may change, and how well a variable is measured."""
-    given = {key: entry.child(key) for key in _OF_ACTUATOR + _OF_SENSOR}
-    limits: dict[str, float] = {}
+def _nominal(entry: Entry, variable: Variable | None, conversion: Conversion) -> float | None:
+    """The nominal value of the task, or that of the FMU unless its unit has another zero."""
+    nominal = entry.child("nominal")
+    if nominal.value is not None:
+        value = number(nominal)
+        if not 0 < value < math.inf:
+            raise nominal.error(f"nominal must be positive, got {value:g}")
+        return value
+    own = None if variable is None else variable.nominal
+    return None if not own or conversion.offset else abs(own * conversion.factor)
+
+
+def _of_actuator(entry: Entry) -> dict[str, Any]:
+    """How much and how often an action may change."""
+    given = {key: entry.child(key) for key in _OF_ACTUATOR}
+    limits: dict[str, Any] = {}
     for key, one in given.items():
         if one.value is None:
             continue
@@ -319,24 +310,7 @@ def inverted(conversion: Conversion, text: str) -> str:
 def is_plain(record: Record) -> bool:
     """Whether the values of the task are those of the FMU."""
     is_same = record.conversion == IDENTITY and not record.levels
-    return is_same and record.is_direct and not record.is_measured
-
-
-def number_or_distribution(entry: Entry) -> Any:
-    """A number, or a distribution, whose numbers may be texts with expressions of constants.
-
-    Raises:
-        ConfigError: If it is neither.
-    """
-    if is_distribution(entry.value):
-        return entry.value
-    if not isinstance(entry.value, Mapping):
-        return number(entry)
-    with entry.placing():
-        items = check_mapping(entry.name, entry.value)
-        for name in items.keys() - {"distribution", "values", "probabilities"}:
-            items[name] = number(entry.child(name))
-        return as_distribution(entry.name, items)
+    return is_same and record.is_direct
 
 
 def start_value(record: Record, entry: Entry) -> Any:

@@ -10,7 +10,7 @@ from fmugym.errors import ConfigError, shown
 
 __all__ = ["as_toml"]
 
-_INLINE: Final = ("fmu", "clock")
+_INLINE: Final = ("fmu", "clock", "warm_up")
 """Tables that describe one value; they are written in one line."""
 
 

@@ -1,4 +1,4 @@
-"""One co-simulation instance of an FMU, whatever its FMI version.
+"""One instance of an FMU, whatever its FMI version and interface.
 
 Calls in the step loop go through ctypes with prepared arguments, because FMPy's wrappers build new
 arrays for every call.
@@ -21,6 +21,7 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.log import Hearing, MessageLog
+from fmugym.fmi.solver import Solving
 from fmugym.fmi.status import Phase, Status, sane
 
 __all__ = ["Initialize", "Instance", "SavedState", "Span"]
@@ -49,7 +50,7 @@ Initialize = Callable[[Span, Callable[[], None]], None]
 
 
 class Instance(ABC):
-    """One co-simulation instance of an FMU; made by ``Library.instantiate``.
+    """One instance of an FMU; made by ``Library.instantiate``.
 
     Attributes:
         phase: Decides which calls are legal.
@@ -74,7 +75,9 @@ class Instance(ABC):
         target: logging.Logger,
         hearing: Hearing,
         hear_all: bool = False,
+        solving: Solving | None = None,
     ) -> None:
+        self._solving = solving
         self.phase = Phase.DEAD
         self._description = description
         self._slave = copy.copy(slave)  # shares the library and its functions
@@ -472,7 +475,10 @@ class SavedState:
 
     Attributes:
         pointer: The FMU's handle.
+        memory: What a solver adds to the state.
     """
+
+    memory: Any = None
 
     def __init__(self, instance: Instance, pointer: ctypes.c_void_p) -> None:
         self.pointer = pointer

@@ -12,18 +12,21 @@ import fmpy
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.exchange import FMI2ExchangeInstance
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import Hearing
+from fmugym.fmi.solver import Solving
 
 __all__ = ["Library"]
 
-_INSTANCE_CLASSES: Final[dict[int, type[Instance]]] = {
-    1: FMI1Instance,
-    2: FMI2Instance,
-    3: FMI3Instance,
+_INSTANCE_CLASSES: Final[dict[tuple[int, str], type[Instance]]] = {
+    (1, "co_simulation"): FMI1Instance,
+    (2, "co_simulation"): FMI2Instance,
+    (3, "co_simulation"): FMI3Instance,
+    (2, "model_exchange"): FMI2ExchangeInstance,
 }
 _load_lock = threading.Lock()
 
@@ -34,13 +37,20 @@ class Library:
     Args:
         fmu: The FMU. It is extracted if necessary, and closed with the library.
         target: The logger for the messages of all instances.
+        solving: How the equations of FMUs of model exchange are solved; None for the defaults.
 
     Raises:
         FMULoadError: If the library cannot be loaded or lacks a function of the standard.
     """
 
-    def __init__(self, fmu: LoadableFMU, target: logging.Logger) -> None:
-        self._instance_class = _INSTANCE_CLASSES[fmu.description.fmi_major_version]
+    def __init__(
+        self, fmu: LoadableFMU, target: logging.Logger, solving: Solving | None = None
+    ) -> None:
+        description = fmu.description
+        self._instance_class = _INSTANCE_CLASSES[
+            description.fmi_major_version, description.interface
+        ]
+        self._solving = solving
         self._fmu = fmu
         self._target = target
         self._hearing = Hearing()
@@ -66,7 +76,12 @@ class Library:
         if not self.close.alive:
             raise SimulationError(f"{self._fmu.path.name} is closed")
         instance = self._instance_class(
-            self._fmu.description, self._native.slave, self._target, self._hearing, hear_all
+            self._fmu.description,
+            self._native.slave,
+            self._target,
+            self._hearing,
+            hear_all,
+            self._solving,
         )
         self._native.instances.append(instance)
         return instance

@@ -18,6 +18,7 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.health import CountedPool
 from fmugym.pool.patience import Patience, speaks_of_licence
 from fmugym.pool.progress import INITIALIZATION, STEP, announce, hears_calls, progress
+from fmugym.pool.seats import Claim
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["Attendant", "AttendedPool"]
@@ -132,6 +133,16 @@ class AttendedPool(CountedPool):
     def is_attended(self) -> bool:
         """See ``Pool.is_attended``."""
         return self._attendant is not None
+
+    _claim: Claim | None = None
+
+    def hold(self, claim: Claim | None) -> None:
+        """Keep the seats of the instances until ``close``."""
+        self._claim = claim
+
+    def _return_seats(self) -> None:
+        if self._claim is not None:
+            self._claim.release()
 
     def attend(self, attendant: Attending | None) -> None:
         """Let somebody go with all calls of ``reset`` from now on."""

@@ -157,6 +157,23 @@ class Pool(ABC):
             SimulationError: If an instance refuses.
         """
 
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """Ask the FMU for partial derivatives now, with the values in ``inputs`` set.
+
+        Args:
+            unknowns: Outputs or derivatives of states, k of them.
+            knowns: Continuous states or inputs, m of them.
+
+        Returns:
+            Shape (k, m, N).
+
+        Raises:
+            SimulationError: If the FMU offers no directional derivatives, or an instance refuses.
+        """
+        raise SimulationError(f"a {type(self).__name__} has no directional derivatives")
+
     @abstractmethod
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
         """Return the counters of each instance by name, each of shape (N,); see ``HEALTH``."""
@@ -282,7 +299,7 @@ class Pool(ABC):
         """
         return False
 
-    def start_of_play(self) -> Callable[..., int]:
+    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes outside of a step; see ``NativePool``.
 
         Raises:

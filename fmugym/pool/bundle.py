@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Bundle", "Record", "SaveMethod", "joined"]
+__all__ = ["Bundle", "Copies", "Record", "SaveMethod", "joined"]
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -20,6 +22,9 @@ class SaveMethod(StrEnum):
 
     STATE = "state"
     """The FMU serializes its state. Saving and restoring cost about as much as a step."""
+    COPY = "copy"
+    """The FMU copies its state, but cannot serialize it. The environment that has saved restores
+    the copy; for others and for pickles, the inputs of the episode are kept, too."""
     REPLAY = "replay"
     """The inputs of the episode are kept. Saving costs nothing, restoring plays the episode again.
     """
@@ -46,6 +51,21 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
+class Copies:
+    """States that only the instances which have saved them can restore.
+
+    Attributes:
+        pool: A weak reference to their pool.
+        snapshot: From its ``save``.
+        indices: The instances, shape (M,).
+    """
+
+    pool: weakref.ref[Any]
+    snapshot: Any
+    indices: IndexArray
+
+
+@dataclass(frozen=True, eq=False)
 class Bundle:
     """The states of M instances.
 
@@ -57,6 +77,7 @@ class Bundle:
         data: The serialized states one after the other; ``b""`` if there are records.
         ends: Where each of them ends in the data, shape (M,).
         records: Or a record for each; None for an empty state.
+        copies: Copies of the states, besides the records. They are no part of a pickle.
     """
 
     outputs: FloatArray
@@ -64,11 +85,17 @@ class Bundle:
     data: bytes
     ends: IndexArray
     records: tuple[Record | None, ...] | None = None
+    copies: Copies | None = None
 
     @property
     def method(self) -> SaveMethod:
         """How the states were saved."""
-        return SaveMethod.STATE if self.records is None else SaveMethod.REPLAY
+        if self.records is None:
+            return SaveMethod.STATE
+        return SaveMethod.REPLAY if self.copies is None else SaveMethod.COPY
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Bundle, (self.outputs, self.steps, self.data, self.ends, self.records)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -84,9 +111,19 @@ class Bundle:
         outputs = np.ascontiguousarray(self.outputs[:, chosen])
         if self.records is not None:
             records = tuple(self.records[place] for place in chosen.tolist())
-            return Bundle(outputs, self.steps[chosen], b"", self.ends[chosen], records)
+            copies = self.copies and replace(self.copies, indices=self.copies.indices[chosen])
+            return Bundle(outputs, self.steps[chosen], b"", self.ends[chosen], records, copies)
         data, ends = joined(map(self.state, chosen.tolist()))
         return Bundle(outputs, self.steps[chosen], data, ends)
+
+    @classmethod
+    def of_all(cls, bundles: Sequence[Bundle]) -> Bundle:
+        """Put bundles of one pool together."""
+        outputs = np.concatenate([bundle.outputs for bundle in bundles], axis=1)
+        steps = np.concatenate([bundle.steps for bundle in bundles])
+        data, ends = joined(b.state(place) for b in bundles for place in range(len(b)))
+        records = [bundle.records for bundle in bundles if bundle.records is not None]
+        return cls(outputs, steps, data, ends, sum(records, ()) if records else None)
 
     @property
     def content(self) -> tuple[object, ...]:

@@ -12,7 +12,7 @@ from fmugym.archive.description import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.pool.tape import Judge, Recorder, Rehearsals, Tape
+from fmugym.pool.tape import Effort, Judge, Recorder, Rehearsals, Tape
 
 __all__ = [
     "HEALTH",
@@ -123,12 +123,30 @@ class CountedPool(Pool):
         self._recorder = Recorder() if self._recorder is None else self._recorder
         self._recorder.wait(resets, steps)
 
+    def effort(self) -> Effort:
+        """How much time the pool's calls take; only once ``rehearse_with`` was called."""
+        self._count_steps()
+        assert self._recorder is not None
+        return self._recorder.effort(self._counts[:, Column.STEPS], self._one_by_one)
+
+    @property
+    def _one_by_one(self) -> int:
+        """How many instances a call resets and steps one after the other."""
+        return self.num_instances
+
     def _note_reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+        self,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        mask: MaskArray | None,
+        seconds: float,
     ) -> None:
         """Tell the recorder of a reset, after it."""
         recorder = self._recorder
-        if recorder is None or not (mask is None or mask[0]):
+        if recorder is None:
+            return
+        recorder.note_reset(seconds)
+        if not (mask is None or mask[0]):
             return
         tape = recorder.finish()
         if tape is not None:
@@ -139,10 +157,11 @@ class CountedPool(Pool):
             else:
                 recorder.drop()
 
-    def _note_step(self, skip: MaskArray | None) -> None:
+    def _note_step(self, skip: MaskArray | None, seconds: float) -> None:
         """Tell the recorder of a step, after it; only while it records."""
         if self._recorder is None or (skip is not None and skip[0]):
             return
+        self._recorder.note_step(seconds)
         tape = self._recorder.add(self.inputs[:, 0], self.outputs[:, 0], int(self.statuses[0]))
         if tape is not None:
             self._hand_over(tape)

@@ -174,15 +174,22 @@ class LeakWatch:
 
         @functools.wraps(function)
         def watched(*args: P.args, **kwargs: P.kwargs) -> R:
-            return self.call(function, *args, **kwargs)
+            left = self._calls_left = self._calls_left - 1
+            if left > 0:
+                return function(*args, **kwargs)
+            return self._look_around(function, *args, **kwargs)
 
         return watched
 
     def call(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """Call a function that resets instances, and watch it."""
-        self._calls_left -= 1
-        if self._calls_left > 0:
+        left = self._calls_left = self._calls_left - 1
+        if left > 0:
             return function(*args, **kwargs)
+        return self._look_around(function, *args, **kwargs)
+
+    def _look_around(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the function, and look at the memory."""
         measurement = self._replacing or self._plain
         if measurement is None:
             result = function(*args, **kwargs)

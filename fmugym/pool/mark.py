@@ -22,6 +22,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
+from fmugym.errors import printable
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.process.last_words import describe_exit
 
@@ -42,10 +43,17 @@ _CALLS: Final = (
     "a copy of its state",
     "a return to a state",
     "its end",
+    "no call",
 )
 """What an FMU was asked for, in the order of ``native/mark.h``."""
 
 STEP, RESET, END = (_CALLS.index(name) for name in ("a step", "a reset", "its end"))
+
+_NO_CALL: Final = _CALLS.index("no call")
+"""The process has ended elsewhere, because its heap was damaged."""
+
+_TEXT: Final = slice(96, 192)
+"""What the C library said then."""
 
 _EXIT: Final = 255
 """In the place of a signal: the FMU has called ``exit``."""
@@ -154,11 +162,18 @@ def _content_of_ended(path: Path) -> Iterator[bytes]:
     """Read a file if no living process holds its lock."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: others may be reading it, too
-        yield file.read(2)
+        yield file.read(_TEXT.stop)
 
 
 def _sentence(content: bytes) -> list[str]:
     if len(content) < 2 or content[0] == 0 or content[1] >= len(_CALLS):
         return []
+    if content[1] == _NO_CALL:
+        said = content[_TEXT].partition(b"\0")[0].decode(errors="replace").strip()
+        how = describe_exit(-content[0])
+        return [
+            f"in training, its process ended with {how} outside of its calls because the heap was "
+            f"damaged ({printable(said)})"
+        ]
     how = "a call of exit" if content[0] == _EXIT else describe_exit(-content[0])
     return [f"in training, it ended its process with {how} in {_CALLS[content[1]]}"]

@@ -43,12 +43,13 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import HealthArray, no_counts
+from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
+from fmugym.pool.pacing import last_initialization
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import SAMPLINGS, ResetMethod
-from fmugym.pool.tape import Judge, Rehearsals, Tape
+from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
 
@@ -177,6 +178,7 @@ class NativePool(SavingPool):
                     "states": description.capabilities.can_get_and_set_fmu_state,
                     "categories": tuple(c.encode() for c in description.error_categories),
                     "mark": None if self._mark is None else self._mark.page,
+                    "solving": _solving(description, spec),
                 },
                 experiment={
                     "start_time": spec.start_time,
@@ -190,7 +192,7 @@ class NativePool(SavingPool):
                     "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
                     "reloads": method == ResetMethod.LIBRARY,
                     "one_initialization": spec.one_initialization,
-                    "pace": (spec.initialization_interval, *spec.turn),
+                    "pace": spec.initialization_interval,
                     "start_outputs": (
                         np.array(spec.start_outputs).tobytes() if spec.blind_start else None
                     ),
@@ -208,6 +210,7 @@ class NativePool(SavingPool):
                     "statuses": self.statuses,
                     "observations": self.observations,
                     "health": self._counts,
+                    "last_initialization": last_initialization(spec),
                 },
                 count=self.num_instances,
                 threads=self.threads,
@@ -229,7 +232,8 @@ class NativePool(SavingPool):
             version = self._fmu.description.fmi_major_version
             types = bytes(_type_number(variable, version) for variable in variables)
             references = np.array([v.value_reference for v in variables], np.uint32)
-            access = _native.Access(version, types, references.tobytes())
+            is_exchange = self._fmu.description.model_exchange is not None
+            access = _native.Access(version, types, references.tobytes(), is_exchange)
             self._accesses[variables] = access
         return access
 
@@ -370,6 +374,12 @@ class NativePool(SavingPool):
             np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
         )
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        access = self._access(tuple(self._variables[name] for name in record.names))
+        starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
+        self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
+
     def _count_steps(self) -> None:
         if self._close.alive:
             self._pool.count_steps()
@@ -406,7 +416,10 @@ class NativePool(SavingPool):
 
     def close(self) -> None:
         """See ``Pool.close``."""
-        self._close()
+        try:
+            self._close()
+        finally:
+            self._return_seats()
 
     def _open_pool(self) -> _native.Pool:
         if not self._close.alive:
@@ -504,7 +517,21 @@ class NativePool(SavingPool):
     @property
     def costs(self) -> dict[str, float]:
         """The measured time of one instance in ns by method; 0 if it is not known yet."""
-        return dict(zip(("step", "reset", "step_or_reset"), self._pool.costs(), strict=True))
+        names = ("step", "reset", "step_or_reset", "play", "first_reset")
+        return dict(zip(names, self._pool.costs(), strict=True))
+
+    def effort(self) -> Effort:
+        """See ``CountedPool.effort``."""
+        self._count_steps()
+        costs = {name: 1e-9 * cost for name, cost in self.costs.items()}
+        steps = [costs[name] for name in ("step", "step_or_reset", "play") if costs[name]] or [0.0]
+        of_steps = self._counts[:, Column.STEPS]
+        of_resets = float(self._counts[:, Column.RESETS].sum()) * costs["reset"]
+        return Effort(
+            total=float(of_steps.sum()) * min(steps) + of_resets,
+            episode=costs["first_reset"] + TAPE_ROWS * max(steps),
+            steps=int(of_steps[0]),
+        )
 
     def prepare_play(
         self,
@@ -601,13 +628,13 @@ class NativePool(SavingPool):
         own = self._pool
         return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
 
-    def start_of_play(self) -> Callable[..., int]:
+    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes after ``prepare_play``, outside of a step.
 
         Returns:
             A function of a mask, observations and drawn values (draws, N). It fills all of the
             observations, and the drawn values in the mask; ``given`` ones are read. It returns how
-            many instances had trouble.
+            many instances had trouble, and whether any episode of another one has ended.
         """
         return self._reset_of_play
 
@@ -696,6 +723,27 @@ def _resources(folder: Path, version: int) -> bytes:
     if version == 2:
         return (folder / "resources").as_uri().encode()
     return os.path.join(folder, "resources", "").encode()
+
+
+def _solving(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
+    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    model = description.model_exchange
+    if model is None:
+        return None
+    solving, states, rates = spec.solving, None, None
+    if description.capabilities.provides_directional_derivatives and model.state_references:
+        states = np.array(model.state_references, np.uint32).tobytes()
+        rates = np.array(model.derivative_references, np.uint32).tobytes()
+    return (
+        solving.solver.encode(),
+        solving.tolerance,
+        solving.max_step,
+        model.number_of_states,
+        model.number_of_event_indicators,
+        model.needs_completed_integrator_step,
+        states,
+        rates,
+    )
 
 
 def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:

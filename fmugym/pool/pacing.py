@@ -1,39 +1,104 @@
-"""The pace at which instances are made and initialized, for licences that limit it."""
+"""The pace at which instances are made and initialized, for licences that limit it.
+
+All environments of an FMU on a machine share a file with the time at which the last of these calls
+began. Before a call, an environment moves this time on by its own interval, and waits until it has
+come. The native pool does so in ``native/pace.c``. All processes of a machine have the same
+monotonic clock, but it begins anew with the machine: so the file also has the time of that.
+"""
 
 from __future__ import annotations
 
-import math
+import mmap
+import os
 import threading
 import time
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Final
 
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.errors import ConfigError
+from fmugym.pool.extension import has_native_pool
+from fmugym.pool.locks import exclusively
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["Pacer"]
+__all__ = ["Pacer", "last_initialization"]
+
+TimeArray = npt.NDArray[np.int64]
+
+_lock: Final = threading.Lock()
+
+_SIZE: Final = 4096
+_DRIFT: Final = 60.0
+"""By how many seconds the time at which the machine was started seems to change at most."""
+
+
+def last_initialization(spec: PoolSpec) -> TimeArray:
+    """When the last instance was made or initialized, in ns of the monotonic clock; 0 for never.
+
+    Returns:
+        Memory of shape (1,) that all pools with the same ``spec.locks`` share.
+
+    Raises:
+        ConfigError: If the file cannot be made.
+    """
+    if not spec.locks or spec.initialization_interval == 0.0:
+        return np.zeros(1, np.int64)
+    path = Path(f"{spec.locks}.pace")
+    try:
+        with exclusively(_mutex(spec)):
+            return _opened(path)[:1]
+    except OSError as error:
+        raise ConfigError(
+            f"config key 'max_initializations_per_second' needs the file {path}: {error}"
+        ) from None
+
+
+def _mutex(spec: PoolSpec) -> Path:
+    return Path(f"{spec.locks}.lock")
+
+
+def _opened(path: Path) -> TimeArray:
+    """Map the file; forget what it has from before the machine was started."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        if os.fstat(handle).st_size < _SIZE:
+            os.write(handle, bytes(_SIZE))
+        times: TimeArray = np.frombuffer(mmap.mmap(handle, _SIZE), np.int64)
+    finally:
+        os.close(handle)
+    start = int(time.time() - time.monotonic())
+    if abs(times[1] - start) > _DRIFT:
+        times[:2] = 0, start
+    return times
 
 
 class Pacer:
-    """Waits before an instance is made or initialized; ``native/pace.c`` does the same in C.
-
-    Time is divided into slots of ``spec.initialization_interval`` seconds of the monotonic clock,
-    which all processes of a machine share. In each slot one call may begin. The workers of a pool
-    have the slots in turn, so they keep to the pace together.
+    """Waits before an instance is made or initialized.
 
     Args:
-        spec: Has the interval and the turn.
+        spec: Has the interval and the place of the file.
     """
 
     def __init__(self, spec: PoolSpec) -> None:
-        self._interval, (self._turn, self._turns) = spec.initialization_interval, spec.turn
-        self._lock = threading.Lock()
-        self._last = -1
+        self._spec, self._interval = spec, spec.initialization_interval
+        self._last = last_initialization(spec)
 
     def wait(self) -> None:
-        """Wait for the next free slot."""
+        """Wait until a call may begin."""
         if self._interval > 0.0:
-            time.sleep(max(0.0, self._claim() * self._interval - time.monotonic()))
+            time.sleep(self._claim())
 
-    def _claim(self) -> int:
-        with self._lock:
-            slot = max(self._last + 1, math.ceil(time.monotonic() / self._interval))
-            self._last = slot + (self._turn - slot) % self._turns
-            return self._last
+    def _claim(self) -> float:
+        """Take the next moment; returns the seconds until then."""
+        if has_native_pool():
+            from fmugym import _native
+
+            return _native.claim_initialization(self._last, self._interval)
+        with _lock, exclusively(_mutex(self._spec)) if self._spec.locks else nullcontext():
+            now = time.monotonic_ns()
+            following = int(self._last[0]) + int(1e9 * self._interval)
+            self._last[0] = following if self._last[0] and following > now else now
+            return max(0.0, 1e-9 * (int(self._last[0]) - now))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -72,7 +73,7 @@ class PythonPool(SavingPool):
         self._mark = mark
         self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
         with self._resetting:
-            self._library = Library(fmu, log)
+            self._library = Library(fmu, log, spec.solving)
         pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:
@@ -101,11 +102,12 @@ class PythonPool(SavingPool):
     def _reset_slots(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
+        began = time.perf_counter()
         with fmu_calls, self._resetting:
             for index, slot in enumerate(self._slots):
                 if mask is None or mask[index]:
                     self._note(index, slot.reset(variables, values[:, index]))
-        self._note_reset(variables, values, mask)
+        self._note_reset(variables, values, mask, time.perf_counter() - began)
 
     def step(
         self,
@@ -116,6 +118,7 @@ class PythonPool(SavingPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
+        began = time.perf_counter() if self._is_recording else 0.0
         with fmu_calls, self._stepping:
             for index, slot in enumerate(self._slots):
                 if skip is None or not skip[index]:
@@ -124,7 +127,7 @@ class PythonPool(SavingPool):
                 observed = self.outputs[: self._spec.num_observed]
                 np.copyto(observations, observed.T, casting="same_kind")
         if self._is_recording:
-            self._note_step(skip)
+            self._note_step(skip, time.perf_counter() - began)
         return self.outputs, self.statuses
 
     def _note(self, index: int, status: int) -> None:
@@ -194,6 +197,10 @@ class PythonPool(SavingPool):
         """See ``SavingPool.record_of``."""
         return self._slots[index].record
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        self._slots[index].replace_record(record)
+
     def _keep_records(self) -> None:
         for slot in self._slots:
             slot.keeps_record = True
@@ -209,6 +216,17 @@ class PythonPool(SavingPool):
                 return np.stack([slot.read(variables) for slot in self._slots], axis=1)
         finally:
             restore_arithmetic()
+
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``."""
+        try:
+            with fmu_calls:
+                parts = [slot.differentiate(unknowns, knowns) for slot in self._slots]
+        finally:
+            restore_arithmetic()
+        return np.stack(parts, axis=2)
 
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
@@ -265,6 +283,7 @@ class PythonPool(SavingPool):
                 self._library.close()
         finally:
             restore_arithmetic()
+            self._return_seats()
 
 
 def _recycle(slots: Sequence[Slot]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
@@ -13,11 +14,11 @@ from fmugym.archive.description import ModelDescription, Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.attendant import AttendedPool
-from fmugym.pool.base import FloatArray
-from fmugym.pool.bundle import Bundle, IndexArray, Record, SaveMethod
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.bundle import Bundle, Copies, IndexArray, Record, SaveMethod
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
-__all__ = ["SavingPool", "Serialized", "offers_states"]
+__all__ = ["SavingPool", "Serialized", "offered_method"]
 
 logger = logging.getLogger(__name__)
 
@@ -25,14 +26,15 @@ Serialized = tuple[bytes, IndexArray, IndexArray]
 """Serialized states one after the other, where each ends, and the communication steps of each."""
 
 
-def offers_states(description: ModelDescription, spec: PoolSpec) -> bool:
-    """Whether states can be serialized in this pool.
+def offered_method(description: ModelDescription, spec: PoolSpec) -> SaveMethod:
+    """How states can be saved in this pool, as the FMU says.
 
     Only where resets restore states is an FMU told in each step that it may be set back.
     """
     able = description.capabilities
-    restores = spec.reset_method == ResetMethod.RESTORE
-    return restores and able.can_get_and_set_fmu_state and able.can_serialize_fmu_state
+    if spec.reset_method != ResetMethod.RESTORE or not able.can_get_and_set_fmu_state:
+        return SaveMethod.REPLAY
+    return SaveMethod.STATE if able.can_serialize_fmu_state else SaveMethod.COPY
 
 
 class SavingPool(AttendedPool):
@@ -42,14 +44,14 @@ class SavingPool(AttendedPool):
     """
 
     _variables: Mapping[str, Variable]
-    _offers_states = False
+    _offered = SaveMethod.REPLAY
     _do_states_work: Callable[[], bool] | None = None
 
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
         """Take over what saving needs; returns whether the pool must keep records."""
         self._variables = description.variables
-        self._offers_states = offers_states(description, spec)
-        return spec.records or not self._offers_states
+        self._offered = offered_method(description, spec)
+        return spec.records or self._offered is not SaveMethod.STATE
 
     def trust_states_if(self, do_states_work: Callable[[], bool]) -> None:
         """Let the first call that saves or restores ask whether serialized states work."""
@@ -58,10 +60,11 @@ class SavingPool(AttendedPool):
     @property
     def save_method(self) -> SaveMethod:
         """See ``Pool.save_method``; the first call may take as long as a trial of the FMU."""
-        if self._offers_states and self._do_states_work is not None:
+        if self._offered is not SaveMethod.REPLAY and self._do_states_work is not None:
             ask, self._do_states_work = self._do_states_work, None
-            self._offers_states = ask()
-        return SaveMethod.STATE if self._offers_states else SaveMethod.REPLAY
+            if not ask():
+                self._mistrust_states()
+        return self._offered
 
     def save_instances(self, indices: IndexArray) -> Bundle:
         """See ``Pool.save_instances``."""
@@ -72,15 +75,26 @@ class SavingPool(AttendedPool):
         records = self._records(indices)
         lengths = [0 if record is None else len(record.inputs) for record in records]
         ends = np.zeros(len(indices), np.int64)
-        return Bundle(outputs, np.array(lengths, np.int64), b"", ends, tuple(records))
+        steps, copies = np.array(lengths, np.int64), self._copies(indices)
+        return Bundle(outputs, steps, b"", ends, tuple(records), copies)
+
+    def _copies(self, indices: IndexArray) -> Copies | None:
+        """Copy the states of all instances; None if some are not asked for, or cannot be copied."""
+        every = len(indices) == self.num_instances and np.all(self.statuses <= Status.WARNING)
+        if self.save_method is not SaveMethod.COPY or not every:
+            return None
+        try:
+            return Copies(weakref.ref(self), self.save(), np.array(indices))
+        except SimulationError:  # an episode has ended in another way
+            return None
 
     def restore_instances(
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> npt.NDArray[np.int8]:
         """See ``Pool.restore_instances``."""
         self._drop_recording()
-        if bundle.method is SaveMethod.REPLAY:
-            self._replay(bundle, sources, indices)
+        if bundle.records is not None:
+            self._restore_or_replay(bundle, sources, indices)
         elif self.save_method is not SaveMethod.STATE:
             raise SimulationError(
                 "the snapshot has serialized FMU states, which do not work in this pool"
@@ -100,6 +114,47 @@ class SavingPool(AttendedPool):
     @abstractmethod
     def record_of(self, index: int) -> Record | None:
         """The record of an instance; None if it does not reach from the reset until now."""
+
+    # Copies
+
+    def _restore_or_replay(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
+        """Restore the copies that are of the same instances, and replay the other episodes."""
+        own = self._are_own(bundle, sources, indices)
+        if own.any() and not self._restore_copies(bundle, sources[own], indices[own]):
+            own[:] = False
+        if not own.all():
+            self._replay(bundle, sources[~own], indices[~own])
+
+    def _are_own(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> MaskArray:
+        copies, records = bundle.copies, bundle.records
+        if copies is None or records is None or copies.pool() is not self:
+            return np.zeros(len(indices), np.bool_)
+        there = np.array([records[source] is not None for source in sources.tolist()], np.bool_)
+        same: MaskArray = there & (copies.indices[sources] == indices)
+        return same
+
+    def _restore_copies(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> bool:
+        """Returns whether that was possible; no instance may have been replaced since."""
+        assert bundle.copies is not None
+        assert bundle.records is not None
+        mask = np.zeros(self.num_instances, np.bool_)
+        mask[indices] = True
+        try:
+            self.restore(bundle.copies.snapshot, mask)
+        except SimulationError:
+            return False
+        if np.any(self.statuses[indices] > Status.WARNING):
+            return False
+        for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
+            record = bundle.records[source]
+            if record is not None:
+                self.replace_record(index, record)
+        self.outputs[:, indices] = bundle.outputs[:, sources]
+        return True
+
+    @abstractmethod
+    def replace_record(self, index: int, record: Record) -> None:
+        """Let the episode of an instance count as the one of a record."""
 
     # Playing episodes again
 
@@ -162,4 +217,4 @@ class SavingPool(AttendedPool):
 
     def _mistrust_states(self) -> None:
         """States have turned out to be wrong; from now on episodes are played again."""
-        self._offers_states = False
+        self._offered = SaveMethod.REPLAY

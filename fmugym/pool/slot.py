@@ -445,6 +445,17 @@ class Slot:
         access = Access(self._instance, variables, np.array(values))
         self._instance.check("setting variables", access.set())
 
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``; shape (k, m).
+
+        Raises:
+            SimulationError: If the FMU refuses.
+        """
+        self._instance.check("setting the inputs", self._inputs.set())
+        return self._instance.jacobian(unknowns, knowns)
+
     @property
     def count(self) -> int:
         """The number of communication steps in this episode."""
@@ -483,6 +494,10 @@ class Slot:
             return self._failed(str(error))
         self._begin_counting_at(count)
         return Status.OK
+
+    def replace_record(self, record: Record) -> None:
+        """Let the episode count as the one of a record."""
+        self._played = record.names, record.starts, [row.tobytes() for row in record.inputs]
 
     @property
     def record(self) -> Record | None:

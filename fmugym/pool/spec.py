@@ -8,13 +8,18 @@ from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import Variable
+from fmugym.fmi.methods import METHODS
+from fmugym.fmi.solver import Solving
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "DEFAULT_LEAK_LIMIT",
+    "DEFAULT_TOLERANCE",
+    "FIXED_STEP_SOLVERS",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
     "SAMPLINGS",
+    "SOLVERS",
     "PoolSpec",
     "ResetMethod",
     "whole_number_of_steps",
@@ -28,6 +33,16 @@ SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 
 The order is that of ``Sampling`` in ``native/pool.h``.
 """
+
+SOLVERS: Final = tuple(METHODS)
+"""The methods of integration for model exchange; see ``fmugym.fmi.methods``."""
+
+FIXED_STEP_SOLVERS: Final = tuple(name for name, method in METHODS.items() if not method.order)
+"""Those whose steps do not depend on the tolerance."""
+
+DEFAULT_TOLERANCE: Final = 1e-6
+"""Relative tolerance of the solver where neither the config nor the FMU gives one: float32
+observations do not show smaller errors."""
 
 DEFAULT_CALL_TIMEOUT: Final = 60.0
 """How long a call to a worker process may take, in seconds of real time."""
@@ -81,14 +96,18 @@ class PoolSpec:
             or freed at a time. Steps run in parallel all the same.
         initialization_interval: The least real time in seconds from one instantiation or
             initialization to the next; see ``fmugym.pool.pacing``.
-        turn: Which turn this pool has in making and initializing instances, and how many turns
-            there are.
+        max_instances: How many instances may exist at once on this machine; None for no limit.
+        locks: The beginning of the paths of the files by which all environments of the FMU keep
+            to these two limits; "" for none.
         keep_states: Whether initial states are kept for other instances and processes, if the trial
             shows that they work there.
         state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
         licence_wait: How long to wait for a refused licence, in seconds of real time.
         blind_start: Whether outputs have the start values of the model description until the first
             step, because the FMU cannot be read before.
+        solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
+        max_step: The longest step of the solver, in seconds; None for no limit other than the
+            communication step.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
             FMU's states can be saved; see ``fmugym.pool.saving``.
     """
@@ -109,13 +128,16 @@ class PoolSpec:
     input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
     initialization_interval: float = 0.0
-    turn: tuple[int, int] = (0, 1)
+    max_instances: int | None = None
+    locks: str = ""
     licence_wait: float = 0.0
     keep_states: bool = False
     state_files: str = ""
     blind_start: bool = False
     samplings: tuple[str, ...] = ()
     records: bool = False
+    solver: str = SOLVERS[0]
+    max_step: float | None = None
 
     def communication_point(self, count: int) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift."""
@@ -125,6 +147,12 @@ class PoolSpec:
     def start_outputs(self) -> tuple[float, ...]:
         """The start values of the outputs in the model description; 0 where it has none."""
         return tuple(variable.start_number for variable in self.outputs)
+
+    @property
+    def solving(self) -> Solving:
+        """How the equations of FMUs of model exchange are solved."""
+        tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
+        return Solving(self.solver, tolerance, self.max_step or math.inf)
 
     @property
     def communication_step_size(self) -> float:

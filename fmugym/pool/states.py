@@ -27,7 +27,7 @@ from fmugym.pool.attendant import AttendedPool, Attending, InitialState, Reset
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["MOST_BYTES", "InitialStates", "StateFiles"]
+__all__ = ["MOST_BYTES", "InitialStates", "StateFiles", "essence"]
 
 logger = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ class InitialStates(Attending):
 
     def __init__(self, spec: PoolSpec) -> None:
         self._files = StateFiles(spec.state_files, len(spec.outputs))
-        self._scope = repr(_essence(spec)).encode()
+        self._scope = repr(essence(spec)).encode()
         self._work = True
 
     def reset(
@@ -191,7 +191,7 @@ class InitialStates(Attending):
         return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()[:32]
 
 
-def _essence(spec: PoolSpec) -> PoolSpec:
+def essence(spec: PoolSpec) -> PoolSpec:
     """The part of a spec on which initial states depend."""
     return replace(
         spec,
@@ -201,7 +201,8 @@ def _essence(spec: PoolSpec) -> PoolSpec:
         input_limits=(),
         one_initialization=False,
         initialization_interval=0.0,
-        turn=(0, 1),
+        max_instances=None,
+        locks="",
         licence_wait=0.0,
         keep_states=False,
         state_files="",

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import cache
 from math import floor, nan
 from types import MappingProxyType
@@ -31,6 +32,7 @@ from fmugym.task.plain import plain_attributes
 from fmugym.task.results import finiteness_of
 from fmugym.task.step import Numbers
 from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Constructed"]
 
@@ -41,6 +43,7 @@ class Constructed(Pictured):
     """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs."""
 
     fmi_version: ClassVar[int | None]
+    fmi_interface: ClassVar[str | None]
     reset_options: ClassVar[tuple[str, ...]]
     metadata: dict[str, Any]
 
@@ -59,6 +62,10 @@ class Constructed(Pictured):
 
     _has_info: bool
     _pool_tells = False
+    _warm_up: WarmUp | None = None
+    """What happens in warm-ups with moving inputs; the pool knows of others only."""
+
+    _warm_ups: WarmUps | None = None
     _pool: Pool | None = None
     _is_closed = False
 
@@ -85,10 +92,14 @@ class Constructed(Pictured):
         _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
         self.render_mode = self._checked_render_mode(render_mode)
-        self.fmu = open_fmu(type(self), fmu_path, self.config)
+        self.fmu = open_fmu(type(self), fmu_path, self.config, self.fmi_interface)
         self._require_fmi_version()
         self._interface = resolve(self.config, self.fmu.description)
         self._spec = self._interface.pool_spec()
+        self._warm_up_steps = self._spec.warm_up_steps
+        if self._warm_up is not None:
+            self._spec = replace(self._spec, warm_up_steps=0)
+            self._warm_ups = WarmUps(self, self._warm_up)
         self._warn_of_peculiarities()
         self._prepare_values()
         self._prepare_episodes()
@@ -142,10 +153,11 @@ class Constructed(Pictured):
     def _require_fmi_version(self) -> None:
         found = self.fmu.description.fmi_major_version
         if self.fmi_version is not None and found != self.fmi_version:
+            kind = "CS" if self.fmu.description.interface == "co_simulation" else "ME"
             raise ConfigError(
                 f"{type(self).__name__} is made for FMI {self.fmi_version}.0, but "
                 f"{self.fmu.path.name} is an FMU of FMI {self.fmu.description.fmi_version}; "
-                f"derive from FMI{found}CSEnv instead"
+                f"derive from FMI{found}{kind}Env instead"
             )
 
     def _warn_of_peculiarities(self) -> None:
@@ -185,7 +197,7 @@ class Constructed(Pictured):
 
     def _prepare_episodes(self) -> None:
         self._plan = self._plan_episode({})
-        self._step_limit = _step_limit(self.config, self._spec)
+        self._step_limit = _step_limit(self.config, self._spec, self._warm_up_steps)
         self._ended = True
         self._in_hooks = False
         self._was_reset = False
@@ -268,7 +280,7 @@ def _set_level(logger: logging.Logger, level: Any) -> None:
         raise ConfigError(f"log_level must be a level of logging, got {shown(level)}") from None
 
 
-def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
+def _step_limit(config: EnvConfig, spec: PoolSpec, warm_up_steps: int) -> int:
     """The number of steps after which an episode is truncated."""
     limit = sys.maxsize if config.max_episode_steps is None else config.max_episode_steps
     if config.stop_time is None:
@@ -276,7 +288,7 @@ def _step_limit(config: EnvConfig, spec: PoolSpec) -> int:
     span = (config.stop_time - spec.start_time) / spec.time_step
     if span > limit:
         return limit
-    steps = floor(span + 1e-9) - spec.warm_up_steps
+    steps = floor(span + 1e-9) - warm_up_steps
     if steps < 1:
         raise ConfigError(
             f"stop_time = {config.stop_time} s leaves no time for a step of {spec.time_step} s "

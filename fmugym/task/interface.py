@@ -13,7 +13,7 @@ from fmugym.checks import LARGEST_COUNT, check_number
 from fmugym.config import EnvConfig
 from fmugym.distributions import is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.pool.spec import PoolSpec, whole_number_of_steps
+from fmugym.pool.spec import FIXED_STEP_SOLVERS, PoolSpec, whole_number_of_steps
 
 __all__ = [
     "Interface",
@@ -93,10 +93,19 @@ class Interface:
             leak_limit=config.leak_limit,
             input_limits=tuple(map(self._limits, self.inputs)),
             initialization_interval=_interval(config.max_initializations_per_second),
+            max_instances=config.max_instances,
             licence_wait=config.licence_wait,
             keep_states=bool(config.keep_initial_states),
             samplings=self._samplings(),
+            solver=config.solver,
+            max_step=self._max_step(),
         )
+
+    def _max_step(self) -> float | None:
+        """The config's, or else, for a solver of fixed steps, the FMU's default step size."""
+        fixed = self.config.solver in FIXED_STEP_SOLVERS
+        default = self.description.step_size if fixed else None
+        return default if self.config.max_step is None else self.config.max_step
 
     def _samplings(self) -> tuple[str, ...]:
         """One for each output; none if a step gives the last value of all."""

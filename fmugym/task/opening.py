@@ -52,8 +52,16 @@ def pools_are_deferred() -> bool:
     return _fmus.get() is not None
 
 
-def open_fmu(cls: type, path: str | os.PathLike[str], config: EnvConfig) -> FMU:
+def open_fmu(
+    cls: type, path: str | os.PathLike[str], config: EnvConfig, interface: str | None = None
+) -> FMU:
     """Open the FMU of an environment; relative paths start at the folder of its class's file.
+
+    Args:
+        cls: The class of the environment.
+        path: The file.
+        config: The environment's config.
+        interface: The only interface that the class can use; None for any.
 
     Raises:
         ConfigError: If an argument is invalid.
@@ -62,13 +70,24 @@ def open_fmu(cls: type, path: str | os.PathLike[str], config: EnvConfig) -> FMU:
     file = _find_file(cls, check_path("fmu_path", path))
     preload = [_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload]
     limits, timeout = config.archive_limits, config.probe_timeout
+    interface = _interface_of(cls, config.interface, interface)
     known = _fmus.get()
     if known is None:
-        return FMU(file, limits=limits, preload=preload, probe_timeout=timeout)
-    key = file, limits, tuple(map(str, preload)), timeout
+        known = {}
+    key = file, limits, tuple(map(str, preload)), timeout, interface
     if key not in known:
-        known[key] = FMU(file, limits=limits, preload=preload, probe_timeout=timeout)
+        known[key] = FMU(
+            file, limits=limits, preload=preload, probe_timeout=timeout, interface=interface
+        )
     return known[key]
+
+
+def _interface_of(cls: type, wanted: str | None, own: str | None) -> str | None:
+    if wanted is not None and own is not None and wanted != own:
+        raise ConfigError(
+            f"config key 'interface' is {wanted!r}, but {cls.__name__} is made for {own!r}"
+        )
+    return wanted or own
 
 
 @dataclass(frozen=True)

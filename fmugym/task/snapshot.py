@@ -41,6 +41,8 @@ _OPERATION: Final = {
 }
 """Config keys on which no state depends."""
 
+_HASH: Final = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{8,}\b")
+
 _WIDE: Final = {"b": np.int64, "i": np.int64, "u": np.uint64, "f": np.float64}
 """By kind, the type in which numbers are compared."""
 
@@ -68,7 +70,8 @@ class Snapshot:
 
     Attributes:
         method: ``"state"`` if the FMU has serialized its state. ``"replay"`` if the inputs of the
-            episode were kept: restoring such a snapshot plays the episode again.
+            episode were kept: restoring such a snapshot plays the episode again. ``"copy"`` if they
+            were kept, and the FMU has a copy of its state for the environment that has saved.
         step_count: Steps since the reset of each environment, shape (M,).
     """
 
@@ -190,11 +193,13 @@ def _taken(column: Any, places: Any) -> Any:
 
 
 def stacked(parts: Sequence[Columns]) -> Columns:
-    """Put the columns of single environments together."""
+    """Put columns of one environment each together."""
     return {name: _stacked([part.get(name) for part in parts]) for name in parts[0]}
 
 
 def _stacked(parts: list[Any]) -> Any:
+    if all(part is None for part in parts):
+        return None
     if isinstance(parts[0], dict):
         names = dict.fromkeys(name for part in parts for name in part)
         return {name: [_first(part.get(name)) for part in parts] for name in names}
@@ -226,21 +231,38 @@ def require_scope(own: Scope, wanted: Scope, what: str) -> None:
     """Compare the scope of a snapshot or the like with that of an environment.
 
     Raises:
-        ConfigError: If they differ; the text names the first difference.
+        ConfigError: If they differ; the text names the first difference, and of long values only
+            the parts that differ.
     """
-    for name, text in own.items():
-        if wanted.get(name) != text:
+    for name in dict.fromkeys([*own, *wanted]):
+        texts = own.get(name, "nothing"), wanted.get(name, "nothing")
+        if texts[0] != texts[1]:
+            here, there = map(_shown, _different_parts(*texts))
             raise ConfigError(
-                f"the {what} is of environments with another {name}: {shown(text)}, expected "
-                f"{shown(wanted.get(name))}"
+                f"the {what} is of environments with another {name}: {here}, expected {there}"
             )
+
+
+def _different_parts(one: str, other: str) -> tuple[str, str]:
+    """Of two lists of values, those that are not the same in both; of other texts the whole."""
+    parts, others = one.strip("{}").split(", "), other.strip("{}").split(", ")
+    only = [part for part in parts if part not in others]
+    only_other = [part for part in others if part not in parts]
+    if not only and not only_other:  # the order is another one
+        return one, other
+    return ", ".join(only) or "nothing more", ", ".join(only_other) or "nothing more"
+
+
+def _shown(text: str) -> str:
+    """A text of a scope on one line, with the first digits of each hash."""
+    return shown(_HASH.sub(r"\1...", text))[1:-1]
 
 
 def scope_of(env: Constructed) -> Scope:
     """What a snapshot's environment must have in common with this one."""
-    config = env.config
+    config, fmu = env.config, env.fmu.description
     scope = {
-        "FMU": content_of(env.fmu.path),
+        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} (SHA-256 {content_of(env.fmu.path)})",
         "action space": str(env.action_space),
     }
     names = [f.name for f in fields(config) if f.name not in _OPERATION]

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
 
 import numpy as np
 
 from fmugym.env import FMUEnv
+from fmugym.series.store import imported
 from fmugym.tools.overview import plain
+from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Policy, Summary, simulate
 
-__all__ = ["Score", "confidence", "evaluate", "table"]
+__all__ = ["Score", "confidence", "evaluate", "plot_scores", "table"]
 
 _Z: Final = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""
+
+_LONGEST_LABEL: Final = 48
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,8 @@ class Score:
         steps: The number of steps of each episode.
         ends: How often an episode ended in which way; faults are counted together.
         real_time_factor: Simulated seconds in a second of real time, the controller included.
+        scenario: The scenario of the episodes; None for those of the task.
+        kpis: The KPIs of the episodes that have reported some, by name.
     """
 
     name: str
@@ -39,6 +46,8 @@ class Score:
     steps: tuple[int, ...]
     ends: Mapping[str, int]
     real_time_factor: float
+    scenario: str | None = None
+    kpis: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
     def mean(self) -> float:
@@ -47,11 +56,19 @@ class Score:
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers in types that JSON has."""
-        half = confidence(self.rewards)
-        mean_cost = float(np.mean(self.costs)) if self.costs else None
-        interval = None if half is None else [self.mean - half, self.mean + half]
-        derived = {"mean_reward": self.mean, "interval_95": interval, "mean_cost": mean_cost}
-        return asdict(self) | derived
+        return asdict(self) | {
+            "mean_reward": self.mean,
+            "interval_95": _interval(self.rewards),
+            "mean_cost": float(np.mean(self.costs)) if self.costs else None,
+            "cost_interval_95": _interval(self.costs),
+            "mean_kpis": {name: float(np.mean(values)) for name, values in self.kpis.items()},
+        }
+
+
+def _interval(values: Sequence[float]) -> list[float] | None:
+    half = confidence(values)
+    mean = float(np.mean(values)) if values else 0.0
+    return None if half is None else [mean - half, mean + half]
 
 
 def confidence(values: Sequence[float]) -> float | None:
@@ -92,6 +109,8 @@ def evaluate(
     policies: Mapping[str, Callable[[FMUEnv], Policy]],
     seeds: Iterable[int],
     most_steps: int,
+    scenario: str | None = None,
+    advance: Advance = no_progress,
 ) -> list[Score]:
     """Let controllers play the same episodes.
 
@@ -100,6 +119,8 @@ def evaluate(
         policies: By name, functions that make a policy for an environment.
         seeds: The seeds of the episodes.
         most_steps: The steps after which an episode is stopped.
+        scenario: The scenario that the environment plays, for the scores.
+        advance: Is told of each step.
 
     Returns:
         A score for each controller, in their order.
@@ -109,15 +130,16 @@ def evaluate(
     try:
         for name, make_policy in policies.items():
             policy, begin = make_policy(env), perf_counter()
-            episodes = [simulate(env, policy, seed, most_steps) for seed in seeds]
-            scores.append(_score(name, episodes, perf_counter() - begin))
+            episodes = [simulate(env, policy, seed, most_steps, advance) for seed in seeds]
+            scores.append(_score(name, episodes, perf_counter() - begin, scenario))
     finally:
         env.close()
     return scores
 
 
-def _score(name: str, episodes: Sequence[Summary], took: float) -> Score:
+def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | None) -> Score:
     ends = ["fault" if one.end.startswith("fault") else one.end for one in episodes]
+    names = dict.fromkeys(kpi for one in episodes for kpi in one.kpis)
     return Score(
         name,
         tuple(one.total_reward for one in episodes),
@@ -125,13 +147,16 @@ def _score(name: str, episodes: Sequence[Summary], took: float) -> Score:
         tuple(one.steps for one in episodes),
         {end: ends.count(end) for end in dict.fromkeys(ends)},
         sum(one.seconds for one in episodes) / took,
+        scenario,
+        {n: tuple(one.kpis[n] for one in episodes if n in one.kpis) for n in names},
     )
 
 
 def table(scores: Sequence[Score]) -> str:
     """Format scores for a terminal: lines of printable ASCII."""
-    header = ("", "reward", "+-", "cost", "steps", "ends", "x real time")
-    rows = [header, *(_row(score) for score in scores)]
+    kpis = tuple(dict.fromkeys(name for score in scores for name in score.kpis))
+    header = ("", "reward", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time")
+    rows = [header, *(_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True))]
     widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -139,14 +164,67 @@ def table(scores: Sequence[Score]) -> str:
     )
 
 
-def _row(score: Score) -> tuple[str, ...]:
+def _labels(scores: Sequence[Score]) -> list[str]:
+    """The controllers, and the scenarios if there are several."""
+    if len({score.scenario for score in scores}) < 2:
+        return [plain(score.name) for score in scores]
+    return [plain(f"{score.name} ({score.scenario})") for score in scores]
+
+
+def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
     half = confidence(score.rewards)
     return (
-        plain(score.name),
+        label,
         f"{score.mean:.6g}",
         "" if half is None else f"{half:.3g}",
         f"{np.mean(score.costs):.6g}" if score.costs else "",
         f"{np.mean(score.steps):.6g}",
         ", ".join(f"{count} {end}" for end, count in score.ends.items()),
+        *(f"{np.mean(score.kpis[name]):.6g}" if name in score.kpis else "" for name in kpis),
         f"{score.real_time_factor:.3g}",
     )
+
+
+def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
+    """Draw rewards and costs: each episode, the mean, and its 95 % confidence interval.
+
+    Args:
+        scores: The scores.
+        path: The file to write.
+        title: A line of text above.
+
+    Raises:
+        ConfigError: If Matplotlib is missing.
+    """
+    figures: Any = imported("matplotlib.figure", "plot")
+    groups = {"reward of an episode": [score.rewards for score in scores]}
+    if all(score.costs for score in scores):
+        groups["cost of an episode"] = [score.costs for score in scores]
+    figure = figures.Figure(
+        figsize=(3.0 + 3.2 * len(groups), 1.4 + 0.42 * len(scores)), layout="constrained"
+    )
+    axes = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+    for axis, (label, values) in zip(axes, groups.items(), strict=True):
+        _draw_scores(axis, values)
+        axis.set_xlabel(label)
+    axes[0].set_yticks(range(len(scores)), list(map(_shortened, _labels(scores))))
+    axes[0].invert_yaxis()
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    figure.savefig(path, dpi=150)
+
+
+def _shortened(text: str) -> str:
+    shown = text.replace("$", r"\$")
+    return shown if len(shown) <= _LONGEST_LABEL else f"{shown[: _LONGEST_LABEL - 3]}..."
+
+
+def _draw_scores(axis: Any, groups: Sequence[Sequence[float]]) -> None:
+    for row, values in enumerate(groups):
+        axis.plot(values, [row] * len(values), "o", color="#9aa5ae", markersize=4, alpha=0.6)
+        half = confidence(values) or 0.0
+        style = {"capsize": 4, "markersize": 6, "linewidth": 1.6}
+        axis.errorbar(np.mean(values), row, xerr=half, fmt="o", color="#0072b2", **style)
+    axis.set_ylim(-0.6, len(groups) - 0.4)
+    axis.grid(axis="x", color="#e4e4e4")
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)

@@ -1,18 +1,19 @@
-"""Episodes of a task, written as a table."""
+"""Episodes of a task, and who acts in them."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, TextIO
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
+import gymnasium
 import numpy as np
 
 from fmugym.baselines import controller_of
 from fmugym.checks import number_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.tools.progress import Advance, no_progress
 
 __all__ = ["Policy", "Summary", "action_of", "policy_of", "simulate"]
 
@@ -44,6 +45,7 @@ class Summary:
         seconds: The simulated time.
         total_reward, total_cost: Sums over the episode; no cost if the task has none.
         end: ``"terminated"``, ``"truncated"``, or ``"fault: ..."`` with its reason.
+        kpis: The KPIs that the task has reported at the end, by name.
     """
 
     seed: int
@@ -52,6 +54,7 @@ class Summary:
     total_reward: float
     total_cost: float | None
     end: str
+    kpis: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers in types that JSON has."""
@@ -60,9 +63,10 @@ class Summary:
     def as_text(self) -> str:
         """The numbers in a line."""
         cost = "" if self.total_cost is None else f", cost {self.total_cost:.6g}"
+        kpis = "".join(f", {name} {value:.6g}" for name, value in self.kpis.items())
         return (
             f"seed {self.seed}: reward {self.total_reward:.6g}{cost} in {self.steps} steps "
-            f"({self.seconds:g} s), {self.end}"
+            f"({self.seconds:g} s), {self.end}{kpis}"
         )
 
 
@@ -105,70 +109,37 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
 
 
 def simulate(
-    env: FMUEnv, policy: Policy, seed: int, most_steps: int, table: TextIO | None = None
+    env: gymnasium.Env[Any, Any],
+    policy: Policy,
+    seed: int,
+    most_steps: int,
+    advance: Advance = no_progress,
 ) -> Summary:
     """Play one episode.
 
     Args:
-        env: The environment.
+        env: An ``FMUEnv``, or a wrapper around one.
         policy: Chooses the actions.
         seed: Of the episode, and of random actions.
         most_steps: The steps after which to stop.
-        table: A text file that gets one line for each step as CSV, or None. Each line is written
-            at once, so that it stays after an interruption.
+        advance: Is told of each step.
 
     Returns:
         The numbers of the episode.
     """
+    inner: Any = env.unwrapped
     env.action_space.seed(seed)
     policy.begin()
     observation, info = env.reset(seed=seed)
-    writer = None if table is None else _Writer(table, seed)
-    if writer is not None:
-        writer.add(env, info, None, "")
-    total, cost, end, begin = 0.0, None, "stopped", env.time
+    total, cost, end, begin = 0.0, None, "stopped", inner.time
     for _ in range(most_steps):
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
-        total += reward
+        total += float(reward)
         cost = float(info["cost"]) + (cost or 0.0) if "cost" in info else cost
-        end = _end(terminated, truncated, info) or end
-        if writer is not None:
-            writer.add(env, info, reward, _end(terminated, truncated, info))
+        advance(1)
         if terminated or truncated:
+            end = f"fault: {info['fault']}" if "fault" in info else ""
+            end = end or ("terminated" if terminated else "truncated")
             break
-    return Summary(seed, env.step_count, env.time - begin, total, cost, end)
-
-
-def _end(terminated: bool, truncated: bool, info: Mapping[str, Any]) -> str:
-    if "fault" in info:
-        return f"fault: {info['fault']}"
-    return "terminated" if terminated else "truncated" if truncated else ""
-
-
-class _Writer:
-    """Writes a table whose first line names the columns."""
-
-    def __init__(self, file: TextIO, seed: int) -> None:
-        self._file, self._writer, self._seed = file, csv.writer(file, lineterminator="\n"), seed
-        self._has_header = file.tell() > 0
-
-    def add(self, env: FMUEnv, info: Mapping[str, Any], reward: float | None, end: str) -> None:
-        """Write the line of a step."""
-        row = {"seed": self._seed, "time": env.time, **dict(_values(env, info))}
-        row |= {"reward": "" if reward is None else reward, "end": end}
-        if not self._has_header:
-            self._writer.writerow(row)
-            self._has_header = True
-        self._writer.writerow(row.values())
-        self._file.flush()
-
-
-def _values(env: FMUEnv, info: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The inputs, outputs, variables of the task, terms of the reward and costs by name."""
-    yield from zip(env.config.model_input_names, env.inputs, strict=True)
-    yield from env.out.items()
-    for name, value in env.variables.items():
-        if np.ndim(value) == 0 and name.isidentifier():  # others are the task's own bookkeeping
-            yield name, value
-    for group in ("reward_terms", "costs"):
-        yield from ((f"{group}.{name}", value) for name, value in info.get(group, {}).items())
+    kpis = {name: float(value) for name, value in info.get("kpis", {}).items()}
+    return Summary(seed, inner.step_count, inner.time - begin, total, cost, end, kpis)

@@ -64,7 +64,7 @@ from fmugym.testing import check_fmu_env
 FMU_PATH = {path}  # a relative path is relative to this file
 
 
-class {name}(fmugym.FMI{version}CSEnv):
+class {name}(fmugym.{base}):
     """TODO: what is there to learn?"""
 
     def __init__(self, log_level: int = logging.WARNING) -> None:
@@ -168,6 +168,12 @@ class Skeleton:
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
 
+    @property
+    def _base(self) -> str:
+        """The name of the base class."""
+        kind = "CS" if self._description.interface == "co_simulation" else "ME"
+        return f"FMI{self._description.fmi_major_version}{kind}Env"
+
     def text(self) -> str:
         """The Python file, ASCII."""
         return _PROGRAM.format(
@@ -175,7 +181,7 @@ class Skeleton:
             import_="" if self.inputs else _IMPORT_WITHOUT_INPUT,
             path=_quoted(self._fmu.path.as_posix()),
             name=self.class_name,
-            version=self._description.fmi_major_version,
+            base=self._base,
             config=textwrap.indent("\n".join(self._config()), " " * 12),
             hooks="" if self.inputs else _HOOKS_WITHOUT_INPUT,
             first_output=_quoted(self.outputs[0].name),

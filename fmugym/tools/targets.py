@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,11 +49,20 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
 
 
 def scenarios_of(target: str) -> list[str]:
-    """The names of the scenarios of a task file; none for anything else."""
+    """The names of the scenarios of a declared task; none for anything else.
+
+    Raises:
+        ConfigError: As ``maker_of``.
+    """
     path = Path(target)
-    if path.suffix.lower() == ".fmu" or not path.is_file():
-        return []
-    return list(Task.read(path).document.get("scenarios", {}))
+    if path.is_file() and path.suffix.lower() != ".fmu":
+        return _scenarios(Task.read(path))
+    with closing(maker_of(target)()) as env:
+        return _scenarios(getattr(env, "task", None))
+
+
+def _scenarios(task: Task | None) -> list[str]:
+    return [] if task is None else list(task.document.get("scenarios", {}))
 
 
 def _registered(env_id: str, arguments: dict[str, Any]) -> FMUEnv:

@@ -187,7 +187,7 @@ def disturb_in_threads(
         FMULoadError: If FMPy cannot load the FMU.
         SimulationError: If an instance alone fails.
     """
-    library = Library(candidate.open(), logger)
+    library = Library(candidate.open(), logger, spec.solving)
     try:
         lives = _two_lives(library, spec)
         if lives[0]() != lives[0].outputs:

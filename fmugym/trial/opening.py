@@ -15,13 +15,15 @@ from fmugym.errors import ConfigError, FMULoadError, LicenceError, SimulationErr
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
+from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
 from fmugym.pool.mark import Mark, Remains, remains_of
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
-from fmugym.pool.saving import SavingPool, offers_states
+from fmugym.pool.saving import SavingPool, offered_method
+from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
@@ -31,6 +33,7 @@ from fmugym.trial.trial import (
     Candidate,
     examine,
     is_known_to_harm,
+    locks_of,
     marks_of,
     note_harm,
     revise,
@@ -105,6 +108,7 @@ def make_pool(
     if reset_method not in (None, *ResetMethod):
         raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
+    spec = _with_locks(fmu, spec)
 
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
@@ -129,6 +133,12 @@ def make_pool(
     return Patience(spec.licence_wait, log).call(attempt)
 
 
+def _with_locks(fmu: FMU, spec: PoolSpec) -> PoolSpec:
+    """Let all environments of the FMU keep to the limits of its licence together."""
+    is_limited = spec.max_instances is not None or spec.initialization_interval > 0.0
+    return replace(spec, locks=locks_of(Candidate.of(fmu))) if is_limited else spec
+
+
 @licence_errors()
 def _open(
     fmu: FMU,
@@ -145,6 +155,27 @@ def _open(
         one_initialization=plan.one_initialization,
         state_files=plan.state_files,
     )
+    seats = Seats.of(fmu.path.name, spec)
+    claim = None if seats is None else seats.take(num_instances, "an environment")
+    try:
+        pool = _open_now(fmu, spec, num_instances, log, plan, call_timeout, note_crash)
+    except BaseException:
+        if claim is not None:
+            claim.release()
+        raise
+    pool.hold(claim)
+    return pool
+
+
+def _open_now(
+    fmu: FMU,
+    spec: PoolSpec,
+    num_instances: int,
+    log: logging.Logger,
+    plan: _Plan,
+    call_timeout: float | None,
+    note_crash: Callable[[str], None],
+) -> SavingPool:
     if plan.isolation == "process":
         pool = ProcessPool(
             fmu,
@@ -224,7 +255,8 @@ class _Trust:
     ) -> _Trust:
         """Look up what earlier trials have shown; without a spare instance there is no other."""
         candidate, tried = Candidate.of(fmu), _tried(spec)
-        if not offers_states(fmu.description, replace(spec, reset_method=plan.method)):
+        method = offered_method(fmu.description, replace(spec, reset_method=plan.method))
+        if method is SaveMethod.REPLAY:
             return cls(spec, bool)
         known: bool | None = is_bundled(fmu.path)
         if not known:
@@ -437,7 +469,8 @@ def _mark(candidate: Candidate) -> Mark | None:
 def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:
     """Compare two instances in this process, in which the FMU will run without a trial anyway."""
     try:
-        return disturb_in_turn(candidate, spec)
+        with taking(Seats.of(candidate.path.name, spec), 2, "a trial"):
+            return disturb_in_turn(candidate, spec)
     except LicenceError:
         raise
     except SimulationError:  # a lone instance fails too: it needs the caller's values

@@ -15,10 +15,11 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.tape import Tape
 from fmugym.trial.rehearsal import difference, tolerance_of
@@ -90,6 +91,9 @@ class Repetition:
             if not fresh.equals(self._play(tape)):
                 self._log.info("%s: two fresh instances differ, nothing can be compared", name)
                 return False
+        except LicenceError as error:
+            self._log.info("%s: no spare instance for now: %s", name, error)
+            return True
         except FMUGymError as error:
             self._log.info("%s: no spare instance plays an episode again: %s", name, error)
             return False
@@ -97,6 +101,11 @@ class Repetition:
 
     def _play(self, tape: Tape) -> _Run:
         """Play a recorded episode on a fresh instance."""
+        seats = Seats.of(self._candidate.path.name, self._spec)
+        with taking(seats, 1, "a rehearsal"):
+            return self._play_now(tape)
+
+    def _play_now(self, tape: Tape) -> _Run:
         spec = replace(self._spec, reset_method=ResetMethod.RESET, leak_limit=None)
         pool = ProcessPool(
             self._candidate.open(),

@@ -14,13 +14,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, PoolSpec
-from fmugym.pool.bundle import Bundle
+from fmugym.pool.bundle import Bundle, SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.saving import SavingPool
+from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.rehearsal import Starts
@@ -72,7 +73,12 @@ def do_states_work(candidate: Candidate, spec: PoolSpec, starts: Starts | None) 
     known = known_to_work(candidate, spec, starts)
     if known is not None:
         return known
-    grade = _grade(Request(candidate, spec, starts, resume=True))
+    try:
+        with taking(Seats.of(candidate.path.name, spec), 1, "a trial of saved states"):
+            grade = _grade(Request(candidate, spec, starts, resume=True))
+    except LicenceError as error:
+        logger.warning("snapshots keep the inputs of the episode for now: %s", error)
+        return False
     note_resuming(candidate, spec, starts, grade)
     if grade is not Grade.BITWISE:
         logger.warning(
@@ -88,7 +94,10 @@ def _grade(request: Request) -> Grade:
     first = run(request)
     if first.sample is None:
         return Grade(first.answer.get("resuming", Grade.FAILS))
-    second = run(replace(request, resume=pickle.loads(first.sample)))
+    halfway: Halfway = pickle.loads(first.sample)
+    if halfway.state.method is not SaveMethod.STATE:  # copies stay in their process
+        return Grade.BITWISE
+    second = run(replace(request, resume=halfway))
     return Grade(second.answer.get("resuming", Grade.FAILS))
 
 

@@ -34,11 +34,12 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import FMULoadError, LicenceError, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, LicenceError, unknown_name
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
+from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
@@ -54,6 +55,7 @@ __all__ = [
     "is_known_to_harm",
     "known_resuming",
     "known_verdict",
+    "locks_of",
     "marks_of",
     "meet",
     "note_harm",
@@ -98,15 +100,23 @@ class Candidate:
     limits: ArchiveLimits
     preload: tuple[str, ...]
     timeout: float | None
+    interface: str = "co_simulation"
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
-        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout)
+        interface = fmu.description.interface
+        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface)
 
     def open(self) -> FMU:
         """Open the FMU without another trial."""
-        return FMU(self.path, limits=self.limits, preload=self.preload, probe_timeout=None)
+        return FMU(
+            self.path,
+            limits=self.limits,
+            preload=self.preload,
+            probe_timeout=None,
+            interface=self.interface,
+        )
 
     @property
     def exempt(self) -> bool:
@@ -225,13 +235,13 @@ def meet(fmu: FMU) -> None:
 
 def known_verdict(fmu: FMU) -> Verdict | None:
     """The verdict of the last trial of an FMU on this machine; None if there was none."""
-    return Verdict.from_text(recall(_content_key(fmu.path)))
+    return Verdict.from_text(recall(_content_key(fmu.path, fmu.description.interface)))
 
 
 def state_files(fmu: FMU) -> str:
     """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
-        return str(cache_folder() / "states" / _content_key(fmu.path))
+        return str(cache_folder() / "states" / _content_key(fmu.path, fmu.description.interface))
     except RuntimeError:  # there is no folder for caches
         return ""
 
@@ -242,7 +252,31 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
     Raises:
         RuntimeError: If there is no folder for caches.
     """
-    return cache_folder() / "marks", _content_key(candidate.path)
+    return cache_folder() / "marks", _content_key(candidate.path, candidate.interface)
+
+
+def locks_of(candidate: Candidate) -> str:
+    """The place of the files by which environments of an FMU keep to the limits of a licence.
+
+    They are in the cache folder, or in the user's own one for temporary files.
+
+    Returns:
+        The beginning of their paths.
+
+    Raises:
+        ConfigError: If there is no folder for them.
+    """
+    name = f"fmugym-{getattr(os, 'getuid', int)()}"
+    try:
+        folder = cache_folder() / "licences"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        folder = Path(tempfile.gettempdir()) / name / "licences"
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise ConfigError(f"the limits of a licence need the folder {folder}: {error}") from None
+    return str(folder / content_of(candidate.path))
 
 
 def examine(
@@ -279,7 +313,8 @@ def examine(
     request = Request(candidate, spec, starts, several, alone)
     if known is not None and known.complete and _answers(known, spec, several=False):
         request = replace(request, known=known, check_memory=not known.isolate)
-    found = _examine(request, must_survive)
+    with taking(Seats.of(candidate.path.name, spec), 2 if several else 1, "a trial"):
+        found = _examine(request, must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found
@@ -293,13 +328,13 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
 
 def is_known_to_harm(candidate: Candidate) -> bool:
     """Whether the cache says that an FMU harms its process."""
-    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
     return known is not None and known.isolate
 
 
 def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
     """Add the harm to its process that the FMU has done with any other config."""
-    known = Verdict.from_text(recall(_content_key(candidate.path)))
+    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
     if known is None or not known.isolate or verdict.isolate:
         return verdict
     reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
@@ -330,7 +365,10 @@ def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> No
     An FMU that is found to harm its process counts as harmful with every other config, too.
     """
     verdict = _with_harm(verdict, candidate)
-    for key in (_verdict_key(candidate, spec, starts), _content_key(candidate.path)):
+    for key in (
+        _verdict_key(candidate, spec, starts),
+        _content_key(candidate.path, candidate.interface),
+    ):
         remember(key, verdict.to_text())
 
 
@@ -388,7 +426,9 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         *(name, verdict.instances, verdict.initializations),
     )
     if verdict.complete:
-        remember(_content_key(request.candidate.path), verdict.to_text())
+        remember(
+            _content_key(request.candidate.path, request.candidate.interface), verdict.to_text()
+        )
     return verdict
 
 
@@ -634,9 +674,16 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     """The scope of a verdict on resets and neighbours."""
-    tried = replace(spec, initialization_interval=0.0, licence_wait=0.0, keep_states=False)
+    tried = replace(
+        spec,
+        initialization_interval=0.0,
+        max_instances=None,
+        locks="",
+        licence_wait=0.0,
+        keep_states=False,
+    )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
-    return f"{_content_key(candidate.path)}-{asked}"
+    return f"{_content_key(candidate.path, candidate.interface)}-{asked}"
 
 
 def content_of(path: Path) -> str:
@@ -645,9 +692,12 @@ def content_of(path: Path) -> str:
     return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
 
-def _content_key(path: Path) -> str:
-    """The scope of a verdict: this content, this platform, and this version of the package."""
-    return _digest(f"{content_of(path)} {fmpy.platform_tuple} {_version()}".encode())
+def _content_key(path: Path, interface: str) -> str:
+    """The scope of a verdict: content, interface, platform, and version of the package."""
+    scope = f"{content_of(path)} {fmpy.platform_tuple} {_version()}"
+    return _digest(
+        f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode()
+    )
 
 
 @functools.lru_cache(maxsize=256)

@@ -176,7 +176,8 @@ def _step_once(request: Request, native: bool, notes: Notes) -> None:
     fmu = request.candidate.open()
     spec = default_spec(fmu)
     if request.spec is not None:
-        spec = replace(spec, initialization_interval=request.spec.initialization_interval)
+        interval, locks = request.spec.initialization_interval, request.spec.locks
+        spec = replace(spec, initialization_interval=interval, locks=locks)
     notes.stage("loading and instantiation")
     pool = local_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native, threads=1)
     try:

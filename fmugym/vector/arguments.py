@@ -196,7 +196,11 @@ def split_options(options: Any, num_envs: int) -> tuple[dict[str, Any], MaskArra
         ConfigError: If the options are neither None nor a dict, or the mask does not fit.
     """
     if type(options) is dict and len(options) == 1 and "reset_mask" in options:  # most common
-        return {}, checked_mask(options["reset_mask"], num_envs)
+        mask = options["reset_mask"]
+        if type(mask) is np.ndarray and mask.dtype is _BOOL and mask.shape == (num_envs,):
+            copy = mask.copy()  # first, because the caller's array may change
+            if b"\x01" in copy.tobytes():  # a fifth of the time of any()
+                return {}, copy
     remaining = {} if options is None else check_mapping("the options of reset", options)
     return remaining, checked_mask(remaining.pop("reset_mask", None), num_envs)
 
@@ -209,10 +213,6 @@ def checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """
     if mask is None:
         return np.ones(num_envs, np.bool_)
-    if type(mask) is np.ndarray and mask.dtype == _BOOL and mask.shape == (num_envs,):
-        copy: MaskArray = mask.copy()  # first, because the caller's array may change
-        if b"\x01" in copy.tobytes():  # a fifth of the time of any()
-            return copy
     try:
         array = np.array(mask)
         fits = array.shape == (num_envs,) and array.dtype == np.bool_ and bool(array.any())

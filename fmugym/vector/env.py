@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import logging
 import pickle
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -216,7 +217,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
-        self._open_pool("reset")
+        if self.closed or self._background.is_pending:
+            self._open_pool("reset")
         remaining, mask = split_options(options, self.num_envs)
         if not self._is_ready and not mask.all():
             when = "reset after an exception" if self._started else "first reset"
@@ -248,7 +250,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        if not self._is_ready or self.closed or self._background.is_pending or self._waits:
+        if not self._is_ready or self.closed or self._background.is_pending:
+            self._refuse_step("step")
+        if self._waits and self._engine.any_ended:
             self._require_ready("step")
         return self._step(actions)
 
@@ -452,10 +456,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         candidates.parameters = tunable_values(self._prototype, parameters, candidates.count)
         present = self.save_state() if self._is_ready else None
         start = self._start_of_rollout(snapshot, present, candidates.count)
-        try:
+        with self._returning_to(present):
             parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
             return joined_rollouts(parts, candidates.count)
+
+    @contextmanager
+    def _returning_to(self, present: Snapshot | None) -> Iterator[None]:
+        """Return to the present episodes afterwards, or to none; nothing starts in between."""
+        engine = self._engine
+        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
+        try:
+            yield
         finally:
+            engine.starts_at_ends = starts_at_ends
             self._is_ready = False
             if present is not None:
                 self._place(present, np.arange(self.num_envs))
@@ -489,11 +502,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             if engine.has_moved:  # a step has failed: the engine knows what follows
                 self._begin(start, places, candidates)
         first = None if actions is not None else engine.observe(np.arange(self.num_envs))
-        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
-        try:
-            return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
-        finally:
-            engine.starts_at_ends = starts_at_ends
+        return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
 
     def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
         """Bring all environments to the places where candidates begin."""

@@ -14,7 +14,14 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.env import FMUVectorEnv
 
-__all__ = ["Derivatives", "derivatives"]
+__all__ = [
+    "Derivatives",
+    "checked_trajectory",
+    "derivatives",
+    "float_box",
+    "moved_both_ways",
+    "precise_step",
+]
 
 
 class Derivatives(NamedTuple):
@@ -63,11 +70,11 @@ def derivatives(
         SimulationError: If an episode ends before the last step, where nothing can be
             differentiated.
     """
-    space = _float_box(envs.single_action_space, "action")
-    seen = _float_box(envs.single_observation_space, "observation")
+    space = float_box(envs.single_action_space, "action")
+    seen = float_box(envs.single_observation_space, "observation")
     checked_snapshot(snapshot, length=1)
-    nominal = _checked(space, actions)
-    delta = _precise_step(seen) if step is None else check_number("step", step, positive=True)
+    nominal = checked_trajectory(space, actions)
+    delta = precise_step(seen) if step is None else check_number("step", step, positive=True)
     candidates, widths = _moved(space, nominal, delta)
     found = envs.rollout(snapshot, candidates)
     if found.lengths.min() < len(nominal):
@@ -86,19 +93,29 @@ def derivatives(
     )
 
 
-def _precise_step(space: spaces.Box) -> float:
+def precise_step(space: spaces.Box) -> float:
     """The step with the least error of a central difference, for numbers of this precision."""
     dtype: Any = space.dtype
     return float(np.cbrt(float(np.finfo(dtype).eps)))
 
 
-def _float_box(space: Any, what: str) -> spaces.Box:
+def float_box(space: Any, what: str) -> spaces.Box:
+    """Return a space in which something can be differentiated.
+
+    Raises:
+        ConfigError: If it is no box of floats.
+    """
     if not isinstance(space, spaces.Box) or space.dtype.kind != "f":
         raise ConfigError(f"derivatives need {what}s in a Box of floats, not in {space}")
     return space
 
 
-def _checked(space: spaces.Box, actions: Any) -> npt.NDArray[Any]:
+def checked_trajectory(space: spaces.Box, actions: Any) -> npt.NDArray[Any]:
+    """Return nominal actions as an array of shape (horizon, ...) and of the type of the space.
+
+    Raises:
+        ConfigError: If they do not fit.
+    """
     try:
         nominal = np.array(actions, space.dtype)
     except (TypeError, ValueError):
@@ -114,18 +131,37 @@ def _moved(
     space: spaces.Box, nominal: npt.NDArray[Any], step: float
 ) -> tuple[npt.NDArray[Any], FloatArray]:
     """The nominal actions, then two candidates for each element; and how far these are apart."""
+    *moved, widths = moved_both_ways(space, nominal, step)
+    candidates = np.repeat(nominal[None], 2 * nominal.size + 1, axis=0)
+    flat = candidates.reshape(len(candidates), -1)
+    elements = np.arange(nominal.size)
+    for first, values in zip((1, 2), moved, strict=True):
+        flat[first + 2 * elements, elements] = values.reshape(-1)
+    return candidates, widths.reshape(-1)
+
+
+def moved_both_ways(
+    space: spaces.Box, nominal: npt.NDArray[Any], step: float
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any], FloatArray]:
+    """Move each element of actions up and down, and not beyond the bounds of the space.
+
+    Args:
+        space: That of one action.
+        nominal: Shape (horizon, ...).
+        step: How far, as a fraction of the width of the space.
+
+    Returns:
+        All moved up, all moved down, and how far these are apart, each of the shape of ``nominal``.
+    """
     high, low = (np.broadcast_to(limit, nominal.shape) for limit in (space.high, space.low))
     with np.errstate(over="ignore", invalid="ignore"):
         width = np.subtract(high, low, dtype=np.float64)
     width[~np.isfinite(width)] = 1.0
-    candidates = np.repeat(nominal[None], 2 * nominal.size + 1, axis=0)
-    flat = candidates.reshape(len(candidates), -1)
-    elements = np.arange(nominal.size)
-    for first, sign in ((1, 1.0), (2, -1.0)):
-        moved = nominal + sign * step * width
-        flat[first + 2 * elements, elements] = np.clip(moved, low, high).reshape(-1)
-    widths = flat[1 + 2 * elements, elements].astype(np.float64) - flat[2 + 2 * elements, elements]
-    return candidates, widths
+    up, down = (
+        np.clip(nominal + sign * step * width, low, high).astype(nominal.dtype)
+        for sign in (1.0, -1.0)
+    )
+    return up, down, np.subtract(up, down, dtype=np.float64)
 
 
 def _differences(values: npt.NDArray[Any], widths: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
 from fmugym.task.values import EpisodeVariables, NamedValues
 
-__all__ = ["batched", "column", "copied", "take"]
+__all__ = ["batched", "column", "copied", "parts", "take"]
 
 
 def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) -> Readings:
@@ -76,6 +76,24 @@ def take(values: Any, index: int) -> Any:
     """Take one environment's part of an array that has the environments in its last axis."""
     part = np.asarray(values)[..., index]
     return part.item() if part.ndim == 0 and part.dtype.kind == "f" else part[()]
+
+
+def parts(batch: Readings, indices: Any) -> Readings:
+    """Return copies of what the hooks of some environments of a batch read."""
+    names = ("state", "previous_state", "inputs", "action", "previous_action", "step_count", "done")
+    rows = {name: np.asarray(getattr(batch, name))[..., indices] for name in names}
+    outputs: Any = np.asarray(batch.values)[..., indices]
+    variables = EpisodeVariables(batch.variables)
+    variables.update({name: np.asarray(v)[..., indices] for name, v in batch.variables.items()})
+    parameters = {name: np.asarray(v)[..., indices] for name, v in batch.parameters.items()}
+    return replace(
+        batch,
+        values=outputs,
+        out=NamedValues("output", list(batch.out), lambda: outputs),
+        parameters=MappingProxyType(parameters),
+        variables=variables,
+        **rows,
+    )
 
 
 def copied(batch: Readings) -> Readings:

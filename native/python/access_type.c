@@ -4,14 +4,14 @@
 
 PyTypeObject *access_type;
 
-const Fmi *fmi_of(int version) {
-    static const Fmi *const versions[] = {&fmi1, &fmi2, &fmi3};
+const Fmi *fmi_of(int version, bool exchange) {
+    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3}, {NULL, &exchange2, NULL}};
 
     if (version < 1 || version > 3) {
         PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);
         return NULL;
     }
-    return versions[version - 1];
+    return versions[exchange][version - 1];
 }
 
 bool is_access(const PyPool *self, PyObject *object) {
@@ -40,13 +40,14 @@ static bool check_types(const uint8_t *types, Py_ssize_t count, Py_ssize_t size)
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     const char *types, *references;
     Py_ssize_t count, size;
-    int version;
+    int version, exchange = 0;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "iy#y#", &version, &types, &count, &references, &size)) {
+    if (!PyArg_ParseTuple(args, "iy#y#|p", &version, &types, &count, &references, &size,
+                          &exchange)) {
         return NULL;
     }
-    const Fmi *fmi = fmi_of(version);
+    const Fmi *fmi = fmi_of(version, exchange);
     if (fmi == NULL || !check_types((const uint8_t *)types, count, size)) {
         return NULL;
     }

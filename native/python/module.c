@@ -63,6 +63,22 @@ static PyObject *initializations(PyObject *module, PyObject *unused) {
     return PyLong_FromUnsignedLongLong(number_of_initializations());
 }
 
+static PyObject *claim_initialization(PyObject *module, PyObject *args) {
+    PyObject *array;
+    Py_buffer buffer = {0};
+    double interval;
+
+    (void)module;
+    if (!PyArg_ParseTuple(args, "Od", &array, &interval) ||
+        !take_vector(array, &buffer, WRITTEN, "last_initialization", ITEM_INT64, 1)) {
+        return NULL;
+    }
+    const Pace pace = {(uint64_t)(interval * 1e9), buffer.buf};
+    const uint64_t next = pace_claim(&pace), now = clock_now();
+    release_buffer(&buffer);
+    return PyFloat_FromDouble(next > now ? 1e-9 * (double)(next - now) : 0.0);
+}
+
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
@@ -72,6 +88,7 @@ static PyMethodDef functions[] = {
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
+    {"claim_initialization", claim_initialization, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -207,6 +207,61 @@ PyObject *py_keep_records(PyObject *object, PyObject *unused) {
 }
 
 typedef struct {
+    int64_t index;
+    const Access *start;
+    const char *starts, *inputs;
+    size_t rows;
+} Replacing;
+
+static void do_replace(PyPool *self, bool alone, void *context) {
+    const Replacing *r = context;
+    const size_t index = (size_t)r->index, width = self->pool.settings.inputs->count;
+
+    (void)alone;
+    record_begin(&self->pool, index, r->start, (const double *)(const void *)r->starts);
+    for (size_t row = 0; row < r->rows; row++) { /* the data of bytes are aligned to 8 bytes */
+        record_add(&self->pool, index, (const double *)(const void *)r->inputs + row * width);
+    }
+}
+
+/* Takes an index, an Access, and as bytes the start values and the inputs; and how many steps. */
+static bool take_replacing(PyPool *self, PyObject *const *args, Replacing *r) {
+    char *starts, *inputs;
+    Py_ssize_t size_of_starts, size_of_inputs;
+
+    r->index = PyNumber_AsSsize_t(args[0], PyExc_IndexError);
+    r->rows = PyLong_AsSize_t(args[4]);
+    if (PyErr_Occurred() || !are_instances(self, &r->index, 1) || !is_access(self, args[1]) ||
+        PyBytes_AsStringAndSize(args[2], &starts, &size_of_starts) < 0 ||
+        PyBytes_AsStringAndSize(args[3], &inputs, &size_of_inputs) < 0) {
+        return false;
+    }
+    const size_t row = self->pool.settings.inputs->count * sizeof(double);
+    r->start = &((PyAccess *)args[1])->access;
+    r->starts = starts;
+    r->inputs = inputs;
+    const bool fits = (size_t)size_of_starts == r->start->count * sizeof(double) &&
+                      (row == 0 ? size_of_inputs == 0
+                                : (size_t)size_of_inputs % row == 0 &&
+                                      (size_t)size_of_inputs / row == r->rows);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the record is damaged");
+    }
+    return fits;
+}
+
+PyObject *py_replace_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    Replacing replacing = {.rows = 0};
+
+    if (!has_arguments(nargs, 5) || !take_replacing(self, args, &replacing) ||
+        !perform(self, ALWAYS_SHORT, do_replace, &replacing)) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+typedef struct {
     size_t index;
     Record record; /* a copy */
     bool found, out_of_memory;

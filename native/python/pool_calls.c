@@ -1,6 +1,7 @@
 /* The methods of the type Pool that step, reset and read instances. */
 
 #include <stdlib.h>
+#include <string.h>
 
 #include "python.h"
 
@@ -328,21 +329,19 @@ PyObject *py_begin_by(PyObject *object, PyObject *const *args, Py_ssize_t nargs)
 }
 
 static void do_copy_costs(PyPool *self, bool alone, void *context) {
-    double *costs = context;
     (void)alone;
-    for (int i = 0; i < OPERATIONS; i++) {
-        costs[i] = self->pool.costs[i].low;
-    }
+    memcpy(context, self->pool.costs, sizeof self->pool.costs);
 }
 
 PyObject *py_costs(PyObject *object, PyObject *unused) {
-    double costs[OPERATIONS];
+    Cost costs[OPERATIONS];
 
     (void)unused;
     if (!perform((PyPool *)object, ALWAYS_SHORT, do_copy_costs, costs)) {
         return NULL;
     }
-    return Py_BuildValue("(ddd)", costs[STEP], costs[RESET], costs[MIXED]);
+    return Py_BuildValue("(ddddd)", costs[STEP].low, costs[RESET].low, costs[MIXED].low,
+                         costs[PLAY].low, costs[RESET].first);
 }
 
 PyObject *py_uses_states(PyObject *object, PyObject *unused) {

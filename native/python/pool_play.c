@@ -472,7 +472,7 @@ static bool take_observations(PyPool *self, const Playing *playing, PyObject *se
  * integers, Q for those without sign, ? for Booleans. */
 static bool has_letter(const Py_buffer *buffer, int letter) {
     const char *format = buffer->format == NULL ? "B" : buffer->format;
-    const char *const letters = letter == 'd'   ? "fd"
+    const char *const letters = letter == 'd'   ? "fde"
                                 : letter == 'q' ? "bhilq"
                                 : letter == 'Q' ? "BHILQ"
                                                 : "?";
@@ -769,6 +769,14 @@ static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *co
                        (Py_ssize_t)playing->play.draws->count, n);
 }
 
+/* How many instances had trouble, and whether any episode is at its end now. */
+static PyObject *start_result(const Playing *playing, const PyTurn *t) {
+    const Play *play = &playing->play;
+    PyObject *any = memchr(play->ended, 1, play->count) == NULL ? Py_False : Py_True;
+
+    return Py_BuildValue("(nO)", (Py_ssize_t)t->troubled, any);
+}
+
 static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     PyTurn t;
@@ -781,7 +789,7 @@ static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *ar
         done = perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self);
     }
     release_turn(playing, &t);
-    return done ? PyLong_FromSize_t(t.troubled) : NULL;
+    return done ? start_result(playing, &t) : NULL;
 }
 
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {

@@ -3,6 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "halves.h"
 #include "programs.h"
 #include "single.h"
 
@@ -361,17 +362,28 @@ static bool fits(const Prepared *p, const Py_buffer *b) {
     return same;
 }
 
-static bool has_nan(const Prepared *p) {
-    const Single *s = &p->single;
+static bool is_nan(char letter, const void *values, size_t i) {
+    const double *doubles = values;
+    const float *floats = values;
+    const Half *halves = values;
 
-    for (size_t i = 0; i < s->elements; i++) {
-        if (p->letter == 'd' ? ((double *)(void *)s->next)[i] != ((double *)(void *)s->next)[i]
-                             : p->letter == 'f' && ((float *)(void *)s->next)[i] !=
-                                                       ((float *)(void *)s->next)[i]) {
-            return true;
-        }
+    switch (letter) {
+    case 'd':
+        return doubles[i] != doubles[i];
+    case 'f':
+        return floats[i] != floats[i];
+    default:
+        return letter == 'e' && half_is_nan(halves[i]);
     }
-    return false;
+}
+
+static bool has_nan(const Prepared *p) {
+    bool found = false;
+
+    for (size_t i = 0; i < p->single.elements && !found; i++) {
+        found = is_nan(p->letter, p->single.next, i);
+    }
+    return found;
 }
 
 /* Whether this is an array as the action space has it, without NaN. Sets no exception. */

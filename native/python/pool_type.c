@@ -196,7 +196,7 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *categories, *mark, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *mark, *solving, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, private_libraries, logging, can_save;
@@ -204,6 +204,7 @@ typedef struct {
     long long substeps, warm_up_steps, retries;
     const char *sampling;
     Py_ssize_t samplings;
+    double pace;
 } Arguments;
 
 bool parse_group(PyObject *group, const char *format, char **names, ...) {
@@ -220,11 +221,11 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "model",   "token",  "resources",  "paths",
-                            "private", "logging", "states", "categories", "mark", NULL};
+                            "private", "logging", "states", "categories", "mark", "solving", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iyyyO!pppO!O:library", names, &a->version, &s->model, &s->token,
+    return parse_group(group, "$iyyyO!pppO!OO:library", names, &a->version, &s->model, &s->token,
                        &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark);
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -233,11 +234,11 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
                             "rebuilds",   "reloads",       "one_initialization",
                             "pace",       "start_outputs", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLpppp(dLL)z#:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLppppdz#:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization, &s->pace_interval, &s->turn, &s->turns,
-                       &s->start_outputs, &a->start_outputs_size);
+                       &a->one_initialization, &a->pace, &s->start_outputs,
+                       &a->start_outputs_size);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -248,10 +249,12 @@ static bool parse_variables(PyObject *group, Arguments *a) {
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
-    static char *names[] = {"inputs", "outputs", "statuses", "observations", "health", NULL};
+    static char *names[] = {"inputs",       "outputs", "statuses",
+                            "observations", "health",  "last_initialization", NULL};
     PyObject **arrays = self->arrays;
-    return parse_group(group, "$OOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
-                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH]);
+    return parse_group(group, "$OOOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
+                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
+                       &arrays[LAST_INITIALIZATION]);
 }
 
 static bool parse(PyPool *self, PyObject *args, PyObject *kwargs, Arguments *a) {
@@ -292,7 +295,7 @@ static bool check_start_outputs(const PyPool *self, const Arguments *a) {
 }
 
 static bool check_accesses(const Arguments *a) {
-    const Fmi *fmi = fmi_of(a->version);
+    const Fmi *fmi = fmi_of(a->version, a->solving != Py_None);
 
     if (fmi == NULL) {
         return false;
@@ -370,6 +373,47 @@ static bool take_strings(PyPool *self, PyObject *strings) {
     return true;
 }
 
+static bool take_method(const char *name, Solving *solving) {
+    static const Method *const methods[] = {&euler, &rk4, &dormand_prince, &rosenbrock};
+
+    for (size_t i = 0; i < sizeof methods / sizeof *methods; i++) {
+        if (strcmp(methods[i]->name, name) == 0) {
+            solving->method = methods[i];
+            return true;
+        }
+    }
+    PyErr_Format(PyExc_ValueError, "there is no solver %s", name);
+    return false;
+}
+
+/* Takes the tuple that fmugym/pool/native.py makes. The references stay in the pool's arguments. */
+static bool take_solving(PyObject *tuple, Solving *solving) {
+    const char *method, *states, *rates;
+    Py_ssize_t count, indicators, states_size, rates_size;
+    int completes;
+
+    if (tuple == Py_None) {
+        return true;
+    }
+    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#", &method, &solving->tolerance, &solving->max_step,
+                          &count, &indicators, &completes, &states, &states_size, &rates,
+                          &rates_size)) {
+        return false;
+    }
+    const Py_ssize_t wanted = count * (Py_ssize_t)sizeof(uint32_t);
+    const bool sound = states == NULL || (states_size == wanted && rates_size == wanted);
+    if (count < 0 || indicators < 0 || !sound || !(solving->tolerance > 0.0)) {
+        PyErr_SetString(PyExc_ValueError, "a number of the solver is out of range");
+        return false;
+    }
+    solving->states = (size_t)count;
+    solving->indicators = (size_t)indicators;
+    solving->completes = completes;
+    solving->state_references = (const uint32_t *)(const void *)states;
+    solving->rate_references = (const uint32_t *)(const void *)rates;
+    return take_method(method, solving);
+}
+
 static bool take_arrays(PyPool *self, const Arguments *a) {
     PyObject *const *arrays = self->arrays;
     Py_buffer *buffers = self->buffers;
@@ -384,13 +428,15 @@ static bool take_arrays(PyPool *self, const Arguments *a) {
            take_matrix(arrays[OBSERVATIONS], &buffers[OBSERVATIONS], WRITTEN, "observations",
                        ITEM_FLOAT32, n, a->num_observed) &&
            take_matrix(arrays[HEALTH], &buffers[HEALTH], WRITTEN, "health", ITEM_INT64, n,
-                       HEALTH_COUNTS);
+                       HEALTH_COUNTS) &&
+           take_vector(arrays[LAST_INITIALIZATION], &buffers[LAST_INITIALIZATION], WRITTEN,
+                       "last_initialization", ITEM_INT64, 1);
 }
 
 static bool settle(PyPool *self, const Arguments *a) {
     Settings *s = &self->pool.settings;
 
-    s->fmi = fmi_of(a->version);
+    s->fmi = fmi_of(a->version, a->solving != Py_None);
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;
     s->can_save = a->can_save && s->fmi->get_state != NULL;
@@ -415,7 +461,9 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;
-    return take_mark(a->mark, &s->mark) &&
+    s->pace.interval = (uint64_t)(a->pace * 1e9);
+    s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
+    return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }
@@ -500,6 +548,7 @@ static PyMethodDef methods[] = {
     FAST("unbundle", py_unbundle),
     {"keep_records", py_keep_records, METH_NOARGS, NULL},
     {"record_of", py_record_of, METH_O, NULL},
+    {"replace_record", (PyCFunction)(void (*)(void))py_replace_record, METH_FASTCALL, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"recycle", py_recycle, METH_NOARGS, NULL},
     FAST("record", py_record),

@@ -22,29 +22,38 @@ PyObject *py_is_free_loop(PyObject *module, PyObject *capsule) {
     return info == NULL ? NULL : PyBool_FromLong(info->loop != NULL && !info->needs_python);
 }
 
-static bool take_call(PyObject *call, Called *called) {
-    PyObject *capsule;
-    Py_ssize_t sizes[CALL_INPUTS + 1] = {0};
-    int inputs;
+static bool take_sizes(PyObject *sizes, Called *called) {
+    const Py_ssize_t values = PyTuple_Size(sizes);
+    bool sound = values <= CALL_VALUES;
 
-    if (!PyArg_ParseTuple(call, "Oi(nnnn);a call is a loop, a number of inputs and sizes", &capsule,
-                          &inputs, &sizes[0], &sizes[1], &sizes[2], &sizes[3])) {
+    for (Py_ssize_t i = 0; i < values && sound; i++) {
+        called->sizes[i] = PyLong_AsSsize_t(PyTuple_GetItem(sizes, i));
+        sound = called->sizes[i] >= 0 && called->sizes[i] <= 8;
+    }
+    called->values = (uint16_t)values;
+    return sound;
+}
+
+static bool take_call(PyObject *call, Called *called) {
+    PyObject *capsule, *sizes;
+    int inputs, kept;
+
+    if (!PyArg_ParseTuple(call, "OiO!i;a call is a loop, a number of inputs, sizes and a number",
+                          &capsule, &inputs, &PyTuple_Type, &sizes, &kept)) {
         return false;
     }
     const LoopInfo *info = PyCapsule_GetPointer(capsule, LOOP);
     if (info == NULL) {
         return false;
     }
-    bool sound = info->loop != NULL && !info->needs_python && inputs > 0 && inputs <= CALL_INPUTS;
-    for (int i = 0; i <= CALL_INPUTS; i++) {
-        sound = sound && sizes[i] >= 0 && sizes[i] <= 8;
-        called->sizes[i] = sizes[i];
-    }
+    const bool sound = take_sizes(sizes, called) && info->loop != NULL && !info->needs_python &&
+                       inputs > 0 && inputs <= kept && kept < called->values;
     called->loop = info->loop;
     called->context = info->context;
     called->auxiliary = info->auxiliary;
     called->inputs = (uint16_t)inputs;
-    if (!sound) {
+    called->kept = (uint16_t)kept;
+    if (!sound && !PyErr_Occurred()) {
         PyErr_SetString(PyExc_ValueError, "a loop cannot be called");
     }
     return sound;
@@ -103,7 +112,7 @@ static bool take_calls(PyProgram *p, PyObject *calls) {
 
 /* Reads how large the arrays of observations must be. */
 static bool measure_seen(PyProgram *p, Py_ssize_t count) {
-    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1};
+    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1, 2};
 
     for (size_t i = 0; i < p->program.number_of_slots; i++) {
         const Slot *slot = &p->program.slots[i];

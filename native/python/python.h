@@ -13,7 +13,7 @@
 #include "buffers.h"
 #include "pool.h"
 
-enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
+enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, LAST_INITIALIZATION, BUFFERS };
 
 typedef struct {
     PyObject_HEAD Access access;
@@ -54,7 +54,7 @@ extern PyObject *closed_error; /* raised by calls of a closed pool */
 extern PyType_Spec access_spec, draws_spec, mark_spec, snapshot_spec, pool_spec;
 
 /* The table of an FMI version; NULL with an exception if there is none. */
-const Fmi *fmi_of(int version);
+const Fmi *fmi_of(int version, bool exchange);
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
 
@@ -103,6 +103,7 @@ PyObject *py_adopt(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_keep_records(PyObject *object, PyObject *unused);
+PyObject *py_replace_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_record_of(PyObject *object, PyObject *index);
 PyObject *py_uses_states(PyObject *object, PyObject *unused);
 

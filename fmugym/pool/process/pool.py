@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -120,6 +121,7 @@ class ProcessPool(SavingPool):
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
+            began = time.perf_counter()
             concerned = self._crew.of_any(mask)
             if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
@@ -127,7 +129,7 @@ class ProcessPool(SavingPool):
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
             self._crew.note_lost()
-            self._note_reset(variables, values, mask)
+            self._note_reset(variables, values, mask, time.perf_counter() - began)
 
     def _as_mask(self, mask: MaskArray | None) -> MaskArray:
         if mask is None:
@@ -218,21 +220,26 @@ class ProcessPool(SavingPool):
         if skip is not None or self._crew.any_lost:
             code = Code.STEP_SOME
             np.logical_or(self._crew.lost, False if skip is None else skip, out=self._mask)
+        began = time.perf_counter() if self._is_recording else 0.0
         replies = self._crew.run(
             "a step", self._crew.able, lambda supervisor: supervisor.step(code)
         )
         if self._is_recording:
-            self._record_step(skip)
+            self._record_step(skip, time.perf_counter() - began)
         if not self._crew.any_lost and Code.TROUBLE not in replies.values():
             return 0
         self._crew.note_lost()
         return int(np.count_nonzero(self.statuses > Status.WARNING))
 
-    def _record_step(self, skip: MaskArray | None) -> None:
+    def _record_step(self, skip: MaskArray | None, seconds: float) -> None:
         if self._crew.lost[0]:  # something else may have ended the process
             self._drop_recording()
         else:
-            self._note_step(skip)
+            self._note_step(skip, seconds)
+
+    @property
+    def _one_by_one(self) -> int:
+        return -(-self.num_instances // self.workers)
 
     def begin_by(self, method: ResetMethod) -> bool:
         """See ``Pool.begin_by``; the libraries of workers cannot be loaded anew."""
@@ -345,6 +352,15 @@ class ProcessPool(SavingPool):
             record: Record | None = replies.get(supervisor)
             return record
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        with self._lock:
+            supervisor = self._crew.of(index)
+            within = index - supervisor.block.start
+            self._crew.run(
+                "a change", [supervisor], lambda s: s.tell("replace_record", within, record)
+            )
+
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
         with self._lock:
@@ -372,18 +388,31 @@ class ProcessPool(SavingPool):
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
+        return np.concatenate(self._asked("reading variables", "read", variables), axis=1)
+
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``."""
+        parts = self._asked("a directional derivative", "differentiate", unknowns, knowns)
+        return np.concatenate(parts, axis=2)
+
+    def _asked(self, doing: str, name: str, *arguments: Any) -> list[FloatArray]:
+        """Ask all workers for arrays, in the order of their blocks."""
         with self._lock:
             self._require_present()
-            parts = self._crew.run(
-                "reading variables", self._crew.supervisors, lambda s: s.tell("read", variables)
-            )
+            crew = self._crew
+            parts = crew.run(doing, crew.supervisors, lambda s: s.tell(name, *arguments))
             self._require_present()
-            return np.concatenate(list(parts.values()), axis=1)
+            return list(parts.values())
 
     def close(self) -> None:
         """See ``Pool.close``."""
         with self._lock:
-            self._crew.close()
+            try:
+                self._crew.close()
+            finally:
+                self._return_seats()
 
     def processes(self) -> list[int]:
         """Return the process numbers of the workers; 0 for a worker that was given up."""
@@ -442,8 +471,4 @@ def _share_out(setup: Setup, workers: int) -> list[Setup]:
     """Give each worker a block of the instances, the blocks as equal as can be."""
     bounds = [setup.num_instances * index // workers for index in range(workers + 1)]
     blocks = itertools.starmap(slice, itertools.pairwise(bounds))
-    specs = (replace(setup.spec, turn=(number, workers)) for number in range(workers))
-    return [
-        replace(setup, block=block, number=number, spec=spec)
-        for number, (block, spec) in enumerate(zip(blocks, specs, strict=True))
-    ]
+    return [replace(setup, block=block, number=number) for number, block in enumerate(blocks)]

@@ -297,6 +297,10 @@ class BlockWorker:
         """See ``SavingPool.record_of``."""
         return self._pool.record_of(index)
 
+    def replace_record(self, index: int, record: Record) -> None:
+        """See ``SavingPool.replace_record``."""
+        self._pool.replace_record(index, record)
+
     def count_steps(self) -> None:
         """Add the steps until now to the shared counts."""
         self._pool.health()
@@ -308,6 +312,13 @@ class BlockWorker:
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         return self._pool.read(variables)
+
+    def differentiate(
+        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        """See ``Pool.differentiate``."""
+        np.copyto(self._pool.inputs, self._block.inputs)
+        return self._pool.differentiate(unknowns, knowns)
 
     def close(self) -> None:
         """Free the instances and leave ``serve``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
@@ -100,6 +100,19 @@ class Engine(ABC):
         Raises:
             ConfigError: If a method changes something that all environments of this engine must
                 share. Then no environment is changed.
+        """
+
+    @abstractmethod
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+        """Evaluate a function of the environment, which reads as hooks do and changes nothing.
+
+        Args:
+            function: Returns numbers for a single environment, and arrays of shape (N,) for a
+                prototype that stands for all of them.
+            actions: The latest actions, environments first.
+
+        Returns:
+            The values of all environments, shape (k, N).
         """
 
     @abstractmethod

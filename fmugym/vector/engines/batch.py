@@ -24,6 +24,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
+from fmugym.task.warm_up import WarmUps
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
@@ -33,7 +34,7 @@ from fmugym.vector.hooks import results
 from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
 from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams
-from fmugym.vector.views import batched, column, take
+from fmugym.vector.views import batched, column, parts, take
 
 __all__ = ["BatchEngine"]
 
@@ -164,6 +165,14 @@ class BatchEngine(Engine):
         self.env.variables.update(variables)
         return returned
 
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+        """See ``Engine.evaluate``."""
+        env = self.env
+        latest = replace(Readings.of(env), action=np.moveaxis(np.asarray(actions), 0, -1))
+        with reading(env, latest):
+            rows = function(env)
+        return np.array([np.broadcast_to(row, self._n) for row in rows], np.float64)
+
     def _with(self, variable: str, values: Mapping[int, Any]) -> FloatArray:
         """The row of an episode variable with other values for some environments."""
         row = np.array(self._row(variable))
@@ -216,11 +225,42 @@ class BatchEngine(Engine):
         drawn = self._streams.draw(plan, indices)
         values = self._place_episodes(drawn, indices, plan)
         self.has_moved = True
+        warm_ups = self.env._warm_ups
+        if warm_ups is None:
+            self._reset_pool(mask, indices, plan, values)
+            self._forget(indices, plan)
+        else:
+            self._begin_with_warm_up(warm_ups, indices, plan, values)
+        return drawn
+
+    def _reset_pool(
+        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, values: FloatArray
+    ) -> None:
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
             self._require_started(indices, statuses)
+
+    def _begin_with_warm_up(
+        self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
+    ) -> None:
+        """Begin episodes with a warm-up, or in the state that an earlier one has led to."""
+        env, pool = self.env, self._pool
+        rows = {name: self._row(name) for name in env.variables}
+        found = warm_ups.find(pool, plan.model_variables, values, rows, indices.tolist())
+        others = np.array([index for index in indices.tolist() if index not in found], np.intp)
+        if len(others):
+            mask = np.zeros(self._n, np.bool_)
+            mask[others] = True
+            self._reset_pool(mask, others, plan, values)
         self._forget(indices, plan)
-        return drawn
+        if len(others):
+            written = warm_ups.run(pool, parts(Readings.of(env), others), others)
+            self._place(written, written.values(), others)
+        warm_ups.restore(pool, found)
+        for index, warmed in found.items():
+            columns = [np.asarray(value)[..., None] for value in warmed.variables.values()]
+            self._place(warmed.variables, columns, np.array([index]))
+        env.previous_state[:, indices] = env.state[:, indices]
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
@@ -88,6 +88,10 @@ class PerEnvEngine(Engine):
         """See ``Engine.call``."""
         values = [attribute(self._envs[index], name) for index in indices]
         return [v(*arguments, **keywords) if callable(v) else v for v in values]
+
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+        """See ``Engine.evaluate``; the environments know their actions."""
+        return np.array([function(env) for env in self._envs], np.float64).T
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """See ``Engine.set_attribute``; the values may be of any type."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.vector.hooks import products, tables
+from fmugym.vector.hooks import nans, products, sorting, tables
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.program import UntraceableError, letter_of
 from fmugym.vector.hooks.symbols import (
@@ -41,8 +41,9 @@ def call_ufunc(
     out = keywords.pop("out", None)
     if ufunc in products.UFUNCS and method == "__call__":
         result = products.UFUNCS[ufunc](*inputs, **keywords)
-    elif ufunc in _PAIRS and method == "__call__" and out is None:
-        return _PAIRS[ufunc](graph, *inputs, **keywords)
+    elif method == "__call__" and ufunc.nout > 1:
+        results = _applied_all(graph, ufunc, inputs, **keywords)
+        return results if out is None else tuple(map(_into_given, out, results))
     elif method == "__call__":
         result = _applied(graph, ufunc, inputs, out, **keywords)
     elif method == "reduce":
@@ -51,7 +52,11 @@ def call_ufunc(
         result = _accumulated(graph, ufunc, *inputs, **keywords)
     else:
         raise UntraceableError(f"it uses numpy.{ufunc.__name__}.{method}")
-    return result if out is None or out[0] is None else _into(out[0], result)
+    return result if out is None else _into_given(out[0], result)
+
+
+def _into_given(out: Any, result: Symbols) -> Any:
+    return result if out is None else _into(out, result)
 
 
 def _into(out: Any, result: Symbols) -> Any:
@@ -91,17 +96,45 @@ def _applied(
     where: Any = True,
     subok: bool = True,
 ) -> Symbols:
-    if ufunc.nout != 1:
-        raise UntraceableError(f"it uses numpy.{ufunc.__name__}, which has two results")
     inputs = tuple(_symbols_of(graph, value) for value in inputs)
-    kinds = tuple(_kind_of(value) for value in inputs)
-    signature = {} if dtype is None else {"signature": (*(None for _ in inputs), np.dtype(dtype))}
-    *types, result = ufunc.resolve_dtypes((*kinds, None), **signature)
-    letter_of(result)
-    cells = [_operand(graph, value, t) for value, t in zip(inputs, types, strict=True)]
+    *types, result = _types_of(ufunc, inputs, dtype)
+    cells = _operands(graph, inputs, types)
     combined = each(lambda *operands: graph.apply(ufunc, operands, result), *cells)
     values = Symbols(graph, combined, result)
     return values if where is True else _where_else(ufunc, where, values, out)
+
+
+def _types_of(ufunc: Any, inputs: tuple[Any, ...], dtype: Any) -> tuple[np.dtype[Any], ...]:
+    """The types of the loop that numpy would choose, the results last."""
+    kinds = [_kind_of(value) for value in inputs]
+    results = [None] * ufunc.nout
+    signature = {} if dtype is None else {"signature": (*(None for _ in inputs), np.dtype(dtype))}
+    types: tuple[np.dtype[Any], ...] = ufunc.resolve_dtypes((*kinds, *results), **signature)
+    for one in types:
+        letter_of(one)
+    return types
+
+
+def _operands(
+    graph: Graph, inputs: tuple[Any, ...], types: Sequence[np.dtype[Any]]
+) -> list[npt.NDArray[Any]]:
+    return [_operand(graph, value, t) for value, t in zip(inputs, types, strict=True)]
+
+
+def _applied_all(graph: Graph, ufunc: Any, inputs: tuple[Any, ...], **keywords: Any) -> Any:
+    """The results of a function that has several."""
+    if keywords:
+        raise UntraceableError(f"it uses an argument of numpy.{ufunc.__name__}")
+    inputs = tuple(_symbols_of(graph, value) for value in inputs)
+    types = _types_of(ufunc, inputs, None)
+    results = types[ufunc.nin :]
+    cells = _operands(graph, inputs, types[: ufunc.nin])
+
+    def part(index: int, dtype: np.dtype[Any]) -> Symbols:
+        found = each(lambda *operands: graph.part(ufunc, index, operands, results), *cells)
+        return Symbols(graph, found, dtype)
+
+    return tuple(part(index, dtype) for index, dtype in enumerate(results))
 
 
 def _where_else(ufunc: Any, where: Any, values: Symbols, out: Any) -> Symbols:
@@ -111,22 +144,6 @@ def _where_else(ufunc: Any, where: Any, values: Symbols, out: Any) -> Symbols:
     if not np.can_cast(values.dtype, out[0].dtype, "same_kind"):
         raise UntraceableError(f"it writes {values.dtype} to an array of {out[0].dtype}")
     return _where(where, values.cast(out[0].dtype), out[0])
-
-
-def _modf(graph: Graph, x: Any) -> tuple[Any, Any]:
-    dtype = np.modf(np.ones(1, as_symbols(graph, x).dtype))[0].dtype
-    value = as_symbols(graph, x).cast(dtype)
-    whole: Any = np.trunc(value)
-    rest = np.where(np.isinf(value), dtype.type(0), value - whole)
-    return np.copysign(rest, value), whole
-
-
-def _divmod(graph: Graph, x: Any, y: Any) -> tuple[Any, Any]:
-    return np.floor_divide(x, y), np.remainder(x, y)
-
-
-_PAIRS: Final[Mapping[Any, Callable[..., tuple[Any, Any]]]] = {np.modf: _modf, np.divmod: _divmod}
-"""Functions with two results."""
 
 
 def _reduced(
@@ -360,25 +377,6 @@ _MOST_TESTED: Final = 64
 """The most values that ``numpy.isin`` may look for."""
 
 
-def _nan_to_num(
-    x: Any, copy: bool = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None
-) -> Any:
-    value = as_symbols(graph_of(x), x)
-    if value.dtype.kind != "f":
-        return value.copy()
-    limits: Any = np.finfo(value.dtype)
-    numbers = (
-        nan,
-        limits.max if posinf is None else posinf,
-        limits.min if neginf is None else neginf,
-    )
-    for condition, number in zip(
-        (value != value, value == np.inf, value == -np.inf), numbers, strict=True
-    ):
-        value = _where(condition, as_symbols(value.graph, number).cast(value.dtype), value)
-    return value
-
-
 def _putmask(a: Any, mask: Any, values: Any) -> None:
     if np.ndim(values):
         raise UntraceableError("it puts several values where a condition holds")
@@ -395,6 +393,8 @@ handlers.update(ufunc=call_ufunc, function=call_function)
 _OWN: Final[Mapping[Any, Callable[..., Any]]] = {
     **tables.FUNCTIONS,
     **products.FUNCTIONS,
+    **sorting.FUNCTIONS,
+    **nans.FUNCTIONS,
     np.where: _where,
     np.select: _select,
     np.clip: _clip,
@@ -404,7 +404,6 @@ _OWN: Final[Mapping[Any, Callable[..., Any]]] = {
     np.argmin: _arg_extreme(np.less),
     np.piecewise: _piecewise,
     np.isin: _isin,
-    np.nan_to_num: _nan_to_num,
     np.linalg.norm: _norm,
     np.zeros_like: _filled(0),
     np.empty_like: _filled(0),
@@ -515,7 +514,8 @@ _OVERRIDING: Final[Mapping[str, Any]] = {
     **{function.__name__: _looked_up for function in tables.FUNCTIONS},
     **dict.fromkeys(("sum", "prod", "mean", "std", "var", "any", "all", "max", "min"), _of_list),
     **dict.fromkeys(("amax", "amin", "cumsum", "cumprod", "diff", "ptp", "moveaxis"), _of_list),
-    **dict.fromkeys(("transpose", "reshape", "ravel", "flip", "roll", "sort"), _of_list),
+    **dict.fromkeys(("transpose", "reshape", "ravel", "flip", "roll"), _of_list),
+    **dict.fromkeys((one.__name__ for one in (*sorting.FUNCTIONS, *nans.FUNCTIONS)), _of_list),
     **dict.fromkeys(("argmax", "argmin", "average", "dot", "cross", "inner"), _of_list),
 }
 

@@ -20,7 +20,7 @@ class Node(NamedTuple):
 
     Attributes:
         kind: ``constant``, ``row``, ``action``, ``previous_action``, ``active``, ``stopped``,
-            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``.
+            ``missing``, ``ufunc``, ``part``, ``cast``, ``where``, ``take`` or ``interpolate``.
         what: The value, the row, the element, the reason, the function or the table.
         operands: The numbers of the nodes that it is computed from.
         dtype: The type of the value.
@@ -122,6 +122,17 @@ class Graph:
         _require_free(self, ufunc, cells, dtype)
         return self.compute("ufunc", ufunc, cells, dtype, ufunc)
 
+    def part(
+        self,
+        ufunc: np.ufunc,
+        index: int,
+        cells: tuple[Cell, ...],
+        dtypes: tuple[np.dtype[Any], ...],
+    ) -> Cell:
+        """One of the results, whose types these are, of a function with several results."""
+        what = ufunc, index, dtypes
+        return self.compute("part", what, cells, dtypes[index], lambda *v: ufunc(*v)[index])
+
     def patched(self, own: Callable[..., Any], function: Any, args: Any, keywords: Any) -> Any:
         """Call what stands for a function of numpy that does not ask its arguments."""
         return own(self, function, *args, **keywords)
@@ -187,8 +198,12 @@ def _require_free(
     graph: Graph, ufunc: np.ufunc, cells: tuple[Cell, ...], dtype: np.dtype[Any]
 ) -> None:
     """Refuse loops that may raise an exception: integers to a negative power do."""
-    if ufunc is not np.power or dtype.kind not in "iu":
-        return
-    exponent = graph.value(cells[1])
-    if exponent is None or exponent < 0:
+    if ufunc is np.power and dtype.kind == "i" and _may_be_negative(graph, cells[1]):
         raise UntraceableError("it raises integers to a power that is not a constant")
+
+
+def _may_be_negative(graph: Graph, cell: Cell) -> bool:
+    exponent, node = graph.value(cell), graph.node(cell)
+    if exponent is not None:
+        return bool(exponent < 0)
+    return node.kind != "cast" or graph.nodes[node.operands[0]].dtype.kind not in "ub"

@@ -156,6 +156,9 @@ class _Compiler:
             case "cast":
                 source, target = self._letters(node)[0], letter_of(node.dtype)
                 return "cast", TYPES.index(source) * len(TYPES) + TYPES.index(target)
+            case "part":
+                ufunc, index, results = what
+                return "call", self._call(node, ufunc, results, index)
         return self._function(node, what)
 
     def _letters(self, node: Node) -> list[str]:
@@ -168,17 +171,30 @@ class _Compiler:
         name = f"{_NAMES.get(ufunc, ufunc.__name__)} {letters[0]}"
         if len(set(letters)) == 1 and name in OPERATIONS:
             return name, 0
-        if len(letters) > 3:
-            raise UntraceableError(f"numpy.{ufunc.__name__} has more than three arguments")
-        types = (*(self._graph.nodes[operand].dtype for operand in node.operands), node.dtype)
-        loop_of(ufunc, types)
-        constant = tuple(self._graph.nodes[operand].kind == "constant" for operand in node.operands)
-        call = self._place(self._calls, (ufunc, types, constant))
-        return "call_square" if self._is_square(node, ufunc, constant) else "call", call
+        call = self._call(node, ufunc, (node.dtype,), 0)
+        return self._quick_name(node, ufunc), call
 
-    def _is_square(self, node: Node, ufunc: np.ufunc, constant: tuple[bool, ...]) -> bool:
-        """Whether a call is a power of 2 of which most values need no call."""
-        if ufunc is not np.float_power or constant != (False, True):
+    def _call(
+        self, node: Node, ufunc: np.ufunc, results: tuple[np.dtype[Any], ...], index: int
+    ) -> int:
+        """The number of a call of one of numpy's loops that keeps one of its results."""
+        if len(node.operands) > 3:
+            raise UntraceableError(f"numpy.{ufunc.__name__} has more than three arguments")
+        types = *(self._graph.nodes[operand].dtype for operand in node.operands), *results
+        loop_of(ufunc, types)
+        return self._place(self._calls, (ufunc, types, self._constant(node), index))
+
+    def _constant(self, node: Node) -> tuple[bool, ...]:
+        return tuple(self._graph.nodes[operand].kind == "constant" for operand in node.operands)
+
+    def _quick_name(self, node: Node, ufunc: np.ufunc) -> str:
+        """The operation that calls a loop: one that needs no call for most values, if there is."""
+        if ufunc is np.remainder and set(self._letters(node)) == {"d"}:
+            return "call_remainder"
+        return "call_square" if self._is_square(node, ufunc) else "call"
+
+    def _is_square(self, node: Node, ufunc: np.ufunc) -> bool:
+        if ufunc is not np.float_power or self._constant(node) != (False, True):
             return False
         bits: Any = self._graph.nodes[node.operands[1]].what
         is_two = node.dtype == np.float64 and bits == np.float64(2.0).tobytes()
@@ -239,12 +255,13 @@ class _Compiler:
 
 
 def _call(
-    ufunc: np.ufunc, types: tuple[np.dtype[Any], ...], constant: tuple[bool, ...]
-) -> tuple[Any, int, tuple[int, ...]]:
+    ufunc: np.ufunc, types: tuple[np.dtype[Any], ...], constant: tuple[bool, ...], index: int
+) -> tuple[Any, int, tuple[int, ...], int]:
     """A loop and its strides. Constants have none, as numbers in hooks on arrays.
 
     Loops may do something else then: ``numpy.power`` squares if the exponent is 2.
     """
-    inputs = [0 if same else t.itemsize for t, same in zip(types, constant, strict=False)]
-    padded = [*inputs, types[-1].itemsize, 0, 0, 0][:4]
-    return loop_of(ufunc, types), len(inputs), tuple(padded)
+    inputs = len(constant)
+    sizes = [0 if same else t.itemsize for t, same in zip(types, constant, strict=False)]
+    sizes += [t.itemsize for t in types[inputs:]]
+    return loop_of(ufunc, types), inputs, tuple(sizes), inputs + index

@@ -20,7 +20,8 @@ __all__ = ["OPERATIONS", "TYPES", "Program", "UntraceableError", "evaluate", "le
 
 OPERATIONS: Final = (
     *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
-    *("store_row", "store_seen", "call", "call_square", "cast", "take", "interpolate"),
+    *("store_row", "store_seen", "call", "call_square", "call_remainder"),
+    *("cast", "take", "interpolate"),
     *("add d", "subtract d", "multiply d", "divide d", "square d", "negative d", "absolute d"),
     *("sqrt d", "minimum d", "maximum d"),
     *("less d", "less_equal d", "greater d", "greater_equal d", "equal d", "not_equal d"),
@@ -33,7 +34,7 @@ OPERATIONS: Final = (
 )
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
-TYPES: Final = "dfqihbQIHB?"
+TYPES: Final = "dfqihbQIHB?e"
 """The types of values: letters of numpy, in the order of ``EACH_TYPE`` of ``native/program.h``."""
 
 MOST_REGISTERS: Final = 256
@@ -101,8 +102,8 @@ class Program:
             means depends on the operation; see ``native/program.h``.
         constants: Registers that keep a value; of type ``CONSTANT``.
         slots: Elements of observations that are stored; of type ``SLOT``.
-        calls: Loops of numpy: the capsule, the number of inputs, bytes of each input and of the
-            output.
+        calls: Loops of numpy: the capsule, the number of inputs, bytes of each input and output,
+            and the number of the output that is kept, counted from the first input.
         rows: The rows that are loaded or stored.
         tables: Values to look up.
         registers: How many registers there are.
@@ -114,7 +115,7 @@ class Program:
     code: npt.NDArray[np.uint16]
     constants: npt.NDArray[Any]
     slots: npt.NDArray[Any]
-    calls: tuple[tuple[Any, int, tuple[int, ...]], ...]
+    calls: tuple[tuple[Any, int, tuple[int, ...], int], ...]
     rows: tuple[Row, ...]
     tables: tuple[npt.NDArray[Any], ...]
     registers: int

@@ -79,7 +79,8 @@ class ScalarGraph(Graph):
 
 _PATCHED_SCALARS: Final = frozenset(
     {"take", "sum", "prod", "mean", "std", "var", "any", "all", "max", "min", "amax", "amin"}
-    | {"ptp", "norm", "look_up"}
+    | {"ptp", "norm", "look_up", "median", "quantile", "percentile", "nansum", "nanprod"}
+    | {"nanmin", "nanmax", "nanmean", "nanvar", "nanstd", "nanmedian"}
 )
 """Functions that return numbers instead of arrays without dimensions."""
 

@@ -52,7 +52,7 @@ _KEPT: Final = frozenset(
     | {"__radd__", "__rand__", "__rdivmod__", "__rfloordiv__", "__rlshift__", "__rmod__"}
     | {"__rmul__", "__ror__", "__rpow__", "__rrshift__", "__rshift__", "__rsub__", "__rtruediv__"}
     | {"__rxor__", "__sub__", "__truediv__", "__xor__", "__matmul__", "__rmatmul__", "dtype"}
-    | {"sum", "prod", "min", "max", "any", "all", "clip", "mean", "var", "std", "astype", "cumsum"}
+    | {"sum", "prod", "min", "max", "any", "all", "clip", "var", "std", "astype", "cumsum"}
     | {"cumprod", "conj", "conjugate", "itemsize"}
 )
 """What of ``numpy.ndarray`` works here, because it ends in one of the three methods of numpy."""
@@ -197,6 +197,16 @@ class Symbols(np.ndarray[Any, Any]):
     def _take(self, indices: Any, axis: Any = None, **_: Any) -> Any:
         return np.take(self, indices, axis)
 
+    def _mean(self, axis: Any = None, dtype: Any = None, out: Any = None, **keywords: Any) -> Any:
+        """Compute a mean; numpy sums numbers of 16 bits with 32 bits."""
+        is_half = self.dtype == np.float16 and dtype is None
+        wanted = np.float32 if is_half else dtype
+        mean = np.ndarray.mean(self, axis, wanted, out, **keywords)
+        return as_symbols(self._graph, mean).cast(np.float16) if is_half else mean
+
+    def _sort(self, axis: int = -1, *args: Any, **keywords: Any) -> None:
+        self[...] = np.sort(self, axis, *args, **keywords)
+
     def _round(self, decimals: int = 0, out: Any = None) -> Any:
         if self.dtype.kind in "iub" or out is not None:
             raise UntraceableError("it rounds integers")
@@ -248,6 +258,9 @@ _METHODS: Final[Mapping[str, Any]] = {
     "fill": Symbols._fill,
     "dot": lambda self, b, out=None: np.dot(self, b, out),
     "argmax": lambda self, *args, **keywords: np.argmax(self, *args, **keywords),
+    "argsort": lambda self, *args, **keywords: np.argsort(self, *args, **keywords),
+    "mean": Symbols._mean,
+    "sort": Symbols._sort,
     "argmin": lambda self, *args, **keywords: np.argmin(self, *args, **keywords),
     "searchsorted": lambda self, *args, **keywords: np.searchsorted(self, *args, **keywords),
     "item": Symbols._item,

@@ -1,0 +1,73 @@
+"""Pages of the reference that are made of docstrings: all public names, room by room."""
+
+import inspect
+from typing import Any, Final
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import fmugym
+
+PAGES: Final = {
+    "Environments": (
+        "FMUEnv",
+        "FMI1CSEnv",
+        "FMI2CSEnv",
+        "FMI3CSEnv",
+        "FMI2MEEnv",
+        "EnvConfig",
+        "register",
+    ),
+    "Many environments": ("FMUVectorEnv",),
+    "Task files": ("load", "Task", "TaskEnv"),
+    "Distributions": ("Uniform", "Normal", "LogUniform", "Choice"),
+    "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
+    "Recordings": ("Recorder", "Recording", "replay"),
+    "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
+    "Rigs": ("Backend", "Paced"),
+    "Errors": (),  # and all other exceptions
+}
+MODULES: Final = {
+    "Baselines": "fmugym.baselines",
+    "Stable-Baselines3": "fmugym.sb3",
+    "TorchRL": "fmugym.torchrl",
+    "Checks of an environment": "fmugym.testing",
+    "Identification": "fmugym.identification",
+    "Pictures": "fmugym.rendering",
+}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages, and name them in the navigation."""
+    pages = {title: "\n\n".join(map(_block, names)) for title, names in _names().items()}
+    pages |= {title: _module(name) for title, name in MODULES.items()}
+    entries: list[Any] = []
+    for title, text in pages.items():
+        uri = f"reference/{title.lower().replace(' ', '-')}.md"
+        files.append(File.generated(config, uri, content=f"# {title}\n\n{text}\n"))
+        entries.append({title: uri})
+    reference = next(entry["Reference"] for entry in config.nav or () if "Reference" in entry)
+    reference.append({"Python": entries})
+    return files
+
+
+def _names() -> dict[str, list[str]]:
+    """The public names of each page; a name that is on no page is an error."""
+    names = {title: list(page) for title, page in PAGES.items()}
+    for name in fmugym.__all__:
+        value = getattr(fmugym, name)
+        if inspect.isclass(value) and issubclass(value, Exception):
+            names["Errors"].append(name)
+    left = set(fmugym.__all__) - {"envs"} - {name for page in names.values() for name in page}
+    if left:
+        raise LookupError(f"put these names on a page of docs/_site/reference.py: {sorted(left)}")
+    return names
+
+
+def _block(name: str) -> str:
+    value = getattr(fmugym, name)
+    return f"::: {value.__module__}.{value.__qualname__}"
+
+
+def _module(name: str) -> str:
+    return f"::: {name}\n    options:\n      show_root_heading: false\n      heading_level: 1"

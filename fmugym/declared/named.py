@@ -1,0 +1,109 @@
+"""The quantities of a declared task: everything in it that has a name and a value."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+
+from fmugym.declared.declarations import Declarations
+from fmugym.declared.naming import Moment, Naming
+from fmugym.errors import ConfigError
+from fmugym.task.quantity import Quantity
+
+__all__ = ["named_values"]
+
+
+def named_values(declared: Declarations, naming: Naming) -> dict[str, tuple[Quantity, str]]:
+    """Find the quantities of a task, in its units.
+
+    Args:
+        declared: The task.
+        naming: Gives names their code.
+
+    Returns:
+        By name, the quantity and the code for its value between two steps.
+    """
+    found: dict[str, tuple[Quantity, str]] = {}
+    for quantity in _quantities(declared, naming):
+        code = _code(naming, quantity.name)
+        if code is not None:
+            found.setdefault(quantity.name, (quantity, code))
+    return found
+
+
+def _quantities(declared: Declarations, naming: Naming) -> Iterator[Quantity]:
+    actions = [record.alias for record in declared.actions]
+    for alias in [*actions, *naming.outputs, *naming.monitors]:
+        yield _of_record(declared, alias, "action" if alias in actions else "output")
+    setpoints = declared.root.child("setpoints").value or {}
+    targets = _targets(declared)
+    for name in setpoints:
+        yield _of_name(declared, name, "setpoint", targets.get(name, ""))
+    for name in declared.series:
+        if name not in setpoints:
+            yield _of_name(declared, name, "data")
+    for name in declared.root.child("memory").value or {}:
+        yield _of_name(declared, name, "memory")
+    for name in declared.root.child("expressions").value or {}:
+        yield _of_name(declared, name, "expression")
+    for alias in declared.inputs:
+        yield _of_record(declared, alias, "input")
+    for alias in declared.parameters:
+        yield _of_record(declared, alias, "parameter")
+
+
+def _of_record(declared: Declarations, alias: str, kind: str) -> Quantity:
+    record = declared.records[alias]
+    return Quantity(alias, kind, _shown(record.unit), record.low, record.high)
+
+
+def _shown(unit: str | None) -> str:
+    """The unit; none for numbers without one, which FMI writes as 1."""
+    return "" if unit in (None, "1") else str(unit)
+
+
+def _of_name(declared: Declarations, name: str, kind: str, target: str = "") -> Quantity:
+    """The quantity of a name that is no variable; a set point has the unit of its variable."""
+    series = declared.series.get(name)
+    unit = "" if series is None else _shown(series.entry.child("unit").value)
+    if target and not unit:
+        unit = _shown(declared.records[target].unit)
+    holds = name in declared.steps or (series is not None and series.is_stepped)
+    return Quantity(name, kind, unit, *declared.limits_of(name), holds, target)
+
+
+def _targets(declared: Declarations) -> dict[str, str]:
+    """By set point, the variable that it is for: as declared, or else in a difference somewhere."""
+    setpoints = declared.root.child("setpoints").value or {}
+    found = {one.setpoint: one.of for one in declared.deviations.values()}
+    for first, second in _pairs(declared):
+        for name, other in ((first, second), (second, first)):
+            if name in setpoints and declared.is_output(other):
+                found.setdefault(name, other)
+    return found
+
+
+def _pairs(declared: Declarations) -> Iterator[tuple[str, str]]:
+    """The names on both sides of differences and comparisons, which have one unit."""
+    for expression in declared.expressions:
+        for node in ast.walk(expression.tree):
+            sides: list[ast.expr] = []
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+                sides = [node.left, node.right]
+            elif isinstance(node, ast.Compare):
+                sides = [node.left, *node.comparators]
+            names = [side.id for side in sides if isinstance(side, ast.Name)]
+            if len(names) == 2:
+                yield names[0], names[1]
+
+
+def _code(naming: Naming, name: str) -> str | None:
+    """Code for a value between two steps; None if it only has one within a step."""
+    for moment in (Moment.SEEN, Moment.JUDGED):
+        try:
+            code = naming.code_of(name, moment)
+        except ConfigError:  # an expression of what is not known at this moment
+            continue
+        if code is not None:
+            return code.number.text
+    return None

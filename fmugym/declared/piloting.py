@@ -1,0 +1,273 @@
+"""Controllers that act on the variables of a task before an episode begins."""
+
+from __future__ import annotations
+
+import re
+from ast import literal_eval
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from hashlib import sha256
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.declared.declarations import Declarations
+from fmugym.declared.expressions import Expression
+from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.observing import History
+from fmugym.declared.variables import Record
+from fmugym.declared.warming import signals_of
+from fmugym.distributions import Choice, is_distribution
+from fmugym.errors import shown
+from fmugym.task.warm_up import WarmUp
+
+if TYPE_CHECKING:
+    from fmugym.baselines import Controller
+
+__all__ = ["DeclaredWarmUp", "WarmUpMaker"]
+
+_VARIABLE: Final = re.compile(r"""env\.variables\[('[^']*'|"[^"]*")\]""")
+
+Hook = Callable[[Any], Any]
+
+
+def variables_in(codes: Sequence[str]) -> tuple[str, ...]:
+    """The episode variables that code reads."""
+    found = (literal_eval(text) for code in codes for text in _VARIABLE.findall(code))
+    return tuple(dict.fromkeys(found))
+
+
+class Pilot(NamedTuple):
+    """A controller and its action.
+
+    Attributes:
+        record: The variable that it writes.
+        place: The place of its action.
+        controller: Chooses the value, in the unit of the task.
+        names: What it measures.
+        signals: A function of the environment that returns these values.
+        clock: A function of the environment that returns the time of data.
+        present: A function that returns the value that is written now, for an action that is a
+            change; otherwise None.
+        rescales: Whether actions go from -1 to 1.
+    """
+
+    record: Record
+    place: int
+    controller: Controller
+    names: tuple[str, ...]
+    signals: Hook
+    clock: Hook
+    present: Hook | None
+    rescales: bool
+
+    def bind(self, count: int, time_step: float) -> None:
+        """Prepare for the warm-up of some environments.
+
+        Raises:
+            ConfigError: If the controller does not fit the action.
+        """
+        record = self.record
+        low, high = (record.low, record.high)
+        if record.levels:
+            low, high = min(record.levels), max(record.levels)
+        space = spaces.Box(np.float32(low), np.float32(high), (1,), np.float32)
+        self.controller.bind(_Many(count, space, time_step), self.names)
+
+    def act(self, env: Any) -> Any:
+        """Choose the next action, as the agent would write it, shape (M,)."""
+        count = len(env.step_count)
+        parts = [np.broadcast_to(value, (count,)) for value in self.signals(env)]
+        rows = np.array(parts, np.float32).reshape(len(parts), count).T
+        value = self._decided(env, rows)
+        if self.record.levels:
+            distance = np.abs(np.array(self.record.levels)[:, None] - value)
+            return distance.argmin(axis=0)
+        if self.present is not None:
+            value = np.clip(value - self.present(env), -self.record.delta, self.record.delta)
+        return self._rescaled(value)
+
+    def _decided(self, env: Any, rows: npt.NDArray[np.float32]) -> Any:
+        from fmugym.baselines import Schedule
+
+        if isinstance(self.controller, Schedule):
+            return np.clip(self.controller.at(self.clock(env)), self.record.low, self.record.high)
+        return self.controller.act(rows)[:, 0].astype(np.float64)
+
+    def _rescaled(self, value: Any) -> Any:
+        record = self.record
+        if not self.rescales:
+            return value
+        low, high = (-record.delta, record.delta) if record.delta else (record.low, record.high)
+        return (value - (low + high) / 2) / ((high - low) / 2)
+
+
+class _Many:
+    """Some environments with one action, as controllers look at them."""
+
+    def __init__(self, count: int, space: spaces.Box, time_step: float) -> None:
+        self.num_envs, self.single_action_space, self.time_step = count, space, time_step
+
+    @property
+    def unwrapped(self) -> _Many:
+        return self
+
+    config = unwrapped
+
+
+class DeclaredWarmUp(WarmUp):
+    """The warm-up of a declared task.
+
+    Args:
+        steps: Its steps.
+        time_step: Their length in seconds.
+        pilots: What acts.
+        inputs: A function of the environment that returns the FMU's inputs.
+        updates: Functions that write episode variables when the FMU has stepped.
+        codes: All code that these functions consist of.
+        constants: The tables that the code reads.
+        writes: The episode variables that are written.
+        caches: Whether to keep the states that it leads to.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        time_step: float,
+        pilots: Sequence[Pilot],
+        inputs: Hook,
+        updates: Sequence[Hook],
+        codes: Sequence[str],
+        constants: Mapping[str, Any],
+        writes: tuple[str, ...],
+        caches: bool,
+    ) -> None:
+        self.steps, self._time_step = steps, time_step
+        self._pilots, self._inputs, self._updates = pilots, inputs, updates
+        self.writes, self.caches = writes, caches
+        self.depends_on = variables_in(codes)
+        told = [repr((p.record.alias, type(p.controller), vars(p.controller))) for p in pilots]
+        tables = [(n, np.asarray(v).tobytes()) for n, v in sorted(constants.items())]
+        content = repr((steps, time_step, told, list(codes), tables))
+        self.digest = sha256(content.encode()).hexdigest()
+        self.begin(1)  # which finds mistakes
+
+    def begin(self, count: int) -> None:
+        """See ``WarmUp.begin``."""
+        for pilot in self._pilots:
+            pilot.bind(count, self._time_step)
+
+    def inputs(self, env: Any) -> Any:
+        """See ``WarmUp.inputs``; the controllers act first."""
+        env.previous_action, env.action = env.action, np.array(env.action)
+        for pilot in self._pilots:
+            place = pilot.place if env.action.ndim > 1 else ...
+            env.action[place] = pilot.act(env)
+        return self._inputs(env)
+
+    def update(self, env: Any) -> None:
+        """See ``WarmUp.update``."""
+        for update in self._updates:
+            update(env)
+
+
+class WarmUpMaker:
+    """Makes the warm-up of a task.
+
+    Args:
+        declared: The task.
+        naming: Gives names their code.
+        time_step: Length of a step in seconds.
+        function: Makes a function of the environment of code.
+    """
+
+    def __init__(
+        self,
+        declared: Declarations,
+        naming: Naming,
+        time_step: float,
+        function: Callable[[str], Hook],
+    ) -> None:
+        self._declared, self._naming = declared, naming
+        self._time_step, self._function = time_step, function
+
+    def make(
+        self,
+        steps: int,
+        inputs: Sequence[str],
+        updates: Sequence[Hook],
+        histories: Sequence[History],
+        switches: Mapping[str, str],
+        variables: Mapping[str, Any],
+    ) -> DeclaredWarmUp:
+        """Make the warm-up.
+
+        Args:
+            steps: Its steps.
+            inputs: Code for the FMU's inputs.
+            updates: Functions that write histories and what ``switches`` has.
+            histories: The histories that are written.
+            switches: Code for other episode variables by name.
+            variables: All episode variables of the config.
+
+        Raises:
+            ConfigError: If a controller does not fit, or states cannot be kept.
+        """
+        table = self._declared.warm_up
+        pilots = [self._pilot(record) for record in self._declared.actions]
+        kept = [text for history in histories for text in (history.now, history.fill)]
+        signals = [self._signal_code(name) for name in table.signals()]
+        with table.entry.placing():
+            warm_up = DeclaredWarmUp(
+                steps,
+                self._time_step,
+                [pilot for pilot in pilots if pilot is not None],
+                self._function(_tuple(inputs)),
+                updates,
+                [*inputs, *signals, *switches.values(), *kept, self._naming.clock_code()],
+                self._naming.constants,
+                (*(history.variable for history in histories), *switches),
+                table.caches,
+            )
+        if table.caches:
+            self._require_few_states(warm_up, variables)
+        return warm_up
+
+    def _require_few_states(self, warm_up: DeclaredWarmUp, variables: Mapping[str, Any]) -> None:
+        """Refuse to keep states that hardly any later episode could use."""
+        parameters = {name: value for name, (_, value) in self._declared.parameters.items()}
+        own = {name: variables[name] for name in warm_up.depends_on}
+        for name, value in (parameters | own).items():
+            if is_distribution(value) and not isinstance(value, Choice):
+                raise self._declared.warm_up.entry.child("cache").error(
+                    f"the state after the warm-up depends on {name!r}, which is drawn from "
+                    f"{shown(value)}: nearly every episode needs a state of its own. Leave out "
+                    "'cache', or draw from a list of values"
+                )
+
+    def _pilot(self, record: Record) -> Pilot | None:
+        controller = self._declared.warm_up.controllers.get(record.alias)
+        if controller is None:
+            return None
+        names = signals_of(controller)
+        present = self._function(self._naming.present_code(record)) if record.delta else None
+        return Pilot(
+            record,
+            self._declared.actions.index(record),
+            controller,
+            tuple(names),
+            self._function(_tuple(map(self._signal_code, names))),
+            self._function(self._naming.clock_code()),
+            present,
+            self._declared.rescales,
+        )
+
+    def _signal_code(self, name: str) -> str:
+        entry = self._declared.warm_up.entry.child("controller")
+        expression = Expression.parse(name)
+        return self._naming.code(entry, expression, Moment.SEEN).number.text
+
+
+def _tuple(codes: Iterable[str]) -> str:
+    return "(" + "".join(f"{code}, " for code in codes) + ")"

@@ -1,0 +1,170 @@
+"""Which values of environments a recorder writes down, and how it reads them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.archive.description import Variable
+from fmugym.env import FMUEnv
+from fmugym.errors import unknown_name
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.task.quantity import Quantities, Quantity
+
+__all__ = ["Choice", "choose", "flat", "matches", "quantities_of"]
+
+_VARYING: Final = ("continuous", "discrete")
+
+
+class Choice(NamedTuple):
+    """The values that a recorder writes down.
+
+    Attributes:
+        quantities: All of them, in the order of the columns.
+        places: Which of the task's quantities are the first ones.
+        read: Reads all of the task's quantities of an environment.
+        variables: Variables of the FMU that come next.
+        observed: The elements of the observation that come last.
+    """
+
+    quantities: tuple[Quantity, ...]
+    places: tuple[int, ...]
+    read: Callable[[Any], Sequence[Any]]
+    variables: tuple[Variable, ...]
+    observed: tuple[int, ...]
+
+    def values(self, present: FloatArray, pool: Pool, observations: FloatArray) -> FloatArray:
+        """Put the values of N environments together.
+
+        Args:
+            present: All of the task's quantities, shape (k, N).
+            pool: Reads variables of the FMU.
+            observations: Shape (N, m).
+
+        Returns:
+            One row for each environment, one column for each quantity.
+        """
+        rows = [present[list(self.places)]]
+        if self.variables:
+            rows.append(pool.read(self.variables))
+        if self.observed:
+            rows.append(observations.T[list(self.observed)])
+        return np.concatenate(rows).T
+
+
+def matches(pattern: str, name: str) -> bool:
+    """Whether a name matches a glob: * is any text, ? one character, brackets are themselves."""
+    expression = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
+    return re.fullmatch(expression, name, re.DOTALL) is not None
+
+
+def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
+    """Find the values that globs name.
+
+    Args:
+        env: The environment, or the prototype of many.
+        patterns: Globs. They choose among the names of the task, the varying numbers of the FMU
+            that the task has no name for, and ``observation.NAME``, what the agent sees of a name.
+            None for all names of the task except parameters.
+
+    Raises:
+        ConfigError: If a glob matches nothing.
+    """
+    quantities, read = quantities_of(env)
+    others = {variable.name: variable for variable in _others(env, quantities)}
+    seen = {f"observation.{name}": index for index, name in enumerate(_observation_names(env))}
+    if patterns is None:
+        wanted = {one.name for one in quantities if one.kind != "parameter"}
+    else:
+        named = [one.name for one in quantities] + [n for n in others if _varies(others[n])]
+        known = [*named, *seen]
+        wanted = {name for one in patterns for name in _found(one, known, others)}
+    places = tuple(i for i, one in enumerate(quantities) if one.name in wanted)
+    variables = tuple(others[name] for name in others if name in wanted)
+    observed = tuple(index for name, index in seen.items() if name in wanted)
+    return Choice(
+        (
+            *(quantities[place] for place in places),
+            *map(_of_variable, variables),
+            *(Quantity(name, "observation") for name in seen if name in wanted),
+        ),
+        places,
+        read,
+        variables,
+        observed,
+    )
+
+
+def _found(pattern: str, known: Sequence[str], others: Iterable[str]) -> list[str]:
+    """The names that a glob finds; constants and parameters must be named in full."""
+    found = [name for name in known if matches(pattern, name)]
+    found += [name for name in others if name == pattern and name not in found]
+    if not found:
+        raise unknown_name("variable to record", pattern, [*known, *others])
+    return found
+
+
+def _varies(variable: Variable) -> bool:
+    return variable.variability in _VARYING and variable.causality != "independent"
+
+
+def quantities_of(env: FMUEnv) -> Quantities:
+    """Everything in a task that has a name and a value: as declared, or else the config's."""
+    of_task = getattr(env, "_quantities_of_task", None)
+    return _of_config(env) if of_task is None else of_task()
+
+
+def _of_config(env: FMUEnv) -> Quantities:
+    config, find = env.config, env.fmu.variable
+    inputs, outputs = config.model_input_names, tuple(env.out)
+    episode = [n for n, value in config.episode_variables.items() if np.ndim(value) == 0]
+    parameters = tuple(config.model_parameters)
+
+    def read(env: Any) -> Sequence[Any]:
+        drawn, variables = env.parameters, env.variables
+        return (
+            *(env.inputs[index] for index in range(len(inputs))),
+            *(env._values[index] for index in range(len(outputs))),
+            *(variables[name] for name in episode),
+            *(drawn.get(name, np.nan) for name in parameters),
+        )
+
+    kinds = {"action": inputs, "output": outputs}
+    found = [_of_variable(find(name), kind) for kind, names in kinds.items() for name in names]
+    found += [Quantity(name, "memory") for name in episode]
+    found += [_of_variable(find(name), "parameter") for name in parameters]
+    return Quantities(found, read)
+
+
+def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
+    limits = variable.minimum, variable.maximum
+    return Quantity(variable.name, kind, variable.unit or "", *limits)
+
+
+def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
+    """The numeric variables of the FMU for which the task has no name of its own."""
+    config = env.config
+    known = {*config.model_input_names, *env.out, *(one.name for one in quantities)}
+    for variable in env.fmu.description.variables.values():
+        if variable.numeric and variable.name not in known:
+            yield variable
+
+
+def _observation_names(env: FMUEnv) -> Sequence[str]:
+    space = env.observation_space
+    if env.observation_names is not None:
+        return env.observation_names
+    if isinstance(space, spaces.Box):
+        return [str(index) for index in range(int(np.prod(space.shape)))]
+    return []
+
+
+def flat(observations: Any, count: int) -> FloatArray:
+    """The observations of N environments as numbers, shape (N, m); without numbers, m is 0."""
+    if not isinstance(observations, np.ndarray):
+        return np.empty((count, 0))
+    return observations.reshape(count, -1).astype(np.float64)

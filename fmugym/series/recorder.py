@@ -1,0 +1,336 @@
+"""Wrappers that write time series down while an environment is used."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorWrapper
+
+from fmugym.checks import check_count, check_path, number_of
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.spec import whole_number_of_steps
+from fmugym.series.choice import choose
+from fmugym.series.rows import Episodes, Infos, Outcome, Rows
+from fmugym.series.store import Block, Memory, Store, open_store
+from fmugym.series.timeseries import TimeSeries
+from fmugym.vector import FMUVectorEnv
+
+__all__ = ["RecordSeries", "RecordVectorSeries"]
+
+
+class _Recorder:
+    """What both wrappers share.
+
+    Args:
+        episodes: The environments.
+        variables, environments, every, path, most_rows: See the wrappers.
+        is_vector: Whether there may be many.
+    """
+
+    def __init__(
+        self,
+        episodes: Episodes,
+        variables: str | Iterable[str] | None,
+        environments: Iterable[int] | None,
+        every: float | None,
+        path: str | os.PathLike[str] | None,
+        most_rows: int,
+        is_vector: bool,
+    ) -> None:
+        self.episodes, self._is_vector = episodes, is_vector
+        patterns = [variables] if isinstance(variables, str) else variables
+        self._choice = choose(episodes.prototype, patterns)
+        self._indices = _chosen(environments, episodes.count)
+        self._every = _steps_of(every, episodes.prototype._spec.time_step)
+        self._path = None if path is None else check_path("the path of a recording", path)
+        self._most_rows = check_count("most_rows", most_rows)
+        self._memory: Memory | None = None
+        self._file: Store | None = None
+
+    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> None:
+        """Write down that episodes have begun."""
+        if self._memory is None:
+            self._open(infos)
+        self._add(self._rows.begin(mask, infos, observations))
+
+    def _open(self, infos: Infos) -> None:
+        self._rows = Rows(
+            self.episodes, self._choice, self._indices, self._every, self._is_vector, infos
+        )
+        if self._path is not None:
+            self._file = open_store(self._path, self._rows.columns)
+            weakref.finalize(self, self._file.close)
+        self._memory = Memory(self._rows.columns, self._most_rows)
+
+    def add(self, outcome: Outcome, idle: MaskArray) -> None:
+        """Write down a step."""
+        self._add(self._rows.add(outcome, idle))
+
+    def _add(self, block: Block) -> None:
+        if not len(block):
+            return
+        if self._memory is not None:
+            self._memory.add(block)
+        if self._file is not None:
+            self._file.add(block)
+
+    @property
+    def series(self) -> TimeSeries:
+        """What was written down until now."""
+        if self._memory is None:
+            raise SimulationError("there is no recording before the first reset")
+        block = self._memory.rows()
+        limits = getattr(self.episodes.prototype, "cost_limits", {})
+        return TimeSeries(self._rows.columns, block.values, block.faults, limits)
+
+    def close(self) -> None:
+        """Complete the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def _chosen(environments: Iterable[int] | None, count: int) -> Any:
+    if environments is None:
+        return np.arange(count)
+    numbers = sorted(set(environments))
+    if not numbers or not set(numbers) <= set(range(count)):
+        raise ConfigError(f"environments are numbers from 0 to {count - 1}, got {shown(numbers)}")
+    return np.array(numbers, np.intp)
+
+
+def _steps_of(every: float | None, time_step: float) -> int:
+    if every is None:
+        return 1
+    steps = whole_number_of_steps(number_of("every", every), time_step)
+    if not steps:
+        raise ConfigError(
+            f"every must be a multiple of the time step of {time_step:g} s, got {every:g} s"
+        )
+    return steps
+
+
+class _One:
+    """A single environment, as ``Episodes``."""
+
+    def __init__(self, env: FMUEnv) -> None:
+        self.prototype, self.count = env, 1
+
+    def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
+        env = self.prototype
+        env._tells = True  # nothing is written, so that compiled steps may go on
+        try:
+            return np.array(function(env), np.float64)[:, np.newaxis]
+        finally:
+            env._tells = False
+
+    @property
+    def pool(self) -> Pool:
+        return self.prototype._open_pool("a recorder")
+
+
+class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Writes down what an environment does, one row for each step.
+
+    The first row of an episode is the moment after the reset. Rewards and costs in a row are those
+    of the step that led to it.
+
+    Args:
+        env: An ``FMUEnv``, or wrappers around one.
+        variables: Globs, which choose among the names of the task, all numeric variables of the
+            FMU that the task has no name for, and ``observation.NAME``, what the agent sees of a
+            name; ``*`` is any text, ``?`` one character. By default, all names of the task except
+            parameters.
+        every: The time from one row to the next in seconds, a multiple of the time step; by default
+            one step. Rewards and costs in a row are then the sums since the row before. Episodes
+            have a last row at their end.
+        path: A new file that gets all rows, too: ``.csv``, in which each row is at once, or
+            ``.parquet`` (extra ``parquet``), which ``close`` completes.
+        most_rows: Rows to keep in memory, for ``series``; earlier ones are dropped.
+
+    Raises:
+        ConfigError: If an argument does not fit, there is no ``FMUEnv`` inside, or pyarrow is
+            missing.
+        FileExistsError: At the first reset, if the file exists.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        variables: str | Iterable[str] | None = None,
+        *,
+        every: float | None = None,
+        path: str | os.PathLike[str] | None = None,
+        most_rows: int = 1_000_000,
+    ) -> None:
+        inner = getattr(env, "unwrapped", None)
+        if not isinstance(inner, FMUEnv):
+            raise ConfigError(f"steps of an FMUEnv can be recorded, got {shown(env)}")
+        super().__init__(env)
+        self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows, False)
+
+    @property
+    def series(self) -> TimeSeries:
+        """What was written down until now.
+
+        Raises:
+            SimulationError: Before the first reset.
+        """
+        return self._recorder.series
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, and write its first row; see ``FMUEnv.reset``."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._recorder.begin(np.array([True]), Infos([info], 1), _batch(observation))
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Do a step, and write its row; see ``FMUEnv.step``."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        no = np.array([False])
+        flags = np.array([terminated]), np.array([truncated])
+        infos, seen = Infos([info], 1), _batch(observation)
+        self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)
+        return observation, reward, terminated, truncated, info
+
+    def complete(self) -> None:
+        """Complete the file; rows that follow are only in memory."""
+        self._recorder.close()
+
+    def close(self) -> None:
+        """Complete the file, and close the environment."""
+        self.complete()
+        super().close()
+
+
+def _batch(observation: Any) -> Any:
+    return observation[np.newaxis] if isinstance(observation, np.ndarray) else observation
+
+
+class _Many:
+    """The environments of a vector environment, as ``Episodes``."""
+
+    def __init__(self, envs: FMUVectorEnv) -> None:
+        self._envs, self.prototype, self.count = envs, envs._prototype, envs.num_envs
+        self.actions: Any = np.zeros(envs.action_space.shape, envs.action_space.dtype)
+
+    def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
+        return self._envs._engine.evaluate(function, self.actions)
+
+    @property
+    def pool(self) -> Pool:
+        return self._envs._open_pool("a recorder")
+
+
+class RecordVectorSeries(VectorWrapper):
+    """Writes down what the environments of a vector environment do; see ``RecordSeries``.
+
+    In the mode ``SAME_STEP``, an FMU is in its next episode when the step returns. The last row of
+    an episode then has rewards, costs and ``observation.NAME``, but no other variables (NaN).
+
+    Args:
+        env: An ``FMUVectorEnv``.
+        variables, every, path, most_rows: As for ``RecordSeries``.
+        environments: The numbers of the environments to write down; by default all.
+
+    Raises:
+        ConfigError: As for ``RecordSeries``.
+        FileExistsError: At the first reset, if the file exists.
+    """
+
+    def __init__(
+        self,
+        env: FMUVectorEnv,
+        variables: str | Iterable[str] | None = None,
+        *,
+        environments: Iterable[int] | None = None,
+        every: float | None = None,
+        path: str | os.PathLike[str] | None = None,
+        most_rows: int = 1_000_000,
+    ) -> None:
+        if not isinstance(env, FMUVectorEnv):
+            raise ConfigError(f"expected a FMUVectorEnv, got {shown(env)}")
+        super().__init__(env)
+        self._mode, self._envs = env.autoreset_mode, _Many(env)
+        self._ended = np.zeros(env.num_envs, np.bool_)
+        self._recorder = _Recorder(
+            self._envs, variables, environments, every, path, most_rows, True
+        )
+
+    @property
+    def series(self) -> TimeSeries:
+        """What was written down until now.
+
+        Raises:
+            SimulationError: Before the first reset.
+        """
+        return self._recorder.series
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes, and write their first rows; see ``FMUVectorEnv.reset``."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), np.bool_)
+        self._begin(mask, infos, observations)
+        return observations, infos
+
+    def _begin(self, mask: MaskArray, infos: Any, observations: Any) -> None:
+        self._envs.actions = self._envs.actions.copy()
+        self._envs.actions[mask] = 0
+        self._ended = self._ended & ~mask
+        self._recorder.begin(mask, Infos(infos, self.num_envs), observations)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all environments, and write their rows; see ``FMUVectorEnv.step``."""
+        return self._noted(actions, self.env.step(actions))
+
+    def step_async(self, actions: Any) -> None:
+        """Begin a step; see ``FMUVectorEnv.step_async``."""
+        self._pending = np.array(actions)
+        self.env.step_async(actions)  # type: ignore[attr-defined]  # it is an FMUVectorEnv
+
+    def step_wait(self, timeout: float | None = None) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Wait for a step, and write its rows; see ``FMUVectorEnv.step_wait``."""
+        result = self.env.step_wait(timeout)  # type: ignore[attr-defined]  # as above
+        return self._noted(self._pending, result)
+
+    def _noted(self, actions: Any, result: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        observations, rewards, terminated, truncated, infos = result
+        self._envs.actions = np.array(actions)
+        ended, none = terminated | truncated, np.zeros(self.num_envs, np.bool_)
+        same_step = self._mode is AutoresetMode.SAME_STEP and ended.any()
+        lost = ended if same_step else none
+        idle = self._ended
+        last, seen = Infos(infos, self.num_envs), observations
+        if same_step:
+            last, seen = self._last(infos, observations, ended)
+        self._recorder.add(Outcome(rewards, terminated, truncated, last, seen, lost), idle)
+        begun = ended if same_step else idle
+        self._ended = none if same_step else ended
+        if begun.any():
+            self._begin(begun, infos, observations)
+        return observations, rewards, terminated, truncated, infos
+
+    def _last(self, infos: Any, observations: Any, ended: MaskArray) -> tuple[Infos, Any]:
+        """The infos and observations with which episodes have ended, in the mode SAME_STEP."""
+        seen = observations
+        if isinstance(observations, np.ndarray):
+            seen = observations.copy()
+            for index in np.flatnonzero(ended).tolist():
+                seen[index] = infos["final_obs"][index]
+        return Infos(infos, self.num_envs, infos["final_info"], ended), seen
+
+    def close(self, **kwargs: Any) -> None:
+        """Complete the file, and close the environments."""
+        self._recorder.close()
+        super().close(**kwargs)

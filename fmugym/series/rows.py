@@ -1,0 +1,232 @@
+"""From the results of steps to rows of time series, for one environment or N of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.series.choice import Choice, flat
+from fmugym.series.store import Block
+from fmugym.task.quantity import Quantity
+
+__all__ = ["Episodes", "Infos", "Outcome", "Rows"]
+
+_GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
+
+
+class Episodes(Protocol):
+    """N environments to read."""
+
+    prototype: FMUEnv
+    count: int
+
+    def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
+        """Evaluate a function of the environment; shape (k, N)."""
+
+    @property
+    def pool(self) -> Pool:
+        """Reads variables of the FMUs."""
+
+
+class Infos(NamedTuple):
+    """The infos of N environments.
+
+    Attributes:
+        of_envs: As a vector environment gives them, or a list with that of a single one.
+        num_envs: N.
+        last: The infos with which episodes have ended, where those of the next ones are in
+            ``of_envs``.
+        ended: The environments that these are of, shape (N,).
+    """
+
+    of_envs: Mapping[str, Any] | list[dict[str, Any]]
+    num_envs: int
+    last: Mapping[str, Any] | None = None
+    ended: Any = False
+
+    def names(self, group: str) -> list[str]:
+        """The names in a dict of the infos."""
+        infos = self.of_envs[0] if isinstance(self.of_envs, list) else self.of_envs
+        return [name for name in infos.get(group, ()) if not name.startswith("_")]
+
+    def numbers(self, *path: str) -> FloatArray:
+        """The numbers at a place in the infos, shape (N,); 0 where there are none."""
+        if isinstance(self.of_envs, list):
+            return np.array([float(_at(self.of_envs[0], path, 0.0))])
+        numbers = _numbers(self.of_envs, path, self.num_envs)
+        if self.last is None:
+            return numbers
+        return np.where(self.ended, _numbers(self.last, path, self.num_envs), numbers)
+
+    def each(self, name: str) -> dict[int, Any]:
+        """The values of those environments that have one."""
+        if isinstance(self.of_envs, list):
+            return {0: self.of_envs[0][name]} if name in self.of_envs[0] else {}
+        if self.last is None:
+            return _each(self.of_envs, name)
+        now = {i: one for i, one in _each(self.of_envs, name).items() if not self.ended[i]}
+        return now | _each(self.last, name)
+
+
+def _numbers(infos: Mapping[str, Any], path: Sequence[str], count: int) -> FloatArray:
+    values = _at(infos, path, None)
+    if values is None:
+        return np.zeros(count)
+    has = _at(infos, (*path[:-1], f"_{path[-1]}"), True)
+    return np.where(has, np.asarray(values, np.float64), 0.0)
+
+
+def _each(infos: Mapping[str, Any], name: str) -> dict[int, Any]:
+    has = infos.get(f"_{name}")
+    if has is None:
+        return {}
+    return {index: _one(infos[name], index) for index in np.flatnonzero(has).tolist()}
+
+
+def _at(infos: Mapping[str, Any], path: Sequence[str], default: Any) -> Any:
+    for name in path:
+        if name not in infos:
+            return default
+        infos = infos[name]
+    return infos
+
+
+def _one(values: Any, index: int) -> Any:
+    if isinstance(values, Mapping):
+        return {n: _one(v, index) for n, v in values.items() if not n.startswith("_")}
+    return values[index]
+
+
+class Outcome(NamedTuple):
+    """What a step of N environments has given.
+
+    Attributes:
+        rewards, terminated, truncated: Shape (N,).
+        infos: The infos of the steps, those of steps that ended an episode included.
+        observations: Likewise.
+        lost: The environments whose FMU is in the next episode already.
+    """
+
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    infos: Infos
+    observations: Any
+    lost: MaskArray
+
+
+class Rows:
+    """Makes rows of what environments do.
+
+    Args:
+        episodes: The environments.
+        choice: The values to write down.
+        indices: The environments to write down.
+        every: The number of steps from one row to the next. Rewards and costs in a row are the sums
+            since the row before.
+        is_vector: Whether rows have the number of the environment.
+        infos: Those of the first reset, which tell the terms of rewards and costs.
+    """
+
+    def __init__(
+        self,
+        episodes: Episodes,
+        choice: Choice,
+        indices: npt.NDArray[np.intp],
+        every: int,
+        is_vector: bool,
+        infos: Infos,
+    ) -> None:
+        self._episodes, self._choice, self._indices = episodes, choice, indices
+        self._every, self._is_vector = every, is_vector
+        self._summed = tuple(_summed(infos))
+        self._kpis = tuple(infos.names("kpis"))
+        count = episodes.count
+        self._sums = np.zeros((count, 1 + len(self._summed)))
+        self._steps = np.zeros(count, np.int64)
+        self._number = np.full(count, -1, np.int64)
+        self.columns = tuple(self._columns())
+
+    def _columns(self) -> Iterator[Quantity]:
+        if self._is_vector:
+            yield Quantity("environment", "index")
+        yield from (Quantity("episode", "index"), Quantity("step", "index"))
+        yield Quantity("time", "time", "s")
+        yield from self._choice.quantities
+        yield Quantity("reward", "reward")
+        for path in self._summed:
+            kind = _GROUPS.get(path[0], "cost")
+            yield Quantity(".".join(path), kind)
+        yield from (Quantity(f"kpis.{name}", "kpi") for name in self._kpis)
+        yield from (Quantity("terminated", "flag"), Quantity("truncated", "flag"))
+
+    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> Block:
+        """Make the first rows of episodes."""
+        self._number[mask] += 1
+        self._steps[mask] = 0
+        self._sums[mask] = 0.0
+        no = np.zeros(len(mask), np.bool_)
+        return self._block(mask, self._values(observations), (no, no), infos)
+
+    def add(self, outcome: Outcome, idle: MaskArray) -> Block:
+        """Make the rows of a step.
+
+        Args:
+            outcome: What the step has given.
+            idle: The environments that did not step.
+        """
+        terms = [outcome.infos.numbers(*path) for path in self._summed]
+        self._sums += np.where(idle, 0.0, np.array([outcome.rewards, *terms])).T
+        self._steps += ~idle
+        ended = (outcome.terminated | outcome.truncated) & ~idle
+        values = self._values(outcome.observations)
+        values[outcome.lost, : len(self._choice.places) + len(self._choice.variables)] = np.nan
+        due = ~idle & (ended | (self._steps % self._every == 0))
+        flags = outcome.terminated, outcome.truncated
+        block = self._block(due, values, flags, outcome.infos)
+        self._sums[due] = 0.0
+        return block
+
+    def _values(self, observations: Any) -> FloatArray:
+        episodes = self._episodes
+        present = episodes.evaluate(self._choice.read)
+        return self._choice.values(present, episodes.pool, flat(observations, episodes.count))
+
+    def _block(
+        self,
+        mask: MaskArray,
+        values: FloatArray,
+        flags: tuple[MaskArray, MaskArray],
+        infos: Infos,
+    ) -> Block:
+        which = self._indices[mask[self._indices]]
+        spec = self._episodes.prototype._spec
+        passed: Any = (spec.warm_up_steps + self._steps[which]) * spec.substeps
+        parts = [
+            *([which] if self._is_vector else []),
+            *(self._number[which], self._steps[which]),
+            *(
+                spec.communication_point(passed),
+                *values[which].T,
+                *self._sums[which].T,
+            ),
+            *(infos.numbers("kpis", name)[which] for name in self._kpis),
+            *(flag[which] for flag in flags),
+        ]
+        rows = {index: row for row, index in enumerate(which.tolist())}
+        told = {
+            rows[index]: str(why) for index, why in infos.each("fault").items() if index in rows
+        }
+        return Block(np.array(parts, np.float64).T, told)
+
+
+def _summed(infos: Infos) -> Iterator[tuple[str, ...]]:
+    yield from (("reward_terms", name) for name in infos.names("reward_terms"))
+    if infos.names("costs"):
+        yield ("cost",)
+        yield from (("costs", name) for name in infos.names("costs"))

@@ -1,0 +1,209 @@
+"""Where the rows of a recorder go: memory, a CSV file, a Parquet file."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
+from fmugym.task.quantity import Quantity
+
+__all__ = ["FAULT", "WHOLE", "Block", "Memory", "Store", "heading", "imported", "open_store"]
+
+FAULT: Final = "fault"
+"""The last column: the reason of a fault, a text."""
+
+WHOLE: Final = ("index", "flag")
+"""The kinds of columns that hold whole numbers."""
+
+_ROWS_OF_A_GROUP: Final = 20_000
+"""Rows that a Parquet file gets at once."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some rows.
+
+    Attributes:
+        values: Shape (rows, columns).
+        faults: The reasons of faults by row.
+    """
+
+    values: FloatArray
+    faults: Mapping[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @classmethod
+    def joined(cls, blocks: Iterable[Block], width: int) -> Block:
+        """Put blocks together."""
+        blocks, begin = list(blocks), 0
+        faults: dict[int, str] = {}
+        for block in blocks:
+            faults |= {begin + row: reason for row, reason in block.faults.items()}
+            begin += len(block)
+        values = [block.values for block in blocks]
+        return cls(np.concatenate(values) if values else np.empty((0, width)), faults)
+
+
+class Store(Protocol):
+    """Takes rows."""
+
+    def add(self, block: Block) -> None:
+        """Add rows."""
+
+    def close(self) -> None:
+        """Add no more rows; more than one call is fine."""
+
+
+def open_store(path: Path, columns: Sequence[Quantity]) -> Store:
+    """Make a store that writes a new file, of the format that its name tells.
+
+    Raises:
+        ConfigError: If the name ends with something else, or a library is missing.
+        FileExistsError: If the file exists.
+    """
+    kinds: dict[str, type[CsvStore | ParquetStore]] = {".csv": CsvStore, ".parquet": ParquetStore}
+    kind = kinds.get(path.suffix.lower())
+    if kind is None:
+        raise ConfigError(f"a recording is a .csv or .parquet file, got {shown(str(path))}")
+    return kind(path, columns)
+
+
+class Memory:
+    """Keeps the latest rows in memory.
+
+    Args:
+        columns: The columns.
+        most_rows: The rows to keep; earlier ones are dropped.
+    """
+
+    def __init__(self, columns: Sequence[Quantity], most_rows: int) -> None:
+        self._width, self._most = len(columns), most_rows
+        self._blocks: deque[Block] = deque()
+        self._small: list[Block] = []
+        self._rows = 0
+        self.dropped = 0
+
+    def add(self, block: Block) -> None:
+        """Add rows. Small blocks are put together, since each takes memory of its own."""
+        self._small.append(block)
+        self._rows += len(block)
+        if len(self._small) >= 1000:
+            self._join()
+        while self._blocks and self._rows - len(self._blocks[0]) >= self._most:
+            old = len(self._blocks.popleft())
+            self._rows, self.dropped = self._rows - old, self.dropped + old
+
+    def _join(self) -> None:
+        self._blocks.append(Block.joined(self._small, self._width))
+        self._small = []
+
+    def close(self) -> None:
+        """Do nothing: rows stay."""
+
+    def rows(self) -> Block:
+        """All rows that are kept."""
+        return Block.joined([*self._blocks, *self._small], self._width)
+
+
+def heading(column: Quantity) -> str:
+    """The name and the unit of a column, such as ``T [degC]``."""
+    return f"{column.name} [{column.unit}]" if column.unit else column.name
+
+
+class CsvStore:
+    """Writes a CSV file; each row is in the file at once, so that an interruption loses none."""
+
+    def __init__(self, path: Path, columns: Sequence[Quantity]) -> None:
+        self._file = path.open("x", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._whole = [column.kind in WHOLE for column in columns]
+        self._writer.writerow([*map(heading, columns), FAULT])
+
+    def add(self, block: Block) -> None:
+        """See ``Store``."""
+        for number, row in enumerate(block.values.tolist()):
+            cells = [self._cell(*pair) for pair in zip(row, self._whole, strict=True)]
+            self._writer.writerow([*cells, block.faults.get(number, "")])
+        self._file.flush()
+
+    @staticmethod
+    def _cell(value: float, whole: bool) -> Any:
+        if math.isnan(value):
+            return ""
+        return int(value) if whole else value
+
+    def close(self) -> None:
+        """See ``Store``."""
+        self._file.close()
+
+
+class ParquetStore:
+    """Writes a Parquet file. Rows are written in groups, the last one by ``close``."""
+
+    def __init__(self, path: Path, columns: Sequence[Quantity]) -> None:
+        self._arrow = imported("pyarrow", "parquet")
+        parquet = imported("pyarrow.parquet", "parquet")
+        self._file = path.open("xb")
+        self._columns, self._rows = columns, 0
+        self._schema = self._arrow.schema([*map(self._field, columns), (FAULT, "string")])
+        self._writer = parquet.ParquetWriter(self._file, self._schema)
+        self._waiting: list[Block] = []
+
+    def _field(self, column: Quantity) -> Any:
+        facts = {"unit": column.unit, "quantity": json.dumps(asdict(column))}
+        kind = "int64" if column.kind in WHOLE else "float64"
+        return self._arrow.field(column.name, self._arrow.type_for_alias(kind), metadata=facts)
+
+    def add(self, block: Block) -> None:
+        """See ``Store``."""
+        self._waiting.append(block)
+        self._rows += len(block)
+        if self._rows >= _ROWS_OF_A_GROUP:
+            self._write()
+
+    def _write(self) -> None:
+        block = Block.joined(self._waiting, len(self._columns))
+        self._waiting, self._rows = [], 0
+        arrays = [
+            self._arrow.array(values.astype(np.int64) if column.kind in WHOLE else values)
+            for values, column in zip(block.values.T, self._columns, strict=True)
+        ]
+        faults = [block.faults.get(number) for number in range(len(block))]
+        table = [*arrays, self._arrow.array(faults, self._arrow.string())]
+        self._writer.write_table(self._arrow.table(table, schema=self._schema))
+
+    def close(self) -> None:
+        """See ``Store``."""
+        if not self._file.closed:
+            if self._waiting:
+                self._write()
+            self._writer.close()
+            self._file.close()
+
+
+def imported(module: str, extra: str) -> Any:
+    """Import a library of an extra.
+
+    Raises:
+        ConfigError: If it is missing.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ConfigError(
+            f"this needs {module.partition('.')[0]}, which cannot be imported; install the extra: "
+            f"pip install 'fmugym-toolbox[{extra}]'"
+        ) from error

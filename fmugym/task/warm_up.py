@@ -1,0 +1,315 @@
+"""Warm-ups with moving inputs: steps before the first observation, and states that they lead to."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from threading import Lock
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import Variable
+from fmugym.fmi.status import Status
+from fmugym.pool import Pool
+from fmugym.pool.attendant import InitialState
+from fmugym.pool.base import FloatArray
+from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
+from fmugym.pool.patience import failed_reset
+from fmugym.pool.states import StateFiles, essence
+from fmugym.task.readings import Readings, reading
+from fmugym.task.spaces import to_input_types
+from fmugym.task.values import EpisodeVariables
+from fmugym.trial.trial import state_files
+
+__all__ = ["Found", "WarmUp", "WarmUps", "rows_of_one"]
+
+_MOST_BYTES: Final = 2**28
+"""The size of all warmed-up states in memory; the ones that were not used for longest go first."""
+
+_OF_LAST_AXIS: Final = ("values", "previous_state", "inputs", "action", "previous_action")
+
+
+class WarmUp(ABC):
+    """What happens in a warm-up.
+
+    Its methods read the environment as hooks do. The readings are arrays with M environments on the
+    last axis, also in a single environment. ``step_count`` rises to 0.
+
+    Attributes:
+        steps: How many steps it has.
+        caches: Whether to keep the states that it leads to.
+        depends_on: The episode variables on which it depends.
+        writes: The episode variables that it writes.
+        digest: Tells it from others that lead to other states.
+    """
+
+    steps: int
+    caches: bool = False
+    depends_on: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
+    digest: str = ""
+
+    @abstractmethod
+    def begin(self, count: int) -> None:
+        """Prepare for the warm-up of some environments.
+
+        Args:
+            count: M.
+        """
+
+    @abstractmethod
+    def inputs(self, env: Any) -> Any:
+        """Return the FMU's inputs for the next step, each a number or an array of shape (M,)."""
+
+    @abstractmethod
+    def update(self, env: Any) -> None:
+        """Write the episode variables that the warm-up changes, when the FMU has stepped."""
+
+
+@dataclass(frozen=True)
+class Warmed:
+    """What a warm-up has led to.
+
+    Attributes:
+        state: The FMU's state.
+        inputs: Its inputs, shape (k_in,).
+        variables: The episode variables that the warm-up writes, by name.
+    """
+
+    state: Bundle
+    inputs: FloatArray
+    variables: Mapping[str, Any]
+
+    @property
+    def size(self) -> int:
+        """About how many bytes it takes."""
+        return len(self.state.data) + sum(np.asarray(v).nbytes for v in self.variables.values())
+
+
+class _Memory:
+    """Warmed-up states of all environments of this process by key."""
+
+    def __init__(self) -> None:
+        self._states: OrderedDict[bytes, Warmed] = OrderedDict()
+        self._lock, self._size = Lock(), 0
+
+    def find(self, key: bytes) -> Warmed | None:
+        with self._lock:
+            if key in self._states:
+                self._states.move_to_end(key)
+            return self._states.get(key)
+
+    def keep(self, key: bytes, warmed: Warmed) -> None:
+        with self._lock:
+            if key in self._states or warmed.size > _MOST_BYTES:
+                return
+            self._states[key] = warmed
+            self._size += warmed.size
+            while self._size > _MOST_BYTES:
+                self._size -= self._states.popitem(last=False)[1].size
+
+
+_memory: Final = _Memory()
+
+Found = dict[int, Warmed]
+"""By the index of an environment, the state that its warm-up leads to."""
+
+
+class WarmUps:
+    """The warm-ups of one environment, or of N.
+
+    Args:
+        env: The environment, or the prototype of N.
+        warm_up: What happens in them.
+    """
+
+    def __init__(self, env: Any, warm_up: WarmUp) -> None:
+        self._env, self._warm_up = env, warm_up
+        starts = env.config.episode_variables
+        self._shapes = {name: np.shape(starts[name]) for name in warm_up.writes}
+        self._prefix: str | None = None
+        self._scope = b""
+        self._keys: dict[int, bytes] = {}
+
+    # States that are known
+
+    def find(
+        self,
+        pool: Pool,
+        variables: Sequence[Variable],
+        values: FloatArray,
+        rows: Mapping[str, Any],
+        indices: Iterable[int],
+    ) -> Found:
+        """Look for states that warm-ups of new episodes lead to.
+
+        Args:
+            pool: The pool that the episodes are going to begin in.
+            variables: The start variables of the episodes.
+            values: Their values, shape (P, N).
+            rows: The episode variables by name, environments on the last axis.
+            indices: The environments.
+        """
+        self._keys = {}
+        if not self._warm_up.caches or pool.save_method is not SaveMethod.STATE:
+            return {}
+        names = repr([variable.name for variable in variables]).encode()
+        found = {}
+        for index in indices:
+            own = [np.asarray(rows[name])[..., index] for name in self._warm_up.depends_on]
+            parts = [names, values[:, index].tobytes(), *(np.float64(v).tobytes() for v in own)]
+            key = self._key(parts)
+            warmed = _memory.find(key) or self._read(key)
+            if warmed is None:
+                self._keys[index] = key
+            else:
+                found[index] = warmed
+        return found
+
+    def _key(self, parts: Iterable[bytes]) -> bytes:
+        if self._prefix is None:
+            self._prefix = state_files(self._env.fmu)
+            spec = repr(essence(self._env._spec))
+            self._scope = f"{self._prefix} {spec} {self._warm_up.digest}".encode()
+        digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
+        return hashlib.sha256(b"".join(digests)).digest()
+
+    def restore(self, pool: Pool, found: Found) -> None:
+        """Bring FMUs to states that were found.
+
+        Raises:
+            SimulationError: If an FMU refuses.
+        """
+        for index, warmed in found.items():
+            where = np.array([index])
+            status = pool.restore_instances(warmed.state, np.zeros(1, np.int64), where)[index]
+            if status > Status.WARNING:
+                raise failed_reset(self._located(pool, index))
+            pool.inputs[:, index] = warmed.inputs
+
+    # Warm-ups
+
+    def run(self, pool: Pool, readings: Readings, indices: IndexArray) -> Mapping[str, Any]:
+        """Do the warm-up of episodes that have just begun.
+
+        Args:
+            pool: The pool; ``pool.inputs`` then has the last inputs.
+            readings: What hooks of these episodes read, environments on the last axis.
+            indices: The environments, shape (M,).
+
+        Returns:
+            The episode variables that it has written, environments on the last axis.
+
+        Raises:
+            SimulationError: If an FMU fails.
+            ConfigError: If an input does not fit its type.
+        """
+        count, warm_up = len(indices), self._warm_up
+        skip = np.ones(pool.num_instances, np.bool_)
+        skip[indices] = False
+        warm_up.begin(count)
+        with reading(self._env, readings):
+            env: Any = self._env
+            for step in range(-warm_up.steps, 0):
+                env.step_count = np.full(count, step)
+                self._step(pool, indices, skip)
+                env.step_count = np.full(count, step + 1)
+                warm_up.update(env)
+            variables = {name: env.variables[name] for name in warm_up.writes}
+        self._keep(pool, variables, indices)
+        return variables
+
+    def _step(self, pool: Pool, indices: IndexArray, skip: npt.NDArray[np.bool_]) -> None:
+        env: Any = self._env
+        with np.errstate(over="ignore", invalid="ignore"):
+            given = np.array(np.broadcast_arrays(*self._warm_up.inputs(env), env.step_count)[:-1])
+        if not env._input_writer.all_real:
+            columns = [to_input_types(env._interface.inputs, column) for column in given.T]
+            given = np.array(columns).T
+        env.inputs = given
+        pool.inputs[:, indices] = given
+        env.previous_state = env.state
+        pool.step(None, skip)
+        for index in indices.tolist():
+            if pool.statuses[index] > Status.WARNING:
+                raise failed_reset(self._located(pool, index))
+        env._values = pool.outputs[:, indices]
+        env.state = env._values[: env._output_count]
+
+    def _located(self, pool: Pool, index: int) -> str:
+        text = f"the warm-up failed: {pool.failure(index)}"
+        return text if pool.num_instances == 1 else f"environment {index}: {text}"
+
+    def _keep(self, pool: Pool, rows: Mapping[str, Any], indices: IndexArray) -> None:
+        """Keep the states of those for which none was known."""
+        for place, index in enumerate(indices.tolist()):
+            key = self._keys.pop(index, None)
+            if key is None:
+                continue
+            state = pool.save_instances(np.array([index]))
+            variables = {name: np.array(row[..., place]) for name, row in rows.items()}
+            warmed = Warmed(state, pool.inputs[:, index].copy(), variables)
+            _memory.keep(key, warmed)
+            self._write(key, warmed)
+
+    # On disk
+
+    @property
+    def _sizes(self) -> list[int]:
+        return [int(np.prod(shape)) for shape in self._shapes.values()]
+
+    def _files(self, pool_width: int) -> StateFiles | None:
+        prefix = self._prefix or ""
+        width = pool_width + len(self._env._interface.inputs) + sum(self._sizes)
+        return StateFiles(prefix, width) if prefix else None
+
+    def _read(self, key: bytes) -> Warmed | None:
+        spec, count = self._env._spec, len(self._env._interface.inputs)
+        files = self._files(len(spec.outputs))
+        found = None if files is None else files.find(key.hex()[:32])
+        if found is None:
+            return None
+        numbers = np.frombuffer(found.outputs)
+        outputs, rest = np.split(numbers, [len(spec.outputs)])
+        inputs, rest = np.split(rest, [count])
+        parts = np.split(rest, np.cumsum(self._sizes)[:-1]) if self._sizes else []
+        shapes = self._shapes.items()
+        variables = {n: p.reshape(s) for (n, s), p in zip(shapes, parts, strict=True)}
+        steps, ends = np.array([self._warm_up.steps * spec.substeps]), np.array([len(found.data)])
+        warmed = Warmed(Bundle(outputs[:, None].copy(), steps, found.data, ends), inputs, variables)
+        _memory.keep(key, warmed)
+        return warmed
+
+    def _write(self, key: bytes, warmed: Warmed) -> None:
+        files = self._files(len(warmed.state.outputs))
+        if files is not None:
+            values = [warmed.state.outputs, warmed.inputs, *warmed.variables.values()]
+            numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
+            files.keep(key.hex()[:32], InitialState(numbers.tobytes(), warmed.state.data))
+
+
+def rows_of_one(env: Any) -> Readings:
+    """What the hooks of a single environment read, as arrays of one environment."""
+    readings = Readings.of(env)
+    rows: dict[str, Any] = {name: _row(getattr(readings, name)) for name in _OF_LAST_AXIS}
+    variables = EpisodeVariables(readings.variables)
+    variables.update({name: _row(value) for name, value in readings.variables.items()})
+    return replace(
+        readings,
+        **rows,
+        state=rows["values"][: env._output_count],
+        parameters=MappingProxyType({n: _row(v) for n, v in readings.parameters.items()}),
+        variables=variables,
+        step_count=np.zeros(1, np.int64),
+        done=np.zeros(1, np.bool_),
+    )
+
+
+def _row(value: Any) -> npt.NDArray[Any]:
+    return np.asarray(value)[..., np.newaxis]

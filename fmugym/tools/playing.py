@@ -1,0 +1,194 @@
+"""The commands that play episodes: simulate, record, evaluate, bench."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+from fmugym.env import FMUEnv
+from fmugym.series import RecordSeries
+from fmugym.tools.evaluation import evaluate, plot_scores, table
+from fmugym.tools.options import (
+    Commands,
+    add_command,
+    add_episodes,
+    add_json,
+    add_players,
+    add_task,
+    check_numbers,
+    only_player,
+    players_of,
+    say,
+    say_json,
+)
+from fmugym.tools.overview import plain
+from fmugym.tools.progress import progress
+from fmugym.tools.records import Recording, require_format
+from fmugym.tools.simulation import Summary, simulate
+from fmugym.tools.speed import bench, speed_table
+from fmugym.tools.targets import maker_of, scenarios_of
+
+__all__ = ["add_bench", "add_evaluate", "add_record", "add_simulate"]
+
+
+def add_simulate(commands: Commands) -> None:
+    """Add ``simulate``."""
+    text = "play episodes with random or constant actions, a controller or an agent"
+    command = add_command(commands, "simulate", _simulate, text)
+    add_task(command)
+    add_players(command)
+    command.add_argument("--scenario", help="a scenario of the task file")
+    add_episodes(command, 1, 0)
+    command.add_argument("--output", type=Path, metavar="FILE", help="a new CSV file of all steps")
+    add_json(command)
+
+
+def _simulate(arguments: argparse.Namespace) -> None:
+    check_numbers(arguments, "episodes", "steps")
+    make_policy = only_player(arguments)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+    summaries: list[Summary] = []
+    with ExitStack() as stack:
+        env: Any = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
+        policy = make_policy(env)
+        if arguments.output is not None:
+            env = stack.enter_context(closing(RecordSeries(env, path=arguments.output)))
+        total = _steps_of(env.unwrapped, arguments)
+        advance = stack.enter_context(progress(total, "simulate"))
+        for seed in seeds:
+            summaries.append(simulate(env, policy, seed, arguments.steps, advance))
+            if not arguments.json:
+                say(plain(summaries[-1].as_text()))
+    if arguments.json:
+        say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
+
+
+def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
+    """How many steps the episodes take at most; None if only ``--steps`` limits them."""
+    limit = env.config.max_episode_steps
+    return None if limit is None else min(limit, arguments.steps) * int(arguments.episodes)
+
+
+def add_record(commands: Commands) -> None:
+    """Add ``record``."""
+    text = "play episodes and write them to a table, a picture or a report"
+    command = add_command(commands, "record", _record, text)
+    add_task(command)
+    add_players(command)
+    command.add_argument("--scenario", help="a scenario of the task file")
+    add_episodes(command, 1, 0)
+    command.add_argument(
+        "--output",
+        type=Path,
+        action="append",
+        required=True,
+        metavar="FILE",
+        help="a new file: .csv, .parquet, .html (a report), .png, .svg or .pdf; more than once "
+        "for several",
+    )
+    command.add_argument(
+        "--variables", action="append", metavar="GLOB", help="by default all names of the task"
+    )
+    command.add_argument("--every", type=float, metavar="SECONDS", help="between rows")
+    add_json(command)
+
+
+def _record(arguments: argparse.Namespace) -> None:
+    check_numbers(arguments, "episodes", "steps")
+    players = players_of(arguments)
+    for path in arguments.output:
+        require_format(path, len(players))
+    recording = Recording(arguments.task, arguments.scenario, arguments.output)
+    summaries: dict[str, list[Summary]] = {name: [] for name in players}
+    try:
+        for name, make_policy in players.items():
+            with (
+                closing(maker_of(arguments.task, arguments.scenario)()) as env,
+                progress(_steps_of(env, arguments), name) as advance,
+            ):
+                policy = make_policy(env)
+                recorder = recording.begin(name, env, arguments.variables, arguments.every)
+                for seed in range(arguments.seed, arguments.seed + arguments.episodes):
+                    one = simulate(recorder, policy, seed, arguments.steps, advance)
+                    summaries[name].append(one)
+                    if not arguments.json:
+                        say(plain(f"{name}: {one.as_text()}"))
+    finally:
+        recording.finish(arguments.seed)
+    if arguments.json:
+        runs = {name: [one.as_dict() for one in found] for name, found in summaries.items()}
+        say_json({"task": arguments.task, "output": arguments.output, "runs": runs})
+
+
+def add_evaluate(commands: Commands) -> None:
+    """Add ``evaluate``."""
+    text = "let agents, controllers, random and constant actions play the same episodes"
+    command = add_command(commands, "evaluate", _evaluate, text)
+    add_task(command)
+    add_players(command)
+    command.add_argument(
+        "--scenario",
+        action="append",
+        help="a scenario of the task file, or 'all'; more than once for several",
+    )
+    add_episodes(command, 10, 1_000_000)
+    command.add_argument(
+        "--plot", type=Path, metavar="FILE", help="a new picture of the rewards and costs"
+    )
+    add_json(command)
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    check_numbers(arguments, "episodes", "steps")
+    if arguments.plot is not None:
+        require_format(arguments.plot, 1)
+    players = players_of(arguments, random=True)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+    scores = []
+    for scenario in _scenarios(arguments):
+        make_env = maker_of(arguments.task, scenario)
+        label = "evaluate" if scenario is None else scenario
+        with progress(None, label) as advance:
+            scores += evaluate(make_env, players, seeds, arguments.steps, scenario, advance)
+    if arguments.plot is not None:
+        plot_scores(scores, arguments.plot, str(arguments.task))
+    if arguments.json:
+        say_json({"task": arguments.task, "scores": [one.as_dict() for one in scores]})
+    else:
+        say(table(scores))
+
+
+def _scenarios(arguments: argparse.Namespace) -> list[str | None]:
+    """The scenarios to play; None for the episodes of the task."""
+    names: list[str] = arguments.scenario or []
+    if names == ["all"]:
+        return list(scenarios_of(arguments.task)) or [None]
+    return list(dict.fromkeys(names)) or [None]
+
+
+def add_bench(commands: Commands) -> None:
+    """Add ``bench``."""
+    text = "measure steps per second: one environment, many, and the FMU's share"
+    command = add_command(commands, "bench", _bench, text)
+    add_task(command, ", or an FMU")
+    command.add_argument(
+        "--envs",
+        type=int,
+        action="append",
+        metavar="N",
+        help="the size of a vector environment; more than once for several; default 8, 64, 1024",
+    )
+    command.add_argument(
+        "--seconds", type=float, default=1.0, help="of each measurement; default 1"
+    )
+    add_json(command)
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    report = bench(maker_of(arguments.task), arguments.envs or [8, 64, 1024], arguments.seconds)
+    if arguments.json:
+        say_json({"task": arguments.task, **report.as_dict()})
+    else:
+        say(speed_table(report))

@@ -1,0 +1,112 @@
+"""What ``fmugym record`` writes: tables, pictures, reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from fmugym.declared import Task
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.series import RecordSeries, TimeSeries, plot, write_report
+
+__all__ = ["Recording", "require_format"]
+
+_TABLES: Final = (".csv", ".parquet")
+_PICTURES: Final = (".png", ".svg", ".pdf")
+_REPORT: Final = ".html"
+
+
+def require_format(path: Path, runs: int) -> None:
+    """Refuse a file before any episode is played for it.
+
+    Raises:
+        ConfigError: If its name tells no known format, or a table cannot hold so many runs.
+        FileExistsError: If it exists.
+    """
+    known = (*_TABLES, *_PICTURES, _REPORT)
+    if path.suffix.lower() not in known:
+        raise ConfigError(f"a file ends with one of {', '.join(known)}; got {shown(str(path))}")
+    if path.suffix.lower() in _TABLES and runs > 1:
+        raise ConfigError(f"{shown(str(path))} holds one run, got {runs}; a report holds several")
+    if path.exists():
+        raise FileExistsError(f"{path} exists; name a new file")
+
+
+class Recording:
+    """The episodes of one controller after another, and the files about them.
+
+    Args:
+        target: The task, as in the arguments.
+        scenario: Its scenario.
+        paths: The files.
+    """
+
+    def __init__(self, target: str, scenario: str | None, paths: Sequence[Path]) -> None:
+        self._title = target if scenario is None else f"{target}, scenario {scenario}"
+        self._paths = paths
+        self._recorders: dict[str, RecordSeries] = {}
+        self._text = self._description = ""
+        self._facts: dict[str, str] = {}
+
+    def begin(
+        self, name: str, env: FMUEnv, variables: Sequence[str] | None, every: float | None
+    ) -> RecordSeries:
+        """Wrap the environment of the next controller."""
+        tables = [path for path in self._paths if path.suffix.lower() in _TABLES]
+        first = tables[0] if tables else None
+        self._recorders[name] = RecordSeries(env, variables, every=every, path=first)
+        self._look_at(env)
+        return self._recorders[name]
+
+    def _look_at(self, env: FMUEnv) -> None:
+        """Keep what a report tells of the task."""
+        task = getattr(env, "task", None)
+        if isinstance(task, Task):
+            self._text = "\n".join(source.text for source in task.sources).strip()
+            self._description = str(task.document.get("description", ""))
+        self._facts = {
+            "FMU": f"{env.fmu.path.name} (FMI {env.fmu.description.fmi_version})",
+            "time step": f"{env.config.time_step:g} s",
+            "fmugym": version("fmugym-toolbox"),
+        }
+
+    def finish(self, seed: int) -> None:
+        """Write all files with what was recorded until now."""
+        runs: dict[str, TimeSeries] = {}
+        for name, recorder in self._recorders.items():
+            recorder.complete()
+            with suppress(SimulationError):  # it has nothing of a run that could not begin
+                runs[name] = recorder.series
+        tables = 0
+        for path in self._paths if runs else ():
+            if path.suffix.lower() in _TABLES:
+                tables += 1
+                if tables > 1:
+                    next(iter(runs.values())).write(path)
+            elif path.suffix.lower() == _REPORT:
+                self._write_report(path, runs, seed)
+            else:
+                _draw(path, runs, self._title)
+
+    def _write_report(self, path: Path, runs: dict[str, TimeSeries], seed: int) -> None:
+        facts = self._facts | {"first seed": str(seed)}
+        write_report(
+            path,
+            runs,
+            title=self._title,
+            description=self._description,
+            facts=facts,
+            text=self._text,
+        )
+
+
+def _draw(path: Path, runs: dict[str, TimeSeries], title: str) -> None:
+    """Draw the first episode of each run; a run after the first has its number in the name."""
+    for number, (name, series) in enumerate(runs.items()):
+        first = next(iter(series.episodes().values()))
+        own = path.with_stem(f"{path.stem}-{number}") if number else path
+        plot(first, own, title=f"{title}: {name}")

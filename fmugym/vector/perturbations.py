@@ -1,0 +1,243 @@
+"""Derivatives by the states of an FMU: episodes that start a little beside a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import Variable
+from fmugym.errors import SimulationError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.bundle import Bundle, IndexArray
+from fmugym.task.interface import checked_value
+from fmugym.task.snapshot import Columns, Snapshot, stacked, taken
+from fmugym.vector.env import FMUVectorEnv
+from fmugym.vector.sensitivities import float_box, moved_both_ways
+
+__all__ = ["Matrices", "differentiate_by_starts"]
+
+_AGREEMENT: Final = 1e-3
+"""By how much a step may differ after a start at the state before it, as a fraction of scales."""
+
+_FIRST: Final = np.zeros(1, np.int64)
+
+
+class Matrices(NamedTuple):
+    """The arrays of a ``LinearTrajectory``."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    x: FloatArray
+    y: FloatArray
+
+
+class _Trials(NamedTuple):
+    """Single steps, M of them.
+
+    Attributes:
+        at: Which step of the trajectory each is, shape (M,).
+        starts: Whether the FMU starts at given states instead of going on, shape (M,).
+        states: These states, shape (M, n_x).
+        actions: Shape (M, ...).
+    """
+
+    at: IndexArray
+    starts: MaskArray
+    states: FloatArray
+    actions: npt.NDArray[Any]
+
+    def take(self, places: IndexArray) -> _Trials:
+        """Some of them."""
+        return _Trials(
+            self.at[places], self.starts[places], self.states[places], self.actions[places]
+        )
+
+
+def differentiate_by_starts(
+    envs: FMUVectorEnv,
+    start: Snapshot,
+    nominal: npt.NDArray[Any],
+    states: Mapping[str, str],
+    steps: tuple[float, float],
+) -> Matrices:
+    """Differentiate each step of a trajectory by the states before it and by its action.
+
+    Args:
+        envs: The environments; they return to their present episodes.
+        start: Of one environment, where the trajectory begins.
+        nominal: The actions, shape (horizon, ...).
+        states: The start variable of each state.
+        steps: How far states and actions are moved, as fractions.
+
+    Returns:
+        The matrices, the states and the outputs.
+
+    Raises:
+        SimulationError: See ``linearize_along``.
+    """
+    present = envs.save_state() if envs._is_ready else None
+    with envs._returning_to(present):
+        return _Perturbation(envs, states, start).differentiate(nominal, steps)
+
+
+class _Perturbation:
+    """Plays a trajectory, and single steps beside it."""
+
+    def __init__(self, envs: FMUVectorEnv, states: Mapping[str, str], start: Snapshot) -> None:
+        env = envs._prototype
+        self._envs, self._engine, self._pool = envs, envs._engine, envs._pool
+        self._space = float_box(envs.single_action_space, "action")
+        self._x = tuple(map(env.fmu.variable, states))
+        self._count_of_y = env._output_count
+        self._start = start
+        self._everywhere = np.arange(envs.num_envs)
+        fixed = {
+            name: checked_value(env.fmu.variable(name), column[0])
+            for name, column in start.columns_for(envs._scope)["parameters"].items()
+            if column[0] is not None and env.fmu.variable(name).kind != "string"
+        }
+        names = [*(name for name in fixed if name not in states.values()), *states.values()]
+        self._variables: tuple[Variable, ...] = tuple(map(env.fmu.variable, names))
+        self._fixed = np.array([fixed[name] for name in names[: -len(states)]])
+        self._starts = tuple(states.values())
+
+    def differentiate(self, nominal: npt.NDArray[Any], steps: tuple[float, float]) -> Matrices:
+        """See ``differentiate_by_starts``."""
+        x, y = self._follow(nominal)
+        scales = self._scales(x)
+        trials, widths = self._trials(nominal, x[:-1], scales * steps[0], steps[1])
+        rounds = [self._play(trials.take(p)) for p in self._rounds(len(trials.at))]
+        before, after = (
+            np.concatenate(part)[: len(trials.at)] for part in zip(*rounds, strict=True)
+        )
+        horizon, n = len(nominal), len(self._x)
+        by_step = after.reshape(horizon, -1, after.shape[1])
+        self._require_agreement(x, by_step[:, 0, :n], scales)
+        moved = before.reshape(horizon, -1, n)[:, 1 : 1 + 2 * n].reshape(horizon, n, 2, n)
+        apart = np.einsum("kipi->kpi", moved)  # of each pair, the state that was moved
+        widths = np.concatenate([apart[:, 0] - apart[:, 1], widths], axis=1)
+        pairs = by_step[:, 1:].reshape(horizon, -1, 2, after.shape[1])
+        slopes = np.swapaxes((pairs[:, :, 0] - pairs[:, :, 1]) / widths[:, :, None], 1, 2)
+        (a, b), (c, d) = (
+            (rows[:, :, :n], rows[:, :, n:]) for rows in (slopes[:, :n], slopes[:, n:])
+        )
+        return Matrices(a, b, c, d, x, y)
+
+    def _follow(self, nominal: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Play the trajectory, and keep each moment of it; returns x and y."""
+        count = len(self._everywhere)
+        self._envs._place(self._start, np.zeros(count, np.int64))
+        x, y = [self._pool.read(self._x)[:, 0]], []
+        bundles, columns = [], []
+        for index, action in enumerate(nominal):
+            bundles.append(self._pool.save_instances(_FIRST))
+            columns.append(self._engine.columns(_FIRST))
+            result = self._engine.step(np.repeat(action[None], count, axis=0), None)
+            self._require_fine(f"step {index + 1}", _FIRST)
+            if (result.terminated | result.truncated)[0] and index + 1 < len(nominal):
+                raise SimulationError(
+                    f"the episode ends after {index + 1} of {len(nominal)} steps: no step follows "
+                    "that could be linearized"
+                )
+            x.append(self._pool.read(self._x)[:, 0])
+            y.append(self._pool.outputs[: self._count_of_y, 0].copy())
+        self._bundle: Bundle = Bundle.of_all(bundles)
+        self._columns: Columns = stacked(columns)
+        return np.array(x), np.array(y)
+
+    def _scales(self, x: FloatArray) -> FloatArray:
+        """The magnitude of each state."""
+        nominals = np.array([abs(v.nominal or 1.0) for v in self._x])
+        largest = np.abs(x).max(axis=0)
+        return np.where(largest > 0.0, largest, nominals)
+
+    def _trials(
+        self, nominal: npt.NDArray[Any], x: FloatArray, deltas: FloatArray, step: float
+    ) -> tuple[_Trials, FloatArray]:
+        """For each step: a start at its states, at moved states, and moved actions.
+
+        Returns:
+            The trials, and how far each pair of actions is apart, shape (horizon, n_u).
+        """
+        (horizon, n), size = x.shape, nominal[0].size
+        each = 1 + 2 * n + 2 * size
+        states = np.repeat(x[:, None], each, axis=1)
+        actions = np.repeat(nominal.reshape(horizon, 1, size), each, axis=1)
+        *moved, widths = (
+            array.reshape(horizon, size) for array in moved_both_ways(self._space, nominal, step)
+        )
+        for way, sign in enumerate((1.0, -1.0)):
+            for i in range(n):
+                states[:, 1 + 2 * i + way, i] += sign * deltas[i]
+            for j in range(size):
+                actions[:, 1 + 2 * n + 2 * j + way, j] = moved[way][:, j]
+        starts = np.tile(np.arange(each) < 1 + 2 * n, horizon)
+        trials = _Trials(
+            np.repeat(np.arange(horizon), each),
+            starts,
+            states.reshape(-1, n),
+            actions.reshape(-1, *nominal.shape[1:]),
+        )
+        return trials, widths
+
+    def _rounds(self, count: int) -> list[IndexArray]:
+        """Which trials the environments play one after the other."""
+        num_envs = len(self._everywhere)
+        firsts = range(0, count, num_envs)
+        return [np.minimum(np.arange(i, i + num_envs), count - 1) for i in firsts]
+
+    def _play(self, trials: _Trials) -> tuple[FloatArray, FloatArray]:
+        """Do one step of each; returns the states before, and the states and outputs after."""
+        starting, going = np.flatnonzero(trials.starts), np.flatnonzero(~trials.starts)
+        if len(going):
+            self._envs._restore(self._bundle, trials.at[going], going)
+        columns = taken(self._columns, trials.at)
+        if len(starting):
+            self._start_at(trials)
+            self._require_fine("a start", starting)
+            columns["values"][starting] = self._pool.outputs.T[starting]
+        before = self._pool.read(self._x).T
+        self._require_states(before[starting], trials.states[starting])
+        self._engine.place(columns, self._everywhere, self._everywhere)
+        self._engine.step(trials.actions, None)
+        self._require_fine("a step", self._everywhere)
+        outputs = self._pool.outputs[: self._count_of_y]
+        return before, np.concatenate([self._pool.read(self._x), outputs]).T
+
+    def _start_at(self, trials: _Trials) -> None:
+        fixed = np.repeat(self._fixed[:, None], len(self._everywhere), axis=1)
+        values = np.ascontiguousarray(np.concatenate([fixed, trials.states.T]))
+        self._pool.reset(self._variables, values, trials.starts)
+
+    # What may be wrong
+
+    def _require_fine(self, what: str, indices: IndexArray) -> None:
+        for index in indices[self._pool.statuses[indices] > Status.WARNING].tolist():
+            raise SimulationError(f"{what} fails: {self._pool.failure(index)}")
+
+    def _require_states(self, found: FloatArray, wanted: FloatArray) -> None:
+        """Find start variables that do not set their states."""
+        scales = self._scales(wanted) if len(wanted) else np.ones(len(self._x))
+        for index in np.flatnonzero(np.any(np.abs(found - wanted) > _AGREEMENT * scales, axis=0)):
+            state, start = self._x[index].name, self._starts[index]
+            row = int(np.abs(found - wanted)[:, index].argmax())
+            raise SimulationError(
+                f"{start!r} does not set the state {state!r}: with {wanted[row, index]:g} it is "
+                f"{found[row, index]:g}"
+            )
+
+    def _require_agreement(self, x: FloatArray, after: FloatArray, scales: FloatArray) -> None:
+        """Compare the trajectory with steps after a start at its states."""
+        bad = np.abs(after - x[1:]) > _AGREEMENT * scales
+        for step, index in np.argwhere(bad)[:1].tolist():
+            raise SimulationError(
+                f"the states {', '.join(v.name for v in self._x)} do not determine what follows: "
+                f"{self._x[index].name} is {x[step + 1, index]:g} after step {step + 1}, but "
+                f"{after[step, index]:g} after a start at the states before that step"
+            )

@@ -1,0 +1,80 @@
+/* The method of Dormand and Prince of order 5 with an estimate of order 4 and dense output: Hairer,
+ * Norsett, Wanner, Solving Ordinary Differential Equations I, section II.5 and II.6. */
+
+#include "solver.h"
+
+enum { STAGES = 7 };
+
+static const double nodes[STAGES] = {0.0, 1.0 / 5, 3.0 / 10, 4.0 / 5, 8.0 / 9, 1.0, 1.0};
+
+/* The last row also gives the result, so that the last stage is the rates at the end. */
+static const double weights[STAGES][STAGES] = {
+    {0.0},
+    {1.0 / 5},
+    {3.0 / 40, 9.0 / 40},
+    {44.0 / 45, -56.0 / 15, 32.0 / 9},
+    {19372.0 / 6561, -25360.0 / 2187, 64448.0 / 6561, -212.0 / 729},
+    {9017.0 / 3168, -355.0 / 33, 46732.0 / 5247, 49.0 / 176, -5103.0 / 18656},
+    {35.0 / 384, 0.0, 500.0 / 1113, 125.0 / 192, -2187.0 / 6784, 11.0 / 84},
+};
+
+static const double errors[STAGES] = {71.0 / 57600,      0.0,        -71.0 / 16695, 71.0 / 1920,
+                                      -17253.0 / 339200, 22.0 / 525, -1.0 / 40};
+
+static const double dense[STAGES] = {-12715105075.0 / 11282082432,  0.0,
+                                     87487479700.0 / 32700410799,   -10690763975.0 / 1880347072,
+                                     701980252875.0 / 199316789632, -1453857185.0 / 822651844,
+                                     69997945.0 / 29380423};
+
+/* The weighted sum of the first stages of a state. */
+static double sum(const Solver *me, const double *factors, int count, size_t state) {
+    double total = 0.0;
+
+    for (int j = 0; j < count; j++) {
+        total += factors[j] * me->stages[(size_t)j * me->n + state];
+    }
+    return total;
+}
+
+static Status step(Solver *me, double end, double *error) {
+    const double time = me->memory.time, size = end - time;
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < me->n; i++) {
+        me->stages[i] = me->rates[i];
+    }
+    for (int s = 1; s < STAGES && status <= STATUS_WARNING; s++) {
+        for (size_t i = 0; i < me->n; i++) {
+            me->next[i] = me->x[i] + size * sum(me, weights[s], s, i);
+        }
+        status = solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next,
+                              me->stages + (size_t)s * me->n);
+    }
+    for (size_t i = 0; i < me->n; i++) {
+        me->trial[i] = size * sum(me, errors, STAGES, i);
+    }
+    *error = solver_norm(me, me->trial);
+    return status;
+}
+
+static Status between(Solver *me, double end, double fraction, double *x) {
+    const double size = end - me->memory.time, rest = 1.0 - fraction;
+    const double *last = me->stages + (STAGES - 1) * me->n;
+
+    for (size_t i = 0; i < me->n; i++) {
+        const double change = me->next[i] - me->x[i];
+        const double first = size * me->stages[i] - change;
+        const double second = change - size * last[i] - first;
+        const double third = size * sum(me, dense, STAGES, i);
+        x[i] = me->x[i] +
+               fraction * (change + rest * (first + fraction * (second + rest * third)));
+    }
+    return STATUS_OK;
+}
+
+const Method dormand_prince = {.name = "dormand_prince",
+                               .stages = STAGES,
+                               .order = 5.0,
+                               .last = STAGES - 1,
+                               .step = step,
+                               .between = between};

@@ -1,0 +1,140 @@
+/* FMI 2.0 for model exchange. */
+
+#include "fmi2.h"
+#include "solved.h"
+
+enum { MODEL_EXCHANGE = 0 };
+
+static const Binding bindings[] = {
+    SHARED_BINDINGS,
+    {"SetTime", offsetof(Functions, set_time), true},
+    {"SetContinuousStates", offsetof(Functions, set_states), true},
+    {"GetContinuousStates", offsetof(Functions, get_states), true},
+    {"GetDerivatives", offsetof(Functions, get_rates), true},
+    {"GetEventIndicators", offsetof(Functions, get_indicators), true},
+    {"GetNominalsOfContinuousStates", offsetof(Functions, get_nominals), true},
+    {"EnterEventMode", offsetof(Functions, enter_events), true},
+    {"NewDiscreteStates", offsetof(Functions, update), true},
+    {"EnterContinuousTimeMode", offsetof(Functions, enter_continuous), true},
+    {"CompletedIntegratorStep", offsetof(Functions, complete), true},
+    {"GetDirectionalDerivative", offsetof(Functions, differentiate), false},
+};
+
+static bool bind(Library *library, char *error, size_t size) {
+    return library_bind(library, "fmi2", bindings, COUNT_OF(bindings), sizeof(Functions),
+                        error, size);
+}
+
+static Status set_time(const Library *library, void *component, double time) {
+    return sane(functions_of(library)->set_time(component, time));
+}
+
+static Status set_states(const Library *library, void *component, const double *x, size_t count) {
+    return sane(functions_of(library)->set_states(component, x, count));
+}
+
+static Status get_states(const Library *library, void *component, double *x, size_t count) {
+    return sane(functions_of(library)->get_states(component, x, count));
+}
+
+static Status get_rates(const Library *library, void *component, double *rates, size_t count) {
+    return sane(functions_of(library)->get_rates(component, rates, count));
+}
+
+static Status get_indicators(const Library *library, void *component, double *z, size_t count) {
+    return sane(functions_of(library)->get_indicators(component, z, count));
+}
+
+static Status get_nominals(const Library *library, void *component, double *x, size_t count) {
+    return sane(functions_of(library)->get_nominals(component, x, count));
+}
+
+static Status enter_events(const Library *library, void *component) {
+    return sane(functions_of(library)->enter_events(component));
+}
+
+static Status update(const Library *library, void *component, Events *events) {
+    EventInfo info = {0};
+    const Status status = sane(functions_of(library)->update(component, &info));
+
+    *events = (Events){info.needs_update != 0, info.terminate != 0, info.has_next_time != 0,
+                       info.next_time};
+    return status;
+}
+
+static Status enter_continuous(const Library *library, void *component) {
+    return sane(functions_of(library)->enter_continuous(component));
+}
+
+static Status complete(const Library *library, void *component, bool *event, bool *terminate) {
+    int wants_event = 0, wants_to_stop = 0;
+    const Status status =
+        sane(functions_of(library)->complete(component, 0, &wants_event, &wants_to_stop));
+
+    *event = wants_event != 0;
+    *terminate = wants_to_stop != 0;
+    return status;
+}
+
+static Status differentiate(const Library *library, void *component, const uint32_t *rates,
+                            size_t count, uint32_t state, double *column) {
+    const Functions *f = functions_of(library);
+    const double seed = 1.0;
+
+    return f->differentiate == NULL
+               ? STATUS_ERROR
+               : sane(f->differentiate(component, rates, count, &state, 1, &seed, column));
+}
+
+/* The FMU itself, without a solver. */
+static const Fmi fmu = {
+    .boolean_size = sizeof(int),
+    .choose_messages = choose_messages,
+    .initialize = initialize,
+    .get = older_get,
+    .set = older_set,
+    .set_string = older_set_string,
+    .reset = reset,
+    .terminate = terminate,
+    .free_instance = free_instance,
+    .get_state = get_state,
+    .set_state = set_state,
+    .free_state = free_state,
+    .state_size = state_size,
+    .serialize = serialize,
+    .deserialize = deserialize,
+};
+
+static const Model model = {
+    .fmi = &fmu,
+    .set_time = set_time,
+    .set_states = set_states,
+    .get_states = get_states,
+    .get_rates = get_rates,
+    .get_indicators = get_indicators,
+    .get_nominals = get_nominals,
+    .enter_events = enter_events,
+    .update = update,
+    .enter_continuous = enter_continuous,
+    .complete = complete,
+    .differentiate = differentiate,
+};
+
+static void *instantiate(const Library *library, const Identity *identity) {
+    return solved_take(&model, library, identity,
+                       instantiate_as(MODEL_EXCHANGE, library, identity));
+}
+
+static bool exchange(const Library *library, const Exchange *e) {
+    return exchange_by(&exchange2, library, e);
+}
+
+const Fmi exchange2 = {
+    .boolean_size = sizeof(int),
+    .bind = bind,
+    .instantiate = instantiate,
+    .choose_messages = solved_choose_messages,
+    .exchange = exchange,
+    SOLVED_FUNCTIONS,
+    SOLVED_STATES,
+};

@@ -1,0 +1,37 @@
+/* The methods of integration. All take one step from one state, so that nothing else has to be
+ * saved with it. */
+
+#ifndef FMUGYM_METHODS_H
+#define FMUGYM_METHODS_H
+
+#include "fmi.h"
+
+struct Solver;
+
+typedef struct Method {
+    const char *name;
+    size_t stages;      /* arrays of states that it uses */
+    double order;       /* of the estimate of the error; 0 if it makes none */
+    size_t last;        /* the stage that is the rates at the end, or 0 if none is */
+    bool needs_jacobian;
+    /* Computes next at this time from x and the rates, and the norm of the error: above 1, the
+     * step is too large. */
+    Status (*step)(struct Solver *me, double end, double *error);
+    /* The state at a fraction of the step from the time of the memory to the end. */
+    Status (*between)(struct Solver *me, double end, double fraction, double *x);
+} Method;
+
+extern const Method euler, rk4, dormand_prince, rosenbrock;
+
+/* How a pool solves the equations of its instances. */
+typedef struct Solving {
+    const Method *method;
+    double tolerance; /* relative */
+    double max_step;  /* infinite for none */
+    size_t states, indicators;
+    bool completes; /* whether the FMU wants to know of complete steps */
+    /* one for each state; NULL if the FMU gives no directional derivatives */
+    const uint32_t *state_references, *rate_references;
+} Solving;
+
+#endif

@@ -1,0 +1,14 @@
+/* Functions whose results are known without a loop of numpy, but for a few doubtful values. */
+
+#ifndef FMUGYM_QUICK_H
+#define FMUGYM_QUICK_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+/* Both compute blocks of PROGRAM_BLOCK values, and note which of them are doubtful. */
+void quick_square(const double *x, size_t blocks, double *to, uint8_t *doubtful);
+void quick_remainder(const double *x, const double *y, size_t blocks, double *to,
+                     uint8_t *doubtful);
+
+#endif

@@ -1,0 +1,551 @@
+#include "solver.h"
+
+#include <float.h>
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "log.h"
+
+enum {
+    MOST_UPDATES = 1000,  /* of the discrete states in one event */
+    MOST_EVENTS = 100000, /* in one communication step */
+    MOST_GUESSES = 200    /* of the time of one event */
+};
+
+static const double GROWTH = 6.0, SHRINKAGE = 0.2, SAFETY = 0.9;
+static const double SMALL = 0.01;   /* part of a nominal value that errors are compared with */
+static const double FIRST = 0.01;   /* part of its value that a state changes in the first step */
+static const double SHARP = 1e-3;   /* part of the tolerance to which events are located */
+static const double ROOT = 0x1p-26; /* of the resolution of doubles; for differences */
+
+static bool good(Status status) {
+    return status <= STATUS_WARNING;
+}
+
+/* Memory */
+
+static double *take(double **place, size_t count) {
+    double *start = *place;
+    *place += count;
+    return start;
+}
+
+static void share_out(Solver *me, double *memory) {
+    const Solving *s = me->solving;
+    const size_t square = s->method->needs_jacobian ? me->n * me->n : 0;
+
+    me->x = take(&memory, me->n);
+    me->rates = take(&memory, me->n);
+    me->next = take(&memory, me->n);
+    me->nominals = take(&memory, me->n);
+    me->trial = take(&memory, me->n);
+    me->slope = take(&memory, me->n);
+    me->stages = take(&memory, me->n * s->method->stages);
+    me->jacobian = take(&memory, square);
+    me->matrix = take(&memory, square);
+    me->found = take(&memory, me->n);
+    me->z = take(&memory, s->indicators);
+    me->next_z = take(&memory, s->indicators);
+    me->low_z = take(&memory, s->indicators);
+    me->found_z = take(&memory, s->indicators);
+}
+
+bool solver_open(Solver *me) {
+    const Solving *s = me->solving;
+    const size_t rows = 7 + s->method->stages + (s->method->needs_jacobian ? 2 * s->states : 0);
+
+    me->n = s->states;
+    double *memory = calloc(me->n * rows + 4 * s->indicators + 1, sizeof *memory);
+    me->pivots = calloc(me->n + 1, sizeof *me->pivots);
+    if (memory == NULL || me->pivots == NULL) {
+        free(memory);
+        free(me->pivots);
+        return false;
+    }
+    me->arrays = memory;
+    share_out(me, memory);
+    return true;
+}
+
+void solver_close(Solver *me) {
+    free(me->arrays);
+    free(me->pivots);
+}
+
+/* Messages of the solver itself look like the FMU's. */
+static Status fail(const Solver *me, const char *format, ...) {
+    char text[200];
+    va_list values;
+
+    va_start(values, format);
+    vsnprintf(text, sizeof text, format, values);
+    va_end(values);
+    log_message_fmi3((void *)(uintptr_t)me->environment, STATUS_ERROR, "solver", text);
+    return STATUS_ERROR;
+}
+
+/* Calls of the FMU. Each restores the floating-point environment. */
+
+static void restore_floats(const Solver *me) {
+    floats_restore_if_seen(me->floats);
+}
+
+static Status place(Solver *me, double time, const double *x) {
+    Status status = me->model->set_time(me->library, me->component, time);
+
+    if (good(status) && me->n > 0) {
+        status = me->model->set_states(me->library, me->component, x, me->n);
+    }
+    restore_floats(me);
+    return status;
+}
+
+static Status get_indicators(Solver *me, double *z) {
+    const size_t count = me->solving->indicators;
+    const Status status =
+        count == 0 ? STATUS_OK
+                   : me->model->get_indicators(me->library, me->component, z, count);
+    restore_floats(me);
+    return status;
+}
+
+Status solver_rates(Solver *me, double time, const double *x, double *rates) {
+    Status status = place(me, time, x);
+
+    if (good(status) && me->n > 0) {
+        status = me->model->get_rates(me->library, me->component, rates, me->n);
+        restore_floats(me);
+    }
+    return status;
+}
+
+/* Reads the states and their nominal values, which an event may have changed. */
+static Status read_states(Solver *me) {
+    const Model *model = me->model;
+    Status status = STATUS_OK;
+
+    if (me->n > 0) {
+        status = model->get_states(me->library, me->component, me->x, me->n);
+    }
+    if (good(status) && me->n > 0 && me->solving->method->order > 0.0) {
+        status = model->get_nominals(me->library, me->component, me->nominals, me->n);
+    }
+    restore_floats(me);
+    for (size_t i = 0; i < me->n; i++) {
+        const double nominal = fabs(me->nominals[i]);
+        me->nominals[i] = nominal > 0.0 && nominal <= DBL_MAX ? nominal : 1.0;
+    }
+    me->stale = me->knows_rates = me->knows_indicators = me->has_jacobian = false;
+    return status;
+}
+
+/* Finds out what is not yet known of the equations at the current time and states. */
+static Status know(Solver *me) {
+    Status status = STATUS_OK;
+
+    if (!me->knows_rates) {
+        status = solver_rates(me, me->memory.time, me->x, me->rates);
+    }
+    if (good(status) && !me->knows_indicators) {
+        status = get_indicators(me, me->z);
+    }
+    me->knows_rates = me->knows_indicators = good(status);
+    return status;
+}
+
+/* Events */
+
+Status solver_enter_events(Solver *me) {
+    const Status status = me->model->enter_events(me->library, me->component);
+
+    restore_floats(me);
+    me->memory.mode = IN_EVENTS;
+    return status;
+}
+
+Status solver_settle(Solver *me) {
+    const Model *model = me->model;
+    Events events = {.again = true};
+    Status status = STATUS_OK;
+
+    for (int i = 0; events.again && !events.terminate && good(status); i++) {
+        if (i == MOST_UPDATES) {
+            return fail(me, "the discrete states at t = %g s do not settle in %d updates",
+                        me->memory.time, MOST_UPDATES);
+        }
+        events = (Events){0};
+        status = model->update(me->library, me->component, &events);
+        restore_floats(me);
+    }
+    me->memory.next_event =
+        events.has_next && !isnan(events.next) ? events.next : INFINITY;
+    me->memory.terminated |= events.terminate;
+    if (!good(status) || events.terminate) {
+        return status;
+    }
+    status = model->enter_continuous(me->library, me->component);
+    restore_floats(me);
+    me->memory.mode = IN_CONTINUOUS_TIME;
+    return good(status) ? read_states(me) : status;
+}
+
+static Status handle_event(Solver *me) {
+    if (++me->events > MOST_EVENTS) {
+        return fail(me, "the model has more than %d events in a step, the last at t = %.17g s",
+                    MOST_EVENTS, me->memory.time);
+    }
+    const Status status = solver_enter_events(me);
+    return good(status) ? solver_settle(me) : status;
+}
+
+/* Whether an indicator becomes positive or ceases to be: FMI's events. */
+static bool crosses(const Solver *me, const double *before, const double *after) {
+    bool any = false;
+
+    for (size_t i = 0; i < me->solving->indicators; i++) {
+        any |= (before[i] > 0.0) != (after[i] > 0.0);
+    }
+    return any;
+}
+
+/* An interval of fractions of a step: no indicator has crossed zero at low, one has at high. */
+typedef struct {
+    double low, high;
+    double low_weight, high_weight; /* halved while an end stays where it is (Illinois method) */
+} Bracket;
+
+/* The fraction at which straight lines between the ends cross first. */
+static double first_crossing(const Solver *me, const Bracket *b) {
+    double first = 1.0;
+
+    for (size_t i = 0; i < me->solving->indicators; i++) {
+        const double low = b->low_weight * me->low_z[i], high = b->high_weight * me->next_z[i];
+        if ((low > 0.0) != (high > 0.0) && low / (low - high) < first) {
+            first = low / (low - high);
+        }
+    }
+    return b->low + first * (b->high - b->low);
+}
+
+/* Keeps a guess so far from both ends that one of them moves by at least this much. Each fourth
+ * guess halves the interval. */
+static double next_guess(const Solver *me, const Bracket *b, int guesses, double least) {
+    const double middle = 0.5 * (b->low + b->high);
+    const double guess = guesses % 4 == 3 ? middle : first_crossing(me, b);
+
+    if (!(guess > b->low + least)) {
+        return fmin(b->low + least, middle);
+    }
+    return guess < b->high - least ? guess : fmax(b->high - least, middle);
+}
+
+/* Goes to a fraction of the step, and reads the indicators there. */
+static Status go_to(Solver *me, double end, double fraction) {
+    const double time = me->memory.time;
+    Status status = me->solving->method->between(me, end, fraction, me->found);
+
+    if (good(status)) {
+        status = place(me, time + fraction * (end - time), me->found);
+    }
+    return good(status) ? get_indicators(me, me->found_z) : status;
+}
+
+static void narrow(Solver *me, Bracket *b, double guess) {
+    const size_t size = me->solving->indicators * sizeof(double);
+
+    if (crosses(me, me->z, me->found_z)) {
+        *b = (Bracket){b->low, guess, 0.5 * b->low_weight, 1.0};
+        memcpy(me->next_z, me->found_z, size);
+    } else {
+        *b = (Bracket){guess, b->high, 1.0, 0.5 * b->high_weight};
+        memcpy(me->low_z, me->found_z, size);
+    }
+}
+
+/* Finds the first crossing in the step that ends at *end. Moves the end and next to just after
+ * it. */
+static Status locate(Solver *me, double *end) {
+    const double time = me->memory.time, step = *end - time;
+    const double width = fmax(SHARP * me->solving->tolerance,
+                              4.0 * DBL_EPSILON * fmax(fabs(time), fabs(*end)) / step);
+    Bracket b = {0.0, 1.0, 1.0, 1.0};
+    Status status = STATUS_OK;
+
+    memcpy(me->low_z, me->z, me->solving->indicators * sizeof(double));
+    for (int i = 0; b.high - b.low > width && i < MOST_GUESSES && good(status); i++) {
+        const double guess = next_guess(me, &b, i, 0.5 * width);
+        status = go_to(me, *end, guess);
+        narrow(me, &b, guess);
+    }
+    if (b.high == 1.0 || !good(status)) {
+        return good(status) ? place(me, *end, me->next) : status;
+    }
+    status = go_to(me, *end, b.high);
+    memcpy(me->next, me->found, me->n * sizeof(double));
+    *end = time + b.high * step;
+    return status;
+}
+
+/* Steps */
+
+double solver_norm(const Solver *me, const double *errors) {
+    const double tolerance = me->solving->tolerance;
+    double sum = 0.0;
+
+    for (size_t i = 0; i < me->n; i++) {
+        const double size = fmax(fabs(me->x[i]), fabs(me->next[i]));
+        const double part = errors[i] / (tolerance * (size + SMALL * me->nominals[i]));
+        sum += part * part;
+    }
+    return me->n == 0 ? 0.0 : sqrt(sum / (double)me->n);
+}
+
+static double step_for_difference(double value, double nominal) {
+    return ROOT * fmax(fabs(value), 1e-3 * nominal);
+}
+
+/* The derivatives of the rates by one state, from the FMU or from a difference. */
+static Status differentiate_by(Solver *me, size_t state, double *column) {
+    const Solving *s = me->solving;
+    const double value = me->x[state];
+
+    if (s->state_references != NULL) {
+        const Status status =
+            me->model->differentiate(me->library, me->component, s->rate_references, me->n,
+                                     s->state_references[state], column);
+        restore_floats(me);
+        return status;
+    }
+    memcpy(me->trial, me->x, me->n * sizeof(double));
+    me->trial[state] = value + step_for_difference(value, me->nominals[state]);
+    const double change = me->trial[state] - value; /* as rounded */
+    const Status status = solver_rates(me, me->memory.time, me->trial, column);
+    for (size_t i = 0; i < me->n; i++) {
+        column[i] = (column[i] - me->rates[i]) / change;
+    }
+    return status;
+}
+
+static Status differentiate_by_time(Solver *me, double step) {
+    const double time = me->memory.time;
+    const double later = time + fmax(1e-4 * step, ROOT * fabs(time));
+    const Status status = solver_rates(me, later, me->x, me->slope);
+
+    for (size_t i = 0; i < me->n; i++) {
+        me->slope[i] = (me->slope[i] - me->rates[i]) / (later - time);
+    }
+    return status;
+}
+
+Status solver_differentiate(Solver *me, double step) {
+    double *column = me->found;
+    Status status = me->has_jacobian ? STATUS_OK : place(me, me->memory.time, me->x);
+
+    for (size_t j = 0; j < me->n && good(status) && !me->has_jacobian; j++) {
+        status = differentiate_by(me, j, column);
+        for (size_t i = 0; i < me->n; i++) {
+            me->jacobian[i * me->n + j] = column[i];
+        }
+    }
+    me->has_jacobian = good(status);
+    return good(status) ? differentiate_by_time(me, step) : status;
+}
+
+/* Two times that are this close are the same. */
+static double resolution(const Solver *me, double until) {
+    return 16.0 * DBL_EPSILON * fmax(fabs(me->memory.time), fabs(until));
+}
+
+/* In the first step each state changes by a small part of its value. */
+static double first_step(const Solver *me) {
+    double sum = 0.0;
+
+    for (size_t i = 0; i < me->n; i++) {
+        const double part = me->rates[i] / (fabs(me->x[i]) + SMALL * me->nominals[i]);
+        sum += part * part;
+    }
+    return sum > 0.0 ? FIRST / sqrt(sum / (double)me->n) : INFINITY;
+}
+
+/* Divides what remains so that no very short step is left at the end. */
+static double size_of_step(Solver *me, double remaining) {
+    const double most = me->solving->max_step;
+
+    if (me->solving->method->order == 0.0) {
+        return remaining / fmax(1.0, ceil(remaining / most - 1e-6));
+    }
+    if (!(me->memory.step > 0.0)) {
+        me->memory.step = first_step(me);
+    }
+    const double size = fmin(me->memory.step, most);
+    if (remaining <= fmin(1.1 * size, most)) {
+        return remaining;
+    }
+    return remaining < 2.0 * size ? 0.5 * remaining : size;
+}
+
+static double factor_after(const Solver *me, double error) {
+    const double factor = SAFETY * pow(error, -1.0 / me->solving->method->order);
+    return error > 0.0 ? fmin(GROWTH, fmax(SHRINKAGE, factor)) : GROWTH;
+}
+
+/* A step that was shorter than proposed tells little of how long the next one may be. */
+static void accept(Solver *me, double size, double error) {
+    const double proposed = size * factor_after(me, error);
+    me->memory.step = size < me->memory.step ? fmax(me->memory.step, proposed) : proposed;
+}
+
+/* Tries shorter and shorter steps until the error is within the tolerance. Only a method without
+ * an estimate passes on that the FMU discards a call. */
+static Status take_step(Solver *me, double until, double *end) {
+    const Method *method = me->solving->method;
+    const double remaining = until - me->memory.time;
+    double size = size_of_step(me, remaining), error;
+
+    for (;;) {
+        *end = size >= remaining ? until : me->memory.time + size;
+        const Status status = method->step(me, *end, &error);
+        if (method->order == 0.0 || (!good(status) && status != STATUS_DISCARD)) {
+            return status;
+        }
+        if (good(status) && error <= 1.0) {
+            accept(me, size, error);
+            return status;
+        }
+        const bool finite = good(status) && error <= DBL_MAX;
+        me->memory.step = size *= finite ? fmin(SAFETY, factor_after(me, error)) : SHRINKAGE;
+        if (size < resolution(me, until)) {
+            return fail(me, "the solver %s needs steps below %.3g s at t = %.17g s", method->name,
+                        size, me->memory.time);
+        }
+    }
+}
+
+static void exchange_arrays(double **a, double **b) {
+    double *kept = *a;
+    *a = *b;
+    *b = kept;
+}
+
+/* Makes the end of a step the current time. The FMU is there already. */
+static void move_on(Solver *me, double end, bool interrupted) {
+    const Method *method = me->solving->method;
+
+    me->memory.time = end;
+    exchange_arrays(&me->x, &me->next);
+    exchange_arrays(&me->z, &me->next_z);
+    me->knows_rates = method->last > 0 && !interrupted;
+    me->knows_indicators = !interrupted;
+    me->has_jacobian = false;
+    if (me->knows_rates) {
+        memcpy(me->rates, me->stages + method->last * me->n, me->n * sizeof(double));
+    }
+}
+
+static Status complete(Solver *me, bool *event) {
+    bool terminate = false;
+    Status status = STATUS_OK;
+
+    if (me->solving->completes) {
+        status = me->model->complete(me->library, me->component, event, &terminate);
+        restore_floats(me);
+    }
+    me->memory.terminated |= terminate;
+    return status;
+}
+
+/* Takes a very short step if an indicator is 0. As the states move, it may become positive at once,
+ * and the sign after a whole step would not tell: a ball that bounces may be down again. */
+static Status leave_zero(Solver *me, double until, double *end, bool *event) {
+    bool any = false;
+
+    for (size_t i = 0; i < me->solving->indicators; i++) {
+        any |= me->z[i] == 0.0;
+    }
+    if (!any) {
+        return STATUS_OK;
+    }
+    *end = me->memory.time + resolution(me, until);
+    for (size_t i = 0; i < me->n; i++) {
+        me->next[i] = me->x[i] + (*end - me->memory.time) * me->rates[i];
+    }
+    Status status = place(me, *end, me->next);
+    if (good(status)) {
+        status = get_indicators(me, me->next_z);
+    }
+    *event = good(status) && crosses(me, me->z, me->next_z);
+    return status;
+}
+
+/* Takes a step as long as the method can, up to this time or the first event. */
+static Status take_whole_step(Solver *me, double until, double *end, bool *event) {
+    Status status = take_step(me, until, end);
+
+    if (good(status)) {
+        status = place(me, *end, me->next);
+    }
+    if (good(status)) {
+        status = get_indicators(me, me->next_z);
+    }
+    *event = good(status) && crosses(me, me->z, me->next_z);
+    return *event ? locate(me, end) : status;
+}
+
+/* Takes one step, to this time or the first event. */
+static Status step_to(Solver *me, double until) {
+    bool state_event = false, step_event = false;
+    double end = until;
+    Status status = know(me);
+
+    if (good(status)) {
+        status = leave_zero(me, until, &end, &state_event);
+    }
+    if (good(status) && !state_event) {
+        status = take_whole_step(me, until, &end, &state_event);
+    }
+    if (!good(status)) {
+        return status;
+    }
+    move_on(me, end, state_event);
+    status = complete(me, &step_event);
+    const bool event = (state_event || step_event) && !me->memory.terminated;
+    return event && good(status) ? handle_event(me) : status;
+}
+
+/* Time events */
+
+static bool is_due(const Solver *me, double until) {
+    return me->memory.next_event <= me->memory.time + resolution(me, until);
+}
+
+static Status handle_time_event(Solver *me) {
+    me->memory.time = fmax(me->memory.time, me->memory.next_event);
+    const Status status = place(me, me->memory.time, me->x);
+    return good(status) ? handle_event(me) : status;
+}
+
+Status solver_advance(Solver *me, double until) {
+    Memory *memory = &me->memory;
+    Status status = STATUS_OK;
+
+    me->events = 0;
+    if (memory->mode == IN_EVENTS && !memory->terminated) {
+        status = solver_settle(me);
+    } else if (me->stale) {
+        status = read_states(me);
+    }
+    while (good(status) && !memory->terminated) {
+        if (is_due(me, until)) {
+            status = handle_time_event(me);
+        } else if (memory->time < until - resolution(me, until)) {
+            status = step_to(me, fmin(until, memory->next_event));
+        } else {
+            memory->time = fmax(memory->time, until);
+            break;
+        }
+    }
+    return good(status) && memory->terminated ? STATUS_TERMINATED : status;
+}

@@ -1,0 +1,95 @@
+/* Model exchange: the pool integrates the FMU's equations and handles its events.
+ *
+ * Everything above sees an instance that can do steps, as in co-simulation: solved.h. */
+
+#ifndef FMUGYM_SOLVER_H
+#define FMUGYM_SOLVER_H
+
+#include "fmi.h"
+#include "methods.h"
+
+/* What the FMU tells after one update of its discrete states. */
+typedef struct {
+    bool again;     /* whether the discrete states need another update */
+    bool terminate; /* whether the FMU asks to stop */
+    bool has_next;  /* whether it has a time event */
+    double next;    /* its time */
+} Events;
+
+/* The functions of model exchange in one FMI version; those of Fmi beside them. The numbers of
+ * states and event indicators are those of the FMU. */
+typedef struct Model {
+    const Fmi *fmi; /* of the FMU itself */
+    Status (*set_time)(const Library *library, void *component, double time);
+    Status (*set_states)(const Library *library, void *component, const double *x, size_t count);
+    Status (*get_states)(const Library *library, void *component, double *x, size_t count);
+    Status (*get_rates)(const Library *library, void *component, double *rates, size_t count);
+    Status (*get_indicators)(const Library *library, void *component, double *z, size_t count);
+    Status (*get_nominals)(const Library *library, void *component, double *x, size_t count);
+    Status (*enter_events)(const Library *library, void *component);
+    Status (*update)(const Library *library, void *component, Events *events);
+    Status (*enter_continuous)(const Library *library, void *component);
+    /* Tells the FMU that a step is complete. It may want an event, or to stop. */
+    Status (*complete)(const Library *library, void *component, bool *event, bool *terminate);
+    /* The derivatives of all rates by one state; NULL in FMI 1.0. */
+    Status (*differentiate)(const Library *library, void *component, const uint32_t *rates,
+                            size_t count, uint32_t state, double *column);
+} Model;
+
+typedef enum { BEFORE_EVENTS, IN_EVENTS, IN_CONTINUOUS_TIME } Mode;
+
+/* What the solver keeps between two steps, and all that it adds to a saved state. */
+typedef struct {
+    double time;
+    double next_event; /* the time of the next time event, infinite if there is none */
+    double step;       /* the step size that an adaptive method tries next; 0 for none yet */
+    int64_t mode;
+    int64_t terminated; /* whether the FMU has asked to stop */
+} Memory;
+
+/* One instance. */
+typedef struct Solver {
+    const Model *model;
+    const Library *library;
+    void *component;
+    const Solving *solving;
+    const Floats *floats;
+    uint64_t environment; /* for messages */
+    Memory memory;
+    bool stale;            /* whether x and the nominal values must be read */
+    bool knows_rates;      /* whether rates are those at x */
+    bool knows_indicators; /* whether z are those at x */
+    bool has_jacobian;     /* whether the method's Jacobian is that at x */
+    size_t events;         /* handled in this communication step */
+    size_t n;              /* number of states */
+    double *arrays;        /* the memory of all that follow */
+    double *x, *rates;     /* at the time of the memory */
+    double *next;          /* x at the end of the step that is tried */
+    double *nominals;
+    double *z, *next_z; /* event indicators at x, and after the step */
+    double *trial;      /* for the methods: a state, or errors */
+    double *found, *low_z, *found_z; /* while an event is located */
+    double *stages;     /* n for each stage of the method */
+    double *jacobian, *matrix, *slope; /* for methods that need them */
+    uint32_t *pivots;
+} Solver;
+
+/* Allocates the arrays. Returns whether there was enough memory. */
+bool solver_open(Solver *me);
+void solver_close(Solver *me);
+
+/* Goes from IN_EVENTS to IN_CONTINUOUS_TIME, unless the FMU asks to stop. */
+Status solver_settle(Solver *me);
+/* Goes from IN_CONTINUOUS_TIME to IN_EVENTS. */
+Status solver_enter_events(Solver *me);
+/* Integrates to this time, and handles all events until then and at it. */
+Status solver_advance(Solver *me, double until);
+
+/* For the methods: the rates at a time and state. */
+Status solver_rates(Solver *me, double time, const double *x, double *rates);
+/* Fills jacobian, row by row, and slope: the derivatives of the rates by state and time. */
+Status solver_differentiate(Solver *me, double step);
+/* The root mean square of errors, each divided by the tolerance of its state. */
+double solver_norm(const Solver *me, const double *errors);
+
+#endif

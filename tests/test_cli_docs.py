@@ -1,0 +1,67 @@
+"""Every command that docs/command-line.md shows does what it says."""
+
+import re
+import shlex
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import fmugym
+from fmugym.tools.cli import main
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "command-line.md").read_text()
+BLOCKS = re.findall(r"^```bash\n(.*?)^```", PAGE, re.M | re.S)
+BLOCKS += re.findall(
+    r"^```bash\n(.*?)^```", (ROOT / "docs" / "baselines.md").read_text(), re.M | re.S
+)
+NEEDS = {
+    "fmugym train": "stable_baselines3",
+    "--agent": "stable_baselines3",
+    "record": "matplotlib",
+}
+EXAMPLES = "examples/cart_pole.toml"
+
+
+def commands(block):
+    return [line for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split()[1])
+def test_examples_of_commands_run(block, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(fmugym.bundled_fmu("Pendulum"), "model.fmu")
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    if "fmugym new" not in block:
+        assert main(["new", "model.fmu", "--output", "task.toml"]) == 0
+    for command in commands(block):
+        for text, module in NEEDS.items():
+            if text in command and not find_spec(module):
+                pytest.skip(f"needs {module}, which an extra of the package brings")
+        program, *arguments = shlex.split(command)
+        assert program == "fmugym"
+        assert main(arguments) == 0, capsys.readouterr().err
+    capsys.readouterr()
+
+
+def test_every_command_has_an_example_or_a_link():
+    shown = {shlex.split(command)[1] for block in BLOCKS for command in commands(block)}
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    listed = set(re.findall(r"^\| \[?`([\w-]+)`", PAGE, re.M)) & known_commands()
+    assert listed == known_commands()
+    assert known_commands() - shown == {"skeleton", "stand-in"}  # an alias; takes an old FMU
+
+
+def known_commands():
+    from fmugym.tools.cli import _parser
+
+    (action,) = (one for one in _parser()._actions if one.dest == "==SUPPRESS==" or one.choices)
+    return set(action.choices)
+
+
+def test_exit_codes_are_documented():
+    told = re.findall(r"^\| (\d+) \|", PAGE, re.M)
+    assert told == ["0", "1", "2", "130"]

@@ -1,0 +1,175 @@
+"""The commands that play episodes: record, evaluate with several scenarios, bench."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import fmugym
+from fmugym.series import TimeSeries
+from fmugym.tools.cli import main
+
+CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
+PID = "pid of=T setpoint=21 kp=0.3 ti=7200"
+FROST = "--scenario", "frost", "--steps", "30"
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+class TestRecord:
+    def test_a_table_of_chosen_variables_at_a_rate(self, tmp_path, capsys):
+        path = tmp_path / "a.csv"
+        options = "--variables", "T*", "--variables", "u", "--every", "3600", "--output", path
+        arguments = "--controller", PID, *FROST, *options
+        code, out, err = run(capsys, "record", "fmugym/House-v0", *arguments, "--json")
+        assert (code, err) == (0, "")
+        (episodes,) = json.loads(out)["runs"].values()
+        rows = list(csv.DictReader(path.read_text().splitlines()))
+        assert list(rows[0])[3:7] == ["u", "T [degC]", "T_floor [degC]", "T_set [degC]"]
+        assert [int(row["step"]) for row in rows] == [0, 4, 8, 12, 16, 20, 24, 28]
+        played = run(capsys, "simulate", "fmugym/House-v0", "--controller", PID, *FROST, "--json")
+        assert json.loads(played[1])["episodes"] == episodes
+
+    def test_several_files_at_once(self, tmp_path, capsys):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        paths = [tmp_path / name for name in ("a.csv", "b.csv", "a.png", "a.html")]
+        outputs = [text for path in paths for text in ("--output", path)]
+        code, out, _ = run(capsys, "record", CART_POLE, "--seed", "3", *outputs)
+        assert code == 0
+        assert out.startswith("random: seed 3: reward")
+        assert paths[0].read_text() == paths[1].read_text() != ""
+        assert paths[2].read_bytes().startswith(b"\x89PNG")
+        page = paths[3].read_text(encoding="utf-8")
+        task = Path(CART_POLE).read_text().splitlines()[-1]
+        assert task in page
+        assert "first seed" in page
+
+    def test_a_report_compares_controllers(self, tmp_path, capsys):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path = tmp_path / "a.html"
+        who = "--action", "0", "--action", "1"
+        code, out, _ = run(capsys, "record", CART_POLE, *who, "--output", path)
+        assert code == 0
+        assert [line.split(":")[0] for line in out.splitlines()] == ["action 0", "action 1"]
+        page = path.read_text(encoding="utf-8")
+        assert page.count("<figure>") == 2
+        assert "<h2>action 0</h2>" in page
+
+    def test_parquet(self, tmp_path, capsys):
+        pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
+        path = tmp_path / "a.parquet"
+        code, *_ = run(capsys, "record", CART_POLE, "--output", path)
+        assert code == 0
+        assert TimeSeries.read(path)["reward"].sum() == len(TimeSeries.read(path)) - 1
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, fmugym.SimulationError])
+    def test_an_interruption_keeps_what_is_there(self, error, tmp_path, capsys, monkeypatch):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        steps = iter(range(5))
+
+        def step(self, action):
+            if next(steps, None) is None:
+                raise error("enough")
+            return original(self, action)
+
+        original = fmugym.FMUEnv.step
+        monkeypatch.setattr(fmugym.FMUEnv, "step", step)
+        outputs = "--output", tmp_path / "a.csv", "--output", tmp_path / "a.html"
+        code, _, err = run(capsys, "record", CART_POLE, "--action", "0", *outputs)
+        assert code == (130 if error is KeyboardInterrupt else 1)
+        assert ("enough" in err) == (code == 1)
+        assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
+        assert "stopped" in (tmp_path / "a.html").read_text(encoding="utf-8")
+
+    @pytest.mark.parametrize(
+        ("arguments", "fact"),
+        [
+            (["--output", "a.xls"], "a.xls"),
+            (["--output", "a.csv", "--action", "0", "--action", "1"], "one run, got 2"),
+            (["--output", "a.csv", "--variables", "phy"], "'phi'"),
+            (["--output", "a.csv", "--every", "0.03"], "0.02"),
+            (["--output", __file__.replace(".py", ".csv"), "--action", "9"], "'9'"),
+        ],
+    )
+    def test_mistakes(self, arguments, fact, tmp_path, capsys, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        code, out, err = run(capsys, "record", CART_POLE, *arguments)
+        assert (code, out) == (1, "")
+        assert fact in err
+        assert err.count("\n") == 1
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_file_that_exists_stays(self, tmp_path, capsys):
+        path = tmp_path / "a.html"
+        path.write_text("precious")
+        code, _, err = run(capsys, "record", CART_POLE, "--output", path)
+        assert (code, path.read_text()) == (1, "precious")
+        assert "exists" in err
+
+    def test_without_matplotlib_the_extra_is_named(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        code, _, err = run(capsys, "record", CART_POLE, "--output", tmp_path / "a.html")
+        assert code == 1
+        assert "fmugym-toolbox[plot]" in err
+
+
+class TestEvaluate:
+    def test_several_scenarios_and_a_picture(self, tmp_path, capsys):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path = tmp_path / "a.png"
+        options = "--steps", "10", "--episodes", "2", "--action", "0", "--plot", path
+        both = "--scenario", "frost", "--scenario", "spring"
+        code, out, _ = run(capsys, "evaluate", "fmugym/House-v0", *both, *options, "--json")
+        assert code == 0
+        scores = json.loads(out)["scores"]
+        assert [(one["name"], one["scenario"]) for one in scores] == [
+            *(("random", "frost"), ("action 0", "frost")),
+            *(("random", "spring"), ("action 0", "spring")),
+        ]
+        low, high = scores[1]["cost_interval_95"]
+        assert low <= scores[1]["mean_cost"] <= high
+        assert path.read_bytes().startswith(b"\x89PNG")
+        alone = run(capsys, "evaluate", "fmugym/House-v0", *both[2:], *options[:-2], "--json")[1]
+        assert json.loads(alone)["scores"][1]["rewards"] == scores[3]["rewards"]
+
+    def test_all_scenarios(self, capsys):
+        options = "--scenario", "all", "--steps", "2", "--episodes", "1"
+        code, out, _ = run(capsys, "evaluate", "fmugym/House-v0", *options)
+        assert code == 0
+        assert [line.split("  ")[0] for line in out.splitlines()[1:]] == [
+            f"random ({name})" for name in ("autumn", "frost", "spring")
+        ]
+
+
+class TestBench:
+    def test_speeds_of_one_and_of_many(self, capsys):
+        options = "--envs", "4", "--envs", "16", "--seconds", "0.05"
+        code, out, _ = run(capsys, "bench", CART_POLE, *options, "--json")
+        assert code == 0
+        report = json.loads(out)
+        assert [one["envs"] for one in report["speeds"]] == [0, 4, 16]
+        for one in report["speeds"]:
+            count = max(1, one["envs"])
+            assert one["steps_per_second"] * one["microseconds"] == pytest.approx(count * 1e6)
+            assert 0 < one["fmu_share"] <= 1
+            assert one["hooks"] == "compiled"
+        assert report["time_step"] == 0.02
+
+    def test_a_table_with_words_of_caution(self, capsys):
+        code, out, _ = run(capsys, "bench", CART_POLE, "--envs", "4", "--seconds", "0.02")
+        assert code == 0
+        assert out.isascii()
+        assert "single" in out
+        assert "busy" in out
+
+    @pytest.mark.parametrize("arguments", [["--envs", "0"], ["--seconds", "-1"]])
+    def test_mistakes(self, arguments, capsys):
+        code, out, err = run(capsys, "bench", CART_POLE, *arguments)
+        assert (code, out) == (1, "")
+        assert arguments[1] in err

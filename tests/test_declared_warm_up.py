@@ -1,0 +1,303 @@
+"""Warm-ups of declared tasks: controllers and data before an episode, and states that are kept."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import FMUVectorEnv
+from fmugym.baselines import controller_of
+from fmugym.errors import SimulationError, TaskError
+from fmugym.task import warm_up as warm_ups
+from fmugym.trial import trial
+
+THERMOSTAT = "hysteresis of=T setpoint=T_set band=0.5"
+PID = "pid of=T setpoint=T_set kp=0.3 ti=14400 td=60 offset=0.1"
+STEPS = 48  # of half an hour: a day
+
+HOUSE = {
+    "fmu": {"bundled": "House"},
+    "time_step": "30min",
+    "substeps": 2,
+    "episode_length": "3h",
+    "clock": "01-15",
+    "variables": {
+        "T": {"name": "T_op", "unit": "degC", "min": 10, "max": 30},
+        "P": {"name": "P", "unit": "kW", "sample": "mean", "max": 20},
+    },
+    "parameters": {"T_m_0": {"distribution": "uniform", "low": 290, "high": 296}},
+    "data": {
+        "T_out": {"values": [0, 5, -3, 8], "step": "5h", "unit": "degC", "input": "T_out"},
+        "sun": {"values": [0, 0, 300, 90], "step": "6h", "input": "I_sol"},
+    },
+    "setpoints": {"T_set": {"schedule": {"06:00": 21, "22:00": 18}}},
+    "agent": {"actions": ["u"], "observations": ["T", "T_set", "T_out", "P"]},
+    "reward": "-abs(T - T_set) - P",
+}
+
+
+def house(controller=THERMOSTAT, agent=None, action=None, **keys):
+    warm_up = {"period": "1d", "controller": controller}
+    return (
+        HOUSE
+        | {"agent": HOUSE["agent"] | (agent or {})}
+        | {"variables": HOUSE["variables"] | ({} if action is None else {"u": action})}
+        | {"warm_up": warm_up}
+        | keys
+    )
+
+
+def driven(task, controller, seed):
+    """The outputs after a day in which a controller acts on the environment, as an agent does."""
+    day_before = {"clock": "01-14", "episode_length": "100d"}
+    env = fmugym.load({k: v for k, v in task.items() if k != "warm_up"} | day_before)
+    bound = controller_of(controller).bind(env)
+    observation, _ = env.reset(seed=seed)
+    for _ in range(STEPS):
+        observation, *_ = env.step(bound.act(observation))
+    result = env._values, env.inputs[0], observation[2]
+    env.close()
+    return result
+
+
+@pytest.mark.parametrize("controller", [THERMOSTAT, PID])
+def test_it_leads_where_the_controller_leads_as_an_agent(controller):
+    env = fmugym.load(house(controller))
+    for seed in (3, 4):
+        observation, _ = env.reset(seed=seed)
+        values, heating, outside = driven(house(), controller, seed)
+        assert env._values == values
+        assert env.inputs[0] == heating
+        assert observation[2] == outside
+        assert env.time == 86400.0
+        assert env.step_count == 0
+    env.close()
+
+
+def test_data_move_without_a_controller():
+    task = {k: v for k, v in house().items() if k != "warm_up"}
+    env = fmugym.load(task | {"warm_up": "1d"})
+    plain = fmugym.load(task | {"clock": "01-14", "episode_length": "100d"})
+    env.reset(seed=1)
+    plain.reset(seed=1)
+    for _ in range(STEPS):
+        plain.step([0.0])
+    assert env._values == plain._values
+    env.close()
+    plain.close()
+
+
+def test_a_schedule_acts_by_the_clock():
+    env = fmugym.load(house("schedule 06:00=1 22:00=0.25", clock="01-15 05:30"))
+    env.reset(seed=0)
+    assert env.inputs[0] == 0.25
+    later = fmugym.load(house("schedule 06:00=1 22:00=0.25", clock="01-15 07:00"))
+    later.reset(seed=0)
+    assert later.inputs[0] == 1.0
+    env.close()
+    later.close()
+
+
+def test_named_controllers_and_constants():
+    named = house("thermostat", controllers={"thermostat": THERMOSTAT, "half": 0.5})
+    for task, controller in ((named, THERMOSTAT), (house(0.5), "schedule 00:00=0.5")):
+        env, same = fmugym.load(task), fmugym.load(house(controller))
+        np.testing.assert_array_equal(env.reset(seed=1)[0], same.reset(seed=1)[0])
+        env.close()
+        same.close()
+
+
+ACTIONS = {
+    "plain": ({}, None),
+    "rescaled": ({"rescale": True, "normalize": False}, None),
+    "levels": ({}, {"levels": [0, 0.5, 1]}),
+    "changes": ({}, {"delta": 0.2}),
+    "rate": ({}, {"rate": 1e-4}),
+    "least times": ({}, {"levels": [0, 1], "min_on": "2h", "min_off": "2h"}),
+    "histories": ({"history": {"of": ["T", "u", "T_out"], "length": "2h"}}, None),
+}
+WAYS = ["compiled", "array", "per_env"]
+CLOCKS = {"distribution": "choice", "values": [0, 864000.0]}
+
+
+@pytest.mark.parametrize("caches", [False, True], ids=["", "cached"])
+@pytest.mark.parametrize("kind", ACTIONS)
+@pytest.mark.parametrize("hooks", WAYS)
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
+    agent, action = ACTIONS[kind]
+    task = house(PID, agent, action, clock=CLOCKS)
+    if caches:
+        task["warm_up"] = task["warm_up"] | {"cache": True}
+        task["parameters"] = {"T_m_0": 291.0}
+    make = partial(fmugym.load, task)
+    envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
+    if hooks == "compiled":
+        assert envs._engine._task.left == {}
+    observations, _ = envs.reset(seed=2)
+    for i in range(3):
+        singles.append(make())
+        np.testing.assert_array_equal(singles[i].reset(seed=2 + i)[0], observations[i])
+    envs.action_space.seed(1)
+    ended = False
+    for _ in range(16):
+        actions = envs.action_space.sample()
+        observations, rewards, *_ = envs.step(actions)
+        results = []
+        for i, env in enumerate(singles):
+            if ended and mode == "next_step":
+                results.append((env.reset()[0], 0.0, False))
+                continue
+            seen, reward, _, cut, _ = env.step(actions[i])
+            seen = env.reset()[0] if cut and mode == "same_step" else seen
+            results.append((seen, reward, cut))
+        np.testing.assert_array_equal(observations, [seen for seen, *_ in results])
+        np.testing.assert_array_equal(rewards, [reward for _, reward, _ in results])
+        ended = results[0][2]
+    for env in (envs, *singles):
+        env.close()
+
+
+def test_histories_hold_what_was_before_the_episode():
+    agent = {"history": {"of": ["T", "u"], "length": "2h"}}
+    task = house(0.75, agent)
+    env = fmugym.load(task)
+    day_before = {k: v for k, v in task.items() if k != "warm_up"}
+    plain = fmugym.load(day_before | {"clock": "01-14", "episode_length": "100d"})
+    observation, _ = env.reset(seed=5)
+    plain.reset(seed=5)
+    for _ in range(STEPS):
+        expected = plain.step([0.75])[0]
+    np.testing.assert_array_equal(observation, expected)
+    for _ in range(3):
+        np.testing.assert_array_equal(env.step([0.5])[0], plain.step([0.5])[0])
+    env.close()
+    plain.close()
+
+
+def test_steps_after_it_are_compiled():
+    env = fmugym.load(house(), hooks="compiled")
+    python = fmugym.load(house(), hooks="python")
+    for seed in (0, None, None):
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], python.reset(seed=seed)[0])
+        for _ in range(6):
+            one, other = env.step([0.4]), python.step([0.4])
+            np.testing.assert_array_equal(one[0], other[0])
+            assert one[1] == other[1]
+    env.close()
+    python.close()
+
+
+def test_a_saved_state_goes_on():
+    env = fmugym.load(house())
+    env.reset(seed=2)
+    state = env.save_state()
+    first = [env.step([0.5])[1] for _ in range(4)]
+    env.restore_state(state)
+    assert [env.step([0.5])[1] for _ in range(4)] == first
+    env.close()
+
+
+class TestCache:
+    @pytest.fixture(autouse=True)
+    def empty(self, monkeypatch, tmp_path):
+        monkeypatch.setattr(warm_ups, "_memory", warm_ups._Memory())
+        monkeypatch.setattr(trial, "cache_folder", lambda: tmp_path)
+
+    def task(self, **keys):
+        task = house(**keys) | {"parameters": {"T_m_0": 291.0}}
+        task["warm_up"] = task["warm_up"] | {"cache": True}
+        return task
+
+    def test_a_state_serves_later_episodes(self):
+        env, plain = fmugym.load(self.task()), fmugym.load(house(parameters={"T_m_0": 291.0}))
+        expected = plain.reset(seed=0)[0]
+        for _ in range(3):
+            np.testing.assert_array_equal(env.reset(seed=0)[0], expected)
+        assert env.health["steps"] == 2 * STEPS  # substeps of one warm-up
+        np.testing.assert_array_equal(env.step([0.3])[0], plain.step([0.3])[0])
+        env.close()
+        plain.close()
+
+    def test_each_beginning_has_its_own(self):
+        env = fmugym.load(self.task(clock=["01-15", "07-01 03:00"]))
+        days = {}
+        for seed in range(8):
+            observation, info = env.reset(seed=seed)
+            days.setdefault(info["drawn"]["clock"], []).append(observation.tolist())
+        assert len(days) == 2
+        for seen in days.values():
+            assert seen == [seen[0]] * len(seen)
+        assert env.health["steps"] == 2 * 2 * STEPS
+        env.close()
+
+    def test_it_survives_on_disk(self, monkeypatch):
+        agent = {"history": {"of": ["T", "u"], "length": "2h"}}
+        first = fmugym.load(self.task(agent=agent))
+        expected = first.reset(seed=0)[0]
+        after = first.step([0.6])[0]
+        first.close()
+        monkeypatch.setattr(warm_ups, "_memory", warm_ups._Memory())  # another process
+        second = fmugym.load(self.task(agent=agent))
+        np.testing.assert_array_equal(second.reset(seed=0)[0], expected)
+        np.testing.assert_array_equal(second.step([0.6])[0], after)
+        assert second.health["steps"] == 2
+        second.close()
+
+    def test_a_damaged_file_is_no_state(self, monkeypatch, tmp_path):
+        env = fmugym.load(self.task())
+        expected = env.reset(seed=0)[0]
+        env.close()
+        (file,) = (tmp_path / "states").iterdir()
+        content = bytearray(file.read_bytes())
+        content[-1] ^= 1
+        file.write_bytes(content)
+        monkeypatch.setattr(warm_ups, "_memory", warm_ups._Memory())
+        again = fmugym.load(self.task())
+        np.testing.assert_array_equal(again.reset(seed=0)[0], expected)
+        assert again.health["steps"] == 2 * STEPS
+        again.close()
+
+    def test_another_controller_is_another_state(self):
+        task = self.task()
+        cold = task | {"warm_up": task["warm_up"] | {"controller": 0}}
+        one, other = fmugym.load(task), fmugym.load(cold)
+        assert one.reset(seed=0)[0][0] > other.reset(seed=0)[0][0] + 1
+        one.close()
+        other.close()
+
+    def test_what_is_drawn_from_a_continuum_is_refused(self):
+        task = house()
+        task["warm_up"] = task["warm_up"] | {"cache": True}
+        with pytest.raises(TaskError, match=r"^warm_up\.cache: .*'T_m_0'"):
+            fmugym.load(task)
+
+
+@pytest.mark.parametrize(
+    ("warm_up", "fact"),
+    [
+        ({"controller": 0}, "'period'"),
+        ({"period": "1d", "controler": 0}, "'controller'"),
+        ({"period": "40min", "controller": 0}, "2400 s"),
+        ({"period": "1d", "controller": "thermostt"}, "thermostat"),
+        ({"period": "1d", "controller": "pid of=T"}, "'setpoint'"),
+        ({"period": "1d", "controller": "pid of=TT setpoint=1 kp=1"}, "'T'"),
+        ({"period": "1d", "controller": "hysteresis of=T setpoint=T_sot band=1"}, "'T_set'"),
+        ({"period": "1d", "controller": {"v": 0}}, "'u'"),
+        ({"period": "1d", "controller": 3}, r"3\.0"),
+        ({"period": "1d", "controller": 0, "cache": 1}, "cache"),
+    ],
+)
+def test_mistakes_are_placed(warm_up, fact):
+    task = HOUSE | {"warm_up": warm_up, "controllers": {"thermostat": THERMOSTAT}}
+    with pytest.raises(TaskError, match=rf"^warm_up.*{fact}"):
+        fmugym.load(task)
+
+
+def test_a_fault_in_it_is_an_error():
+    task = house(inputs={"Q_int": "exp(1000 * T_set)"})
+    env = fmugym.load(task)
+    with pytest.raises(SimulationError, match="warm-up"):
+        env.reset(seed=0)
+    env.close()

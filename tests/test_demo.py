@@ -1,0 +1,67 @@
+"""``fmugym demo`` trains a controller that also balances Gymnasium's own cart-pole."""
+
+import os
+import subprocess
+import sys
+
+import gymnasium
+import pygame
+import pytest
+
+from fmugym.tools.cli import main
+from fmugym.tools.demo import Training
+
+
+def length(env, controller, seed):
+    observation, _ = env.reset(seed=seed)
+    steps, is_done = 0, False
+    while not is_done:
+        observation, _, terminated, truncated, _ = env.step(int(controller.act(observation)))
+        is_done = terminated or truncated
+        steps += 1
+    return steps
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_it_learns_balances_gymnasiums_cart_pole(seed):
+    training = Training(seed)
+    *_, last = training.rounds()
+    assert last.is_solved
+    with gymnasium.make("CartPole-v1") as env:
+        lengths = [length(env, training.controller, 7_000 + episode) for episode in range(10)]
+    assert sum(lengths) / 10 >= 450
+
+
+def test_the_same_seed_learns_the_same():
+    trainings = [Training(3), Training(3)]
+    assert [*trainings[0].rounds()] == [*trainings[1].rounds()]
+
+
+def test_it_gives_up_after_the_most_rounds():
+    assert len([*Training(0, candidates=4, elites=1).rounds(most=1)]) == 1
+
+
+def test_without_a_display_it_writes_a_picture(tmp_path, capsys):
+    path = tmp_path / "demo.png"
+    assert main(["demo", "--output", str(path)]) == 0
+    assert "of 500" in capsys.readouterr().out
+    width, height = pygame.image.load(path).get_size()
+    assert width > 2 * height
+    assert main(["demo", "--output", str(path)]) == 1
+    assert "demo.png" in capsys.readouterr().err
+    assert main(["demo", "--output", str(tmp_path / "demo.jpg")]) == 1
+    assert "demo.jpg" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="takes the display away as X11 has it")
+def test_no_display_is_no_error():
+    env = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+    done = subprocess.run(
+        [sys.executable, "-m", "fmugym", "demo"],
+        env=env | {"SDL_VIDEODRIVER": "x11"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert "--output" in done.stdout

@@ -1,0 +1,506 @@
+"""Model exchange: solvers, events, pools and environments."""
+
+import logging
+import math
+
+import exchange_tools
+import fmpy
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fmugym
+from fmugym import FMU, ConfigError, FMULoadError
+from fmugym import pool as pools
+from fmugym.fmi.status import Status
+from fmugym.pool import PoolSpec
+from fmugym.pool.spec import SOLVERS
+from fmugym.trial import opening
+
+LOG = logging.getLogger("fmugym.test")
+OPTIONS = {
+    "python": {"backend": "python"},
+    "native": {"backend": "native"},
+    "process": {"backend": "auto", "isolation": "process", "workers": 1},
+}
+DERIVATIVES = 'providesDirectionalDerivative="true"'
+all_solvers = pytest.mark.parametrize("solver", SOLVERS)
+all_versions = pytest.mark.parametrize("version", [2])
+
+
+@pytest.fixture(scope="session")
+def fmu_path(tmp_path_factory):
+    """Write FMUs of the models, each once."""
+    folder, made = tmp_path_factory.mktemp("exchange"), {}
+
+    def make(model, version=2, interfaces=("ModelExchange",), flags=""):
+        key = model, version, interfaces, flags
+        if key not in made:
+            path = folder / f"{model}_{len(made)}.fmu"
+            made[key] = exchange_tools.exchange_fmu(path, model, version, interfaces, flags)
+        return made[key]
+
+    return make
+
+
+@pytest.fixture
+def make_pool(fmu_path):
+    """Make pools that are closed after the test."""
+    made = []
+
+    def make(model, step, kind="native", n=1, inputs=(), outputs=None, version=2, flags="", **spec):
+        if kind == "native" and not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        fmu = FMU(fmu_path(model, version, flags=flags), probe_timeout=None)
+        outputs = exchange_tools.STATES[model] if outputs is None else outputs
+        spec = PoolSpec(
+            inputs=tuple(map(fmu.variable, inputs)),
+            outputs=tuple(map(fmu.variable, outputs)),
+            time_step=step,
+            **spec,
+        )
+        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS[kind])
+        pool.variable = fmu.variable
+        made.append(pool)
+        return pool
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+def start(pool, values=None):
+    """Reset a pool; the start values are numbers, or one for each instance, by name."""
+    values = values or {}
+    variables = tuple(map(pool.variable, values))
+    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
+    pool.reset(variables, np.array(rows, float).reshape(len(rows), pool.num_instances))
+    assert not pool.statuses.any(), pool.failure(0)
+
+
+def run(pool, steps, values=None):
+    """Reset a pool of one, and do steps; the outputs after each, shape (steps + 1, k)."""
+    start(pool, values)
+    rows = [pool.outputs[:, 0].copy()]
+    for _ in range(steps):
+        outputs, statuses = pool.step()
+        assert not statuses.any(), pool.failure(0)
+        rows.append(outputs[:, 0].copy())
+    return np.array(rows)
+
+
+class TestSolvers:
+    @pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("rk4", 4)])
+    def test_fixed_steps_converge_with_their_order(self, make_pool, solver, order):
+        errors = []
+        for max_step in (0.1, 0.05):
+            pool = make_pool("dahlquist", 1.0, solver=solver, max_step=max_step)
+            errors.append(abs(run(pool, 1)[-1, 0] - math.exp(-1)))
+        assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
+
+    @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
+    @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
+    def test_adaptive_steps_keep_the_tolerance(self, make_pool, solver, tolerance):
+        pool = make_pool("van_der_pol", 0.5, solver=solver, tolerance=tolerance)
+        found = run(pool, 20)
+        expected = solve_ivp(
+            lambda t, x: [x[1], (1 - x[0] ** 2) * x[1] - x[0]],
+            (0, 10),
+            [2, 0],
+            rtol=1e-12,
+            atol=1e-12,
+            t_eval=np.linspace(0, 10, 21),
+            method="DOP853",
+        ).y.T
+        errors = np.abs(found - expected).max()
+        assert errors < 30 * tolerance
+        assert errors > 1e-4 * tolerance  # a method that ignored it would be much better or worse
+
+    @pytest.mark.parametrize("flags", ["", DERIVATIVES], ids=["differences", "derivatives"])
+    def test_stiff_kinetics_agree_with_scipy(self, make_pool, flags):
+        pool = make_pool("robertson", 4.0, solver="rosenbrock", tolerance=1e-7, flags=flags)
+        np.testing.assert_allclose(run(pool, 10), robertson(4.0, 10), rtol=3e-6)
+
+    def test_the_stiff_solver_is_not_held_back_by_stiffness(self, make_pool):
+        pool = make_pool("robertson", 1e6, solver="rosenbrock")
+        np.testing.assert_allclose(run(pool, 1), robertson(1e6, 1), rtol=1e-3)
+
+    @all_solvers
+    def test_inputs_take_effect_at_once(self, make_pool, solver):
+        pool = make_pool("dahlquist", 0.1, inputs=["u"], solver=solver, max_step=0.001)
+        start(pool, {"x": 0})
+        x = 0.0
+        for u in (1, -2, -2, 3):
+            outputs, _ = pool.step(np.array([[float(u)]]))
+            x = u + (x - u) * math.exp(-0.1)
+            assert outputs[0, 0] == pytest.approx(x, abs=2e-4 if solver == "euler" else 1e-6)
+
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_a_step_that_gets_too_small_is_a_fault(self, make_pool, kind):
+        pool = make_pool("van_der_pol", 0.1, kind=kind)
+        start(pool, {"mu": 1e200})
+        _, statuses = pool.step()
+        assert statuses[0] == Status.ERROR
+        assert "dormand_prince" in pool.failure(0)
+        start(pool, {"mu": 1.0})
+        _, statuses = pool.step()
+        assert not statuses[0]
+
+
+class TestEvents:
+    @staticmethod
+    def height(t, h=1.0, g=9.81, e=0.7):
+        """The ball's height in closed form, before it comes to rest."""
+        duration = math.sqrt(2 * h / g)
+        if t < duration:
+            return h - g * t * t / 2
+        t, v = t - duration, g * duration
+        while True:
+            v *= e
+            if t < 2 * v / g:
+                return v * t - g * t * t / 2
+            t -= 2 * v / g
+
+    @all_solvers
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_bounces_are_where_the_closed_form_has_them(self, make_pool, solver, kind):
+        pool = make_pool("ball", 0.05, kind, outputs=["h"], solver=solver, max_step=1e-3)
+        found = run(pool, 40)[:, 0]
+        expected = [self.height(0.05 * i) for i in range(41)]
+        tolerance = 2e-2 if solver == "euler" else 1e-8
+        np.testing.assert_allclose(found, expected, atol=tolerance)
+
+    @pytest.mark.parametrize("solver", ["rk4", "dormand_prince", "rosenbrock"])
+    def test_the_ball_comes_to_rest(self, make_pool, solver):
+        outputs = ["h", "v", "bounces"]
+        pool = make_pool("ball", 5.0, outputs=outputs, solver=solver)
+        speed, bounces = math.sqrt(2 * 9.81), 0
+        while speed >= 0.1:
+            speed, bounces = 0.7 * speed, bounces + 1
+        assert run(pool, 1)[-1].tolist() == [0, 0, bounces]
+
+    def test_bounces_without_end_are_a_fault(self, make_pool):
+        pool = make_pool("ball", 1.0)
+        start(pool, {"v_min": 0})
+        statuses = [int(pool.step()[1][0]) for _ in range(3)]
+        assert statuses == [0, 0, Status.ERROR]  # they accumulate at t = 2.56 s
+        assert "100000 events" in pool.failure(0)
+        assert "t = 2.558" in pool.failure(0)
+
+    @all_solvers
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_time_events_and_the_wish_to_stop(self, make_pool, solver, kind):
+        pool = make_pool("stair", 0.3, kind, outputs=["count"], solver=solver)
+        start(pool)
+        for i in range(1, 34):
+            outputs, statuses = pool.step()
+            assert outputs[0, 0] == math.floor(0.3 * i + 1e-9)
+            assert statuses[0] == 0
+        outputs, statuses = pool.step()
+        assert (outputs[0, 0], statuses[0]) == (10, Status.TERMINATED)
+
+    @pytest.mark.parametrize("solver", ["rk4", "dormand_prince", "rosenbrock"])
+    def test_a_switched_circuit(self, make_pool, solver):
+        pool = make_pool("circuit", 0.02, solver=solver, max_step=0.02)
+        found = run(pool, 300, {"limit": 0.42})[:, 0]
+        np.testing.assert_allclose(found, circuit(0.42, 0.02, 300), atol=2e-7)
+
+    @pytest.mark.parametrize("solver", ["rk4", "dormand_prince", "rosenbrock"])
+    def test_stick_and_slip(self, make_pool, solver):
+        pool = make_pool("friction", 0.1, outputs=["x", "v", "mode"], solver=solver, max_step=0.05)
+        found = run(pool, 600)
+        np.testing.assert_allclose(found, stick_and_slip(0.1, 600), atol=3e-6)
+
+    def test_agreement_with_fmpy(self, fmu_path, make_pool):
+        for model, outputs in (("ball", ["h", "v"]), ("circuit", ["voltage"])):
+            values = {"limit": 0.42} if model == "circuit" else {}
+            result = fmpy.simulate_fmu(
+                str(fmu_path(model)),
+                fmi_type="ModelExchange",
+                stop_time=60 * 0.0317,
+                output_interval=0.0317,  # no event is there: FMPy fails where two coincide
+                relative_tolerance=1e-9,
+                output=outputs,
+                start_values=values,
+                record_events=False,
+            )
+            pool = make_pool(model, 0.0317, outputs=outputs, tolerance=1e-9)
+            found = run(pool, 60, values)
+            expected = np.array([result[name] for name in outputs]).T
+            np.testing.assert_allclose(found, expected, atol=1e-5)
+
+    def test_time_does_not_drift(self, make_pool):
+        """The period of the source stays where it is through a million steps."""
+        pool = make_pool("circuit", 0.05, outputs=["voltage"])
+        start(pool, {"limit": 2.0})
+        for _ in range(1_000_000):
+            outputs, statuses = pool.step()
+        decay = math.exp(-0.05 / 0.3)
+        assert statuses[0] == 0
+        assert outputs[0, 0] == pytest.approx(decay * (1 - decay) / (1 - decay**2), abs=1e-5)
+
+
+def robertson(step, count):
+    """The concentrations at each step, from scipy."""
+    return solve_ivp(
+        lambda t, y: [
+            -0.04 * y[0] + 1e4 * y[1] * y[2],
+            0.04 * y[0] - 1e4 * y[1] * y[2] - 3e7 * y[1] ** 2,
+            3e7 * y[1] ** 2,
+        ],
+        (0, step * count),
+        [1, 0, 0],
+        method="Radau",
+        rtol=1e-11,
+        atol=1e-14,
+        t_eval=np.linspace(0, step * count, count + 1),
+    ).y.T
+
+
+def circuit(limit, step, count, tau=0.3, half=0.05):
+    """The voltage of the circuit at each step, from event to event."""
+    voltage, time, source, switch, rows = 0.0, 0.0, 1.0, 1, []
+    for i in range(count + 1):
+        while True:
+            end = min(i * step, switch * half)
+            target = source + (voltage - source) * math.exp((time - end) / tau)
+            if target >= limit:
+                time += tau * math.log((source - voltage) / (source - limit))
+                voltage = 0.0
+                continue
+            voltage, time = target, end
+            if end < switch * half - 1e-9:
+                break
+            source, switch = 1.0 - source, switch + 1
+        rows.append(voltage)
+    return rows
+
+
+def stick_and_slip(step, count, belt=0.1, static=1.0, kinetic=0.6):
+    """Place, speed and mode of the block at each step: a line and an arc in turn."""
+    rows = []
+    radius = math.hypot(static - kinetic, belt)
+    sine = (static - kinetic) / radius
+    slip_time = 2 * math.pi - 2 * math.asin(sine)
+    first, place = 0.0, 0.0  # sticks from here
+    slips = False
+    for i in range(count + 1):
+        time = i * step
+        while True:
+            duration = slip_time if slips else (static - place) / belt
+            if time - first < duration - 1e-12:
+                break
+            first += duration
+            place = place if not slips else 2 * kinetic - static
+            slips = not slips
+        since = time - first
+        if slips:
+            phase = math.asin(sine) + since
+            rows.append([kinetic + radius * math.sin(phase), radius * math.cos(phase), -1.0])
+        else:
+            rows.append([place + belt * since, belt, 0.0])
+    return rows
+
+
+class TestPools:
+    """The contract of ``fmugym.pool.base`` for pools of model exchange."""
+
+    every_kind = pytest.mark.parametrize("kind", OPTIONS)
+    CASES = (
+        ("ball", [], ["h", "v", "bounces"], "h", "dormand_prince"),
+        ("circuit", ["duty"], ["voltage", "discharges"], "limit", "rk4"),
+        ("friction", [], ["x", "v", "mode"], "static", "dormand_prince"),
+        ("robertson", [], ["y1", "y2", "y3"], "y1", "rosenbrock"),
+        ("van_der_pol", [], ["x1", "x2"], "mu", "euler"),
+    )
+    every_case = pytest.mark.parametrize("case", CASES, ids=[f"{c[0]}-{c[4]}" for c in CASES])
+
+    @staticmethod
+    def episode(pool, steps, seed=1, first=0):
+        """Do steps with changing inputs; outputs and statuses of each."""
+        rng = np.random.default_rng(seed)
+        inputs = np.round(rng.uniform(0.2, 0.8, (first + steps, *pool.inputs.shape)), 1)
+        rows = []
+        for values in inputs[first:]:
+            outputs, statuses = pool.step(values)
+            assert not statuses.any(), pool.failure(int(statuses.argmax()))
+            rows.append(outputs.copy())
+        return np.array(rows)
+
+    def pool_of(self, make_pool, case, kind, n, **spec):
+        model, inputs, outputs, name, solver = case
+        step = 1.0 if model == "robertson" else 0.04
+        spec = {"solver": solver, "max_step": 0.01 if solver in ("euler", "rk4") else None} | spec
+        pool = make_pool(model, step, kind, n, inputs, outputs, **spec)
+        start(pool, {name: np.linspace(0.4, 1.0, n)})
+        return pool
+
+    @every_case
+    @pytest.mark.parametrize("kind", ["python", "process"])
+    def test_all_pools_give_the_same_bits(self, make_pool, case, kind):
+        native = self.episode(self.pool_of(make_pool, case, "native", 3), 60)
+        other = self.episode(self.pool_of(make_pool, case, kind, 3), 60)
+        assert native.tobytes() == other.tobytes()
+
+    @every_case
+    def test_neighbours_and_threads_change_nothing(self, make_pool, case):
+        many = self.episode(self.pool_of(make_pool, case, "native", 200), 20)
+        again = self.episode(self.pool_of(make_pool, case, "native", 200), 20)
+        assert many.tobytes() == again.tobytes()
+        alone = self.pool_of(make_pool, case, "python", 200)
+        assert self.episode(alone, 20).tobytes() == many.tobytes()
+
+    @every_case
+    @every_kind
+    def test_a_restored_state_goes_on_in_the_same_way(self, make_pool, case, kind):
+        pool = self.pool_of(make_pool, case, kind, 2)
+        self.episode(pool, 17)
+        snapshot = pool.save()
+        went_on = self.episode(pool, 30, first=17)
+        pool.restore(snapshot)
+        assert self.episode(pool, 30, first=17).tobytes() == went_on.tobytes()
+
+    @every_case
+    @pytest.mark.parametrize("kinds", [("native", "python"), ("python", "native")])
+    def test_states_pass_from_pool_to_pool(self, make_pool, case, kinds):
+        first, second = (self.pool_of(make_pool, case, kind, 1) for kind in kinds)
+        for pool in (first, second):
+            pool.trust_states_if(lambda: True)
+        self.episode(first, 17)
+        zero = np.zeros(1, np.int64)
+        second.restore_instances(first.save_instances(zero), zero, zero)
+        went_on = self.episode(first, 30, first=17)
+        assert self.episode(second, 30, first=17).tobytes() == went_on.tobytes()
+
+    @every_kind
+    def test_a_reset_forgets_the_solver(self, make_pool, kind):
+        case = self.CASES[0]
+        pool = self.pool_of(make_pool, case, kind, 2)
+        first = self.episode(pool, 30)
+        start(pool, {case[3]: np.linspace(0.4, 1.0, 2)})
+        assert self.episode(pool, 30).tobytes() == first.tobytes()
+
+    @every_kind
+    def test_tunable_parameters_change_between_steps(self, make_pool, kind):
+        pool = make_pool("dahlquist", 0.5, kind, inputs=["u"])
+        start(pool)
+        pool.step(np.array([[1.0]]))
+        x = pool.outputs[0, 0]
+        pool.write((pool.variable("k"),), np.array([[2.0]]))
+        outputs, _ = pool.step(np.array([[1.0]]))
+        assert outputs[0, 0] == pytest.approx(0.5 + (x - 0.5) * math.exp(-1), abs=1e-6)
+
+    @every_kind
+    def test_warm_up_and_substeps(self, make_pool, kind):
+        pool = make_pool("dahlquist", 0.5, kind, warm_up_steps=3, substeps=4)
+        start(pool)
+        assert pool.outputs[0, 0] == pytest.approx(math.exp(-1.5), abs=1e-6)
+        assert pool.step()[0][0, 0] == pytest.approx(math.exp(-2), abs=1e-6)
+
+
+E = np.array([0.7], np.float32)
+"""The action: which part of its speed the ball keeps."""
+
+
+class BallEnv(fmugym.FMI2MEEnv):
+    """Is done when the ball has bounced thrice."""
+
+    def __init__(self, path, backend=None, isolation=None, **config):
+        config = {
+            "model_input_names": "e",
+            "bounds": {"e": (0, 1)},
+            "model_output_names": ["h", "v", "bounces"],
+            "model_parameters": {"h": fmugym.Uniform(0.5, 1.5)},
+            "time_step": 0.05,
+        } | config
+        super().__init__(path, config, backend=backend, isolation=isolation)
+
+    def _is_done(self):
+        return self.out["bounces"] > 2.5
+
+
+class AnyBallEnv(BallEnv):
+    fmi_interface = None
+
+
+class TestEnvironments:
+    BOTH = ("ModelExchange", "CoSimulation")
+
+    def test_an_episode(self, fmu_path):
+        env = BallEnv(fmu_path("ball"))
+        env.reset(seed=3)
+        first = env.state[0]
+        terminated, steps = False, 0
+        while not terminated:
+            _, _, terminated, truncated, _ = env.step(E)
+            steps += 1
+            assert not truncated
+        fall = math.sqrt(2 * first / 9.81)
+        last = fall * (1 + 2 * 0.7 + 2 * 0.49)  # the third bounce
+        assert steps == math.ceil(last / 0.05)
+        env.close()
+
+    def test_a_vector_environment_gives_the_same_as_single_ones(self, fmu_path):
+        path = fmu_path("ball")
+        many = fmugym.FMUVectorEnv(lambda: BallEnv(path), 4)
+        many.reset(seed=7)
+        singles = [BallEnv(path) for _ in range(4)]
+        for seed, env in enumerate(singles, start=7):
+            env.reset(seed=seed)
+        for _ in range(20):
+            observations, *_ = many.step(np.tile(E, (4, 1)))
+            expected = [env.step(E)[0] for env in singles]
+            np.testing.assert_array_equal(observations, expected)
+        for env in (many, *singles):
+            env.close()
+
+    @pytest.mark.parametrize("isolation", ["none", "process"])
+    def test_a_snapshot(self, fmu_path, isolation):
+        env = BallEnv(fmu_path("ball"), isolation=isolation)
+        env.reset(seed=1)
+        for _ in range(11):
+            env.step(E)
+        snapshot = env.save_state()
+        went_on = [env.step(E)[0].tolist() for _ in range(10)]
+        env.restore_state(snapshot)
+        assert [env.step(E)[0].tolist() for _ in range(10)] == went_on
+        env.close()
+
+    def test_an_fmu_with_both_interfaces_may_choose(self, fmu_path):
+        path = fmu_path("ball", interfaces=self.BOTH)
+        for interface in (None, "co_simulation", "model_exchange"):
+            env = AnyBallEnv(path, interface=interface)
+            assert env.fmu.description.interface == (interface or "co_simulation")
+            env.reset(seed=1)
+            for _ in range(8):
+                env.step(E)
+            exact = TestEvents.height(0.4, h=env.parameters["h"])
+            is_exact = abs(env.state[0] - exact) < 1e-6
+            assert is_exact == (interface == "model_exchange")
+            env.close()
+
+    def test_interfaces_that_contradict_each_other(self, fmu_path):
+        with pytest.raises(ConfigError, match=r"co_simulation.*BallEnv.*model_exchange"):
+            BallEnv(fmu_path("ball"), interface="co_simulation")
+        with pytest.raises(FMULoadError, match=r"model exchange.*co-simulation"):
+            BallEnv(fmu_path("ball", interfaces=("CoSimulation",)))
+        with pytest.raises(FMULoadError, match=r"co-simulation.*model exchange"):
+            AnyBallEnv(fmu_path("ball"), interface="co_simulation")
+
+    @pytest.mark.parametrize(
+        "config", [{"solver": "rk45"}, {"solver": 4}, {"max_step": 0}, {"interface": "me"}]
+    )
+    def test_bad_config(self, fmu_path, config):
+        with pytest.raises(ConfigError, match=next(iter(config))):
+            BallEnv(fmu_path("ball"), **config)
+
+    def test_a_solver_that_gives_up_truncates(self, fmu_path):
+        env = BallEnv(fmu_path("ball"), model_parameters={"v_min": 0.0}, time_step=1.0)
+        env._is_done = lambda: False
+        env.reset()
+        results = [env.step(E) for _ in range(3)]
+        assert [result[3] for result in results] == [False, False, True]
+        assert "100000" in results[-1][4]["fault"]
+        env.reset()
+        assert not env.step(E)[3]
+        env.close()

@@ -1,0 +1,299 @@
+"""Linear models along a trajectory, compared with equations, scipy and each other."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from test_derivatives import DT, HORIZON, B, G, L, M, Precise
+from test_snapshots import POOLS, vector_of
+from zoo_tools import ZooEnv, parameters, zoo_fmu
+
+import fmugym
+from fmugym import ConfigError, SimulationError, linearize_along
+from fmugym.envs import CartPoleEnv
+from fmugym.vector.trajectories import discrete
+
+TORQUES = np.random.default_rng(0).uniform(-0.015, 0.015, (HORIZON, 1)).astype(np.float32)
+STARTS = {"q": "q_0", "q_dot": "q_dot_0"}
+EXACT = {"solver": 3, "max_step": 1e-3}
+
+
+def along(make_env=Precise, actions=TORQUES, num_envs=8, options=None, **arguments):
+    """Linearize along a trajectory from the first moment of an episode."""
+    envs = vector_of(make_env, num_envs, **(options or {}))
+    with make_env() as env:
+        env.reset(seed=0)
+        snapshot = env.save_state()
+    try:
+        return linearize_along(envs, snapshot, actions, **arguments)
+    finally:
+        envs.close()
+
+
+def exact(**changes):
+    """The point mass, solved precisely."""
+    return Precise(model_parameters=Precise.parameters | EXACT, **changes)
+
+
+def jacobian(q):
+    """Of the equations of the point mass, by q and q_dot."""
+    return np.array([[0.0, 1.0], [-G / L * np.cos(q), -B / (M * L**2)]])
+
+
+def variational(x, torque, step=DT):
+    """A and B of one step, by the variational equations and scipy."""
+
+    def slopes(_, row):
+        q, v, *rest = row
+        phi = np.reshape(rest, (2, 3))
+        forced = np.zeros((2, 3))
+        forced[1, 2] = 1 / (M * L**2)
+        change = -G / L * np.sin(q) + (torque - B * v) / (M * L**2)
+        return [v, change, *(jacobian(q) @ phi + forced).ravel()]
+
+    begin = [*x, *np.eye(2, 3).ravel()]
+    found = solve_ivp(slopes, (0, step), begin, rtol=1e-11, atol=1e-12).y[2:, -1].reshape(2, 3)
+    return found[:, :2], found[:, 2:]
+
+
+class TestDifferences:
+    @pytest.mark.parametrize("num_envs", [1, 8, 64])
+    def test_are_those_of_the_equations(self, num_envs):
+        """One step of explicit Euler: x + DT f(x, u)."""
+        found = along(num_envs=num_envs, states=STARTS, method="differences")
+        expected = np.array([np.eye(2) + DT * jacobian(q) for q in found.x[:-1, 0]])
+        assert pytest.approx(expected, abs=1e-8) == found.A
+        assert found.B[:, :, 0] == pytest.approx(
+            np.tile([0, DT / (M * L**2)], (HORIZON, 1)), abs=1e-8
+        )
+        assert pytest.approx(found.A, abs=1e-12) == found.C  # the outputs are the states
+        assert pytest.approx(found.B, abs=1e-12) == found.D
+        assert (found.states, found.outputs) == (("q", "q_dot"), ("q", "q_dot"))
+        assert found.method == "differences"
+
+    def test_chained_are_those_by_all_actions(self):
+        """``derivatives`` gives the effect of each action on each later observation."""
+        with Precise() as env:
+            env.reset(seed=0)
+            snapshot = env.save_state()
+        envs = vector_of(Precise, 32)
+        by_actions = fmugym.derivatives(envs, snapshot, TORQUES).by_actions
+        found = linearize_along(envs, snapshot, TORQUES, states=STARTS)
+        envs.close()
+        effect = found.B[2]
+        for step in range(3, HORIZON):
+            effect = found.A[step] @ effect
+        assert effect == pytest.approx(by_actions[-1, :, 2], rel=1e-4, abs=1e-4)
+
+    @pytest.mark.parametrize("pool", POOLS)
+    def test_on_every_pool(self, pool):
+        wanted = along(states=STARTS, method="differences")
+        found = along(states=STARTS, method="differences", options=POOLS[pool])
+        assert found.A.tobytes() == wanted.A.tobytes()
+        assert found.B.tobytes() == wanted.B.tobytes()
+
+    def test_include_hooks(self):
+        """Inputs that depend on the state are part of A."""
+        gain = 0.01
+
+        class Damped(Precise):
+            def _get_inputs(self):
+                return 0.5 * self.action - gain * self.out["q_dot"]
+
+        found = along(Damped, states=STARTS)
+        by_torque = DT / (M * L**2)
+        expected = np.array([np.eye(2) + DT * jacobian(q) for q in found.x[:-1, 0]])
+        expected[:, 1, 1] -= gain * by_torque
+        assert pytest.approx(expected, abs=1e-7) == found.A
+        assert found.B[:, 1, 0] == pytest.approx(np.full(HORIZON, 0.5 * by_torque), rel=1e-5)
+        with pytest.raises(ConfigError, match="_get_inputs"):
+            along(Damped, method="directional")
+
+    @pytest.mark.parametrize("num_envs", [1, 16])
+    def test_of_fmi_1(self, num_envs):
+        """Its states can be replayed only."""
+
+        class Old(Precise):
+            version = "1.0"
+
+        found = along(Old, num_envs=num_envs, states=STARTS)
+        assert found.method == "differences"
+        assert found.A.tobytes() == along(states=STARTS, method="differences").A.tobytes()
+        with pytest.raises(ConfigError, match=r"FMI 1\.0"):
+            along(Old, states=STARTS, method="directional")
+
+
+class TestDirectional:
+    def test_are_those_of_scipy(self):
+        found = along(exact)
+        assert (found.method, found.states) == ("directional", ("theta", "theta_dot"))
+        for k, torque in enumerate(TORQUES[:, 0]):
+            a, b = variational([found.x[k, 0] - np.pi, found.x[k, 1]], float(torque))
+            assert found.A[k] == pytest.approx(a, abs=1e-3)
+            assert found.B[k] == pytest.approx(b, rel=1e-3, abs=1e-4)
+
+    def test_error_is_of_order_three(self):
+        errors = []
+        for step in (0.04, 0.02, 0.01):
+            found = along(lambda step=step: exact(time_step=step), TORQUES[:1])
+            x = [found.x[0, 0] - np.pi + 0.0, found.x[0, 1]]
+            a, _ = variational(x, float(TORQUES[0, 0]), step)
+            errors.append(np.abs(found.A[0] - a).max())
+        assert errors[0] / errors[1] > 5
+        assert errors[1] / errors[2] > 5
+
+    @pytest.mark.parametrize("version", ["2.0", "3.0"])
+    def test_equal_differences_of_the_double_pendulum(self, version):
+        names = ("q1", "q2", "q1_dot", "q2_dot")
+
+        class Double(fmugym.FMUEnv):
+            def __init__(self):
+                start = dict(zip((f"{n}_0" for n in names), (0.4, -0.9, 1.0, -2.0), strict=True))
+                config = {
+                    "model_input_names": ["tau1", "tau2"],
+                    "model_output_names": ["q1", "q2_dot"],
+                    "model_parameters": start | {"cf1": 0.0, "cf2": 0.0},  # they have a kink
+                    "bounds": {"tau1": (-0.1, 0.1), "tau2": (-0.1, 0.1)},
+                    "time_step": 0.002,
+                }
+                super().__init__(fmugym.bundled_fmu("DoublePendulum", version), config)
+
+            def _is_done(self):
+                return False
+
+        actions = np.random.default_rng(1).uniform(-0.02, 0.02, (6, 2)).astype(np.float32)
+        directional = along(Double, actions)
+        starts = {name: f"{name}_0" for name in directional.states}
+        differences = along(Double, actions, states=starts, method="differences")
+        assert (directional.method, differences.method) == ("directional", "differences")
+        for name in "ABCD":
+            mine, other = getattr(directional, name), getattr(differences, name)
+            assert mine == pytest.approx(other, rel=2e-3, abs=2e-3 * np.abs(other).max())
+        assert directional.C.shape == (6, 2, 4)
+        assert directional.D.shape == (6, 2, 2)
+        assert directional.x == pytest.approx(differences.x, abs=1e-9)
+
+    def test_at_an_equilibrium_are_those_of_linearize(self):
+        class Upright(Precise):
+            def __init__(self):
+                super().__init__(model_parameters={"q_0": np.pi})
+
+        found = along(Upright, np.zeros((2, 1)))
+        model = fmugym.linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
+        joined = np.zeros((3, 3))
+        joined[:2] = np.hstack([model.A, model.B])
+        expected = expm(joined * DT)[:2]
+        assert np.hstack([found.A[1], found.B[1]]) == pytest.approx(expected, rel=1e-12)
+
+    def test_of_scaled_actions(self):
+        class Scaled(Precise):
+            def _get_inputs(self):
+                return 0.25 * self.action
+
+        scaled, own = along(Scaled), along(Precise, TORQUES / 4)
+        assert pytest.approx(own.A, abs=1e-9) == scaled.A
+        assert pytest.approx(0.25 * own.B, rel=1e-4) == scaled.B
+
+    @pytest.mark.parametrize("isolation", ["none", "process"])
+    def test_wherever_the_fmu_runs(self, isolation):
+        found = along(lambda: Precise(isolation=isolation), method="directional")
+        assert found.A.tobytes() == along(method="directional").A.tobytes()
+
+    def test_exponential_of_stiff_models(self):
+        slopes = np.array([[[-3e4, 2.0, 1.0], [5.0, -0.1, 0.0]], [[0, 1, 0], [0, 0, 1]]], float)
+        a, b = discrete(slopes, 0.1)
+        for index in range(2):
+            joined = np.zeros((3, 3))
+            joined[:2] = slopes[index]
+            expected = expm(0.1 * joined)
+            assert a[index] == pytest.approx(expected[:2, :2], rel=1e-9, abs=1e-12)
+            assert b[index] == pytest.approx(expected[:2, 2:], rel=1e-9, abs=1e-12)
+
+
+def test_present_episodes_go_on():
+    envs, twin = vector_of(Precise, 4), vector_of(Precise, 4)
+    for one in (envs, twin):
+        one.reset(seed=3)
+        one.step(np.full((4, 1), 0.01, np.float32))
+    snapshot = envs.save_state([2])
+    for method, states in (("directional", None), ("differences", STARTS)):
+        linearize_along(envs, snapshot, TORQUES, states=states, method=method)
+    for _ in range(5):
+        mine, other = (one.step(np.full((4, 1), 0.01, np.float32)) for one in (envs, twin))
+        assert mine[0].tobytes() == other[0].tobytes()
+    envs.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_in_the_middle_of_an_episode(hooks):
+    """A step count, a previous action and drawn parameters are those of the snapshot."""
+
+    class Drawn(Precise):
+        def __init__(self):
+            super().__init__(model_parameters=dict(Precise.parameters, b=fmugym.Uniform(0.0, 2e-3)))
+
+        def _get_inputs(self):
+            return self.action + self.previous_action
+
+    with Drawn() as env:
+        env.reset(seed=4)
+        env.step(np.full(1, 0.01, np.float32))
+        env.step(np.full(1, 0.01, np.float32))
+        snapshot, drawn = env.save_state(), env.parameters["b"]
+    envs = vector_of(Drawn, 8, hooks=hooks)
+    found = linearize_along(envs, snapshot, TORQUES, states=STARTS)
+    envs.close()
+    assert found.A[:, 1, 1] == pytest.approx(1 - DT * drawn / (M * L**2), abs=1e-8)
+    assert found.x[0, 0] != pytest.approx(0.4, abs=1e-9)
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("arguments", "reason"),
+        [
+            ({"method": "directoinal"}, "directional"),
+            ({"states": "q"}, "states"),
+            ({"states": []}, "states"),
+            ({"states": ["q_dto"]}, "q_dot"),
+            ({"states": ["q", "q_dot"]}, "start variable"),
+            ({"states": ["q"], "method": "directional"}, "theta"),
+            ({"states": STARTS, "step": 0.0, "method": "differences"}, "step"),
+            ({"actions": np.zeros(3)}, "shape"),
+        ],
+    )
+    def test_of_what_does_not_fit(self, arguments, reason):
+        with pytest.raises(ConfigError, match=reason):
+            along(**arguments)
+
+    @pytest.mark.parametrize(
+        ("states", "reason"),
+        [
+            ({"q": "q_0"}, "q_dot|determine"),
+            ({"q": "theta_0", "q_dot": "q_dot_0"}, "'theta_0' does not set .*'q'"),
+        ],
+    )
+    def test_of_states_that_are_none(self, states, reason):
+        with pytest.raises(SimulationError, match=reason):
+            along(states=states, method="differences")
+
+    def test_of_an_end(self):
+        for method, states in (("directional", None), ("differences", STARTS)):
+            with pytest.raises(SimulationError, match="2"):
+                along(lambda: Precise(max_episode_steps=2), states=states, method=method)
+            found = along(lambda: Precise(max_episode_steps=HORIZON), states=states, method=method)
+            assert len(found.A) == HORIZON
+
+    def test_of_discrete_actions(self):
+        with pytest.raises(ConfigError, match="Box"):
+            along(CartPoleEnv, np.zeros((3, 1)))
+
+    def test_of_an_fmu_without_derivatives(self, tmp_path):
+        path = zoo_fmu(tmp_path, 2)
+
+        class Foreign(ZooEnv):
+            def __init__(self):
+                super().__init__(path, model_parameters=parameters())
+
+        with pytest.raises(ConfigError):
+            along(Foreign, np.zeros((3, 1)), method="directional")
