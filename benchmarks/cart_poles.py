@@ -59,9 +59,14 @@ def require_native_pool() -> None:
 # One environment
 
 
-def environment_run(env: gym.Env[Any, Any]) -> Run:
-    """Make a run of steps, with a reset after each episode."""
-    chosen = actions(1)[:, 0].tolist() * 16
+def environment_run(env: gym.Env[Any, Any], given: Sequence[Any] | None = None) -> Run:
+    """Make a run of steps, with a reset after each episode.
+
+    Args:
+        env: The environment.
+        given: The actions; None for those of a cart-pole.
+    """
+    chosen = actions(1)[:, 0].tolist() * 16 if given is None else given
     env.reset(seed=0)
 
     def block() -> None:

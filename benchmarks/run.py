@@ -3,6 +3,7 @@
     python benchmarks/run.py
     python benchmarks/run.py --quick --only single
     python benchmarks/run.py --json benchmarks.json
+    python benchmarks/run.py --table readme --table vector --table hooks
 
 In each section, the configurations take turns, in many rounds. The figures are medians over the
 rounds, and ratios are computed within a round, so that other work on the machine disturbs all
@@ -32,6 +33,7 @@ import rollouts
 import single
 import tasks
 import vector
+from documents import DOCUMENTS
 from measure import Effort, processors
 from tables import Table
 
@@ -59,8 +61,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING)
     begin, results = time.perf_counter(), {}
     print(f"{_machine()}\n", flush=True)
-    for name in arguments.only or SECTIONS:
-        results[name] = SECTIONS[name](_effort(name, arguments.quick))
+    for name, measure in _chosen(arguments.only or [], arguments.table or []).items():
+        results[name] = measure(_effort(name, arguments.quick))
         for table in results[name]:
             print(f"{table}\n", flush=True)
     print(f"{time.perf_counter() - begin:.0f} s; {_load()}")
@@ -68,10 +70,25 @@ def main() -> None:
         _write(arguments.json, results)
 
 
+def _chosen(
+    sections: list[str], documents: list[str]
+) -> dict[str, Callable[[Effort], list[Table]]]:
+    """What to measure: all sections if nothing is chosen."""
+    chosen = sections if sections or documents else list(SECTIONS)
+    tables = {f"table {name}": DOCUMENTS[name] for name in documents}
+    return {name: SECTIONS[name] for name in chosen} | tables
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="only check that everything works")
     parser.add_argument("--only", action="append", choices=SECTIONS, help="may be repeated")
+    parser.add_argument(
+        "--table",
+        action="append",
+        choices=DOCUMENTS,
+        help="the tables of the README, docs/vector.md or docs/hooks.md; may be repeated",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     return parser
 

@@ -27,7 +27,7 @@ from tables import Table, duration, times
 import fmugym
 from fmugym.task.interface import resolve
 
-__all__ = ["TASKS", "Task", "tables"]
+__all__ = ["TASKS", "Task", "fmugym_run", "tables"]
 
 SIZES = (1, 8, 64, 1024, 4096)
 TITLE = (
@@ -117,14 +117,15 @@ def _add(table: Table, task: Task, sizes: tuple[int, ...], effort: Effort) -> No
 
 def _makers(stack: ExitStack, task: Task, size: int) -> Iterator[tuple[str, Callable[[], Run]]]:
     yield FMU, lambda: _fmu_run(stack, task, size)
-    yield "fmugym", lambda: _fmugym(stack, task, size, "auto")
-    yield 'hooks="array"', lambda: _fmugym(stack, task, size, "array")
+    yield "fmugym", lambda: fmugym_run(stack, task, size, "auto")
+    yield 'hooks="array"', lambda: fmugym_run(stack, task, size, "array")
     yield BY_HAND, lambda: _by_hand(stack, task, size)
     for name in MOST:
         yield name, lambda name=name: _gymnasium(stack, task, size, name)
 
 
-def _fmugym(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
+def fmugym_run(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
+    """Make a run of a vector environment of this package on one thread."""
     envs = fmugym.FMUVectorEnv(
         task.make, size, max_episode_steps=task.limit, hooks=hooks, threads=1
     )

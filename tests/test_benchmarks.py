@@ -134,3 +134,17 @@ def test_a_task_by_hand_is_the_same_task(tasks, index):
     assert not alive.any()
     for each in (envs, prototype, hand):
         each.close()
+
+
+DOCUMENTS = {"readme": "README.md", "vector": "docs/vector.md", "hooks": "docs/hooks.md"}
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_tables_of_the_documentation_have_the_rows_that_stand_there(name):
+    result = run("--table", name)
+    assert (result.returncode, result.stderr) == (0, "")
+    text = (RUN.parent.parent / DOCUMENTS[name]).read_text(encoding="utf-8")
+    written, measured = tables_in(text), tables_in(result.stdout)
+    rows = {"readme": 18, "vector": 5, "hooks": 3}[name]  # and their headers
+    same = [key for key in measured if key in written and not key.startswith(":-")]
+    assert len(same) == rows

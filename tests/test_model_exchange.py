@@ -14,6 +14,7 @@ from fmugym import FMU, ConfigError, FMULoadError
 from fmugym import pool as pools
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
+from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import SOLVERS
 from fmugym.trial import opening
 
@@ -365,7 +366,7 @@ class TestPools:
     def test_states_pass_from_pool_to_pool(self, make_pool, case, kinds):
         first, second = (self.pool_of(make_pool, case, kind, 1) for kind in kinds)
         for pool in (first, second):
-            pool.trust_states_if(lambda: True)
+            pool.save_by(lambda: SaveMethod.STATE)
         self.episode(first, 17)
         zero = np.zeros(1, np.int64)
         second.restore_instances(first.save_instances(zero), zero, zero)

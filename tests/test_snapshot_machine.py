@@ -1,5 +1,7 @@
 """Environments that are saved, restored, stepped and reset in any order, against plain re-runs."""
 
+import pickle
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -80,11 +82,12 @@ class Machine(RuleBasedStateMachine):
             self.note(index, ("step", action), result)
         self.ended = terminated | truncated
 
-    @rule(mask=masks)
-    def save(self, mask):
+    @rule(mask=masks, pickled=st.booleans())
+    def save(self, mask, pickled):
         chosen = np.flatnonzero(mask)
         parts = [(self.histories[i], self.results[i], self.ended[i]) for i in chosen]
-        self.saved.append((self.envs.save_state(np.array(mask)), parts))
+        snapshot = self.envs.save_state(np.array(mask))
+        self.saved.append((pickle.loads(pickle.dumps(snapshot)) if pickled else snapshot, parts))
 
     @rule(mask=masks, number=st.integers(0, 99), place=st.integers(0, N - 1))
     def restore(self, mask, number, place):
@@ -125,11 +128,19 @@ class Machine(RuleBasedStateMachine):
         self.single.close()
 
 
-@pytest.mark.parametrize("version", ["1.0", "2.0"])
-@pytest.mark.parametrize(
-    "options", [{"hooks": "compiled"}, {"hooks": "array"}, {"hooks": "per_env"}], ids=str
-)
-def test_any_order(version, options):
-    machine = type("Own", (Machine,), {"options": options, "version": version})
-    limits = settings(max_examples=25, stateful_step_count=25, deadline=None)
+WAYS = {
+    "compiled": {"hooks": "compiled", "threads": 2},
+    "array": {"hooks": "array", "threads": 1},
+    "per_env": {"hooks": "per_env"},
+    "python": {"backend": "python"},
+    "processes": {"isolation": "process", "workers": 2},
+}
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
+@pytest.mark.parametrize("way", WAYS)
+def test_any_order(version, way):
+    machine = type("Own", (Machine,), {"options": WAYS[way], "version": version})
+    examples = 4 if way == "processes" else 25
+    limits = settings(max_examples=examples, stateful_step_count=25, deadline=None)
     run_state_machine_as_test(machine, settings=limits)

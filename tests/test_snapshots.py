@@ -483,9 +483,9 @@ class TestForeign:
         ("token", "method"),
         [
             ("quick", SaveMethod.STATE),
-            ("slow, crashes elsewhere", SaveMethod.REPLAY),
-            ("slow, refuses elsewhere", SaveMethod.REPLAY),
-            ("slow, differs elsewhere", SaveMethod.REPLAY),
+            ("slow, crashes elsewhere", SaveMethod.COPY),
+            ("slow, refuses elsewhere", SaveMethod.COPY),
+            ("slow, differs elsewhere", SaveMethod.COPY),
         ],
     )
     def test_states_are_tried_in_a_second_process(self, tmp_path, tried, token, method):
@@ -497,6 +497,8 @@ class TestForeign:
             snapshot = env.save_state()
             assert snapshot.method is method
             expected = [env.step(action)[0].tolist() for action in ACTIONS]
+            env.restore_state(snapshot)
+            assert [env.step(a)[0].tolist() for a in ACTIONS] == expected
             with DemandingEnv(path) as other:
                 other.restore_state(snapshot)
                 assert [other.step(a)[0].tolist() for a in ACTIONS] == expected

@@ -45,7 +45,7 @@ class SavingPool(AttendedPool):
 
     _variables: Mapping[str, Variable]
     _offered = SaveMethod.REPLAY
-    _do_states_work: Callable[[], bool] | None = None
+    _ask_for_method: Callable[[], SaveMethod] | None = None
 
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
         """Take over what saving needs; returns whether the pool must keep records."""
@@ -53,17 +53,16 @@ class SavingPool(AttendedPool):
         self._offered = offered_method(description, spec)
         return spec.records or self._offered is not SaveMethod.STATE
 
-    def trust_states_if(self, do_states_work: Callable[[], bool]) -> None:
-        """Let the first call that saves or restores ask whether serialized states work."""
-        self._do_states_work = do_states_work
+    def save_by(self, ask_for_method: Callable[[], SaveMethod]) -> None:
+        """Let the first call that saves or restores ask which method works."""
+        self._ask_for_method = ask_for_method
 
     @property
     def save_method(self) -> SaveMethod:
         """See ``Pool.save_method``; the first call may take as long as a trial of the FMU."""
-        if self._offered is not SaveMethod.REPLAY and self._do_states_work is not None:
-            ask, self._do_states_work = self._do_states_work, None
-            if not ask():
-                self._mistrust_states()
+        if self._offered is not SaveMethod.REPLAY and self._ask_for_method is not None:
+            ask, self._ask_for_method = self._ask_for_method, None
+            self._offered = ask()
         return self._offered
 
     def save_instances(self, indices: IndexArray) -> Bundle:

@@ -28,11 +28,12 @@ from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMe
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
-from fmugym.trial.resuming import do_states_work, known_to_work
+from fmugym.trial.resuming import method_that_works
 from fmugym.trial.trial import (
     Candidate,
     examine,
     is_known_to_harm,
+    known_resuming,
     locks_of,
     marks_of,
     note_harm,
@@ -125,7 +126,7 @@ def make_pool(
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)
             pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
-        pool.trust_states_if(trust.do_states_work)
+        pool.save_by(trust.method_that_works)
         if rehearse and reset_method is None:
             _rehearse(pool, fmu, actual, starts, verdict, completed, log)
         return pool
@@ -243,11 +244,11 @@ class _Trust:
 
     Attributes:
         spec: What the pool does; records are kept until it is known that states work.
-        do_states_work: Finds it out.
+        method_that_works: Finds it out.
     """
 
     spec: PoolSpec
-    do_states_work: Callable[[], bool]
+    method_that_works: Callable[[], SaveMethod]
 
     @classmethod
     def of(
@@ -257,15 +258,16 @@ class _Trust:
         candidate, tried = Candidate.of(fmu), _tried(spec)
         method = offered_method(fmu.description, replace(spec, reset_method=plan.method))
         if method is SaveMethod.REPLAY:
-            return cls(spec, bool)
-        known: bool | None = is_bundled(fmu.path)
-        if not known:
-            known = False if candidate.exempt else known_to_work(candidate, tried, starts)
-            known = False if known is None and not spare else known
-        if known is not None:
-            return cls(replace(spec, records=not known), partial(bool, known))
-        ask = partial(do_states_work, candidate, tried, starts)
-        return cls(replace(spec, records=True), ask)
+            return cls(spec, lambda: method)
+        known: SaveMethod | None = SaveMethod.REPLAY
+        if is_bundled(fmu.path):
+            known = method
+        elif not candidate.exempt:
+            known = known_resuming(candidate, tried, starts)
+            known = SaveMethod.REPLAY if known is None and not spare else known
+        ask = partial(method_that_works, candidate, tried, starts)
+        records = known is not SaveMethod.STATE
+        return cls(replace(spec, records=records), ask if known is None else lambda: known)
 
 
 def _tried(spec: PoolSpec) -> PoolSpec:

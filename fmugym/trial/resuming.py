@@ -28,7 +28,7 @@ from fmugym.trial.rehearsal import Starts
 from fmugym.trial.trial import Candidate, Request, known_resuming, note_resuming, run
 from fmugym.trial.verdict import Grade
 
-__all__ = ["Halfway", "do_states_work", "known_to_work", "make_halfway", "try_halfway"]
+__all__ = ["Halfway", "make_halfway", "method_that_works", "try_halfway"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,49 +56,49 @@ class Halfway:
     rows: FloatArray
 
 
-def known_to_work(candidate: Candidate, spec: PoolSpec, starts: Starts | None) -> bool | None:
-    """What an earlier trial has shown; None if there was none."""
-    grade = known_resuming(candidate, spec, starts)
-    return None if grade is None else grade is Grade.BITWISE
-
-
-def do_states_work(candidate: Candidate, spec: PoolSpec, starts: Starts | None) -> bool:
+def method_that_works(candidate: Candidate, spec: PoolSpec, starts: Starts | None) -> SaveMethod:
     """Find out in two processes whether restored states lead to the same outputs, bit by bit.
+
+    States that do so in the first process only are good for copies within a process.
 
     Args:
         candidate: The FMU.
         spec: The ``PoolSpec`` to try it with.
         starts: The ``Starts`` of episodes.
     """
-    known = known_to_work(candidate, spec, starts)
+    known = known_resuming(candidate, spec, starts)
     if known is not None:
         return known
     try:
         with taking(Seats.of(candidate.path.name, spec), 1, "a trial of saved states"):
-            grade = _grade(Request(candidate, spec, starts, resume=True))
+            method, grade = _tried(Request(candidate, spec, starts, resume=True))
     except LicenceError as error:
         logger.warning("snapshots keep the inputs of the episode for now: %s", error)
-        return False
-    note_resuming(candidate, spec, starts, grade)
+        return SaveMethod.REPLAY
+    if grade is not Grade.FAILS:  # a failure may have passing causes
+        note_resuming(candidate, spec, starts, method)
     if grade is not Grade.BITWISE:
         logger.warning(
-            "%s: its saved states do not work (%s); snapshots keep the inputs of the episode "
-            "instead, and restoring one plays the episode again",
+            "%s: its saved states do not work%s (%s); snapshots keep the inputs of the episode, "
+            "and restoring one%s plays the episode again",
             candidate.path.name,
-            grade,
+            *(" in another process" if method is SaveMethod.COPY else "", grade),
+            " in another environment" if method is SaveMethod.COPY else "",
         )
-    return grade is Grade.BITWISE
+    return method
 
 
-def _grade(request: Request) -> Grade:
+def _tried(request: Request) -> tuple[SaveMethod, Grade]:
+    """How states can be saved, and the grade of the last trial."""
     first = run(request)
     if first.sample is None:
-        return Grade(first.answer.get("resuming", Grade.FAILS))
+        return SaveMethod.REPLAY, Grade(first.answer.get("resuming", Grade.FAILS))
     halfway: Halfway = pickle.loads(first.sample)
     if halfway.state.method is not SaveMethod.STATE:  # copies stay in their process
-        return Grade.BITWISE
+        return SaveMethod.COPY, Grade.BITWISE
     second = run(replace(request, resume=halfway))
-    return Grade(second.answer.get("resuming", Grade.FAILS))
+    grade = Grade(second.answer.get("resuming", Grade.FAILS))
+    return SaveMethod.STATE if grade is Grade.BITWISE else SaveMethod.COPY, grade
 
 
 # In the worker

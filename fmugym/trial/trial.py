@@ -36,6 +36,7 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import ConfigError, FMULoadError, LicenceError, unknown_name
 from fmugym.fmi.words import as_messages, quoted
+from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
@@ -341,18 +342,17 @@ def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
     return replace(verdict, isolate=True, reasons=tuple(reasons))
 
 
-def known_resuming(candidate: Candidate, spec: Any, starts: Any) -> Grade | None:
-    """The grade of states in the middle of an episode; None if they were not tried."""
+def known_resuming(candidate: Candidate, spec: Any, starts: Any) -> SaveMethod | None:
+    """How states in the middle of an episode can be saved; None if that was not tried."""
     try:
-        return Grade(recall(_resuming_key(candidate, spec, starts)) or "")
+        return SaveMethod(recall(_resuming_key(candidate, spec, starts)) or "")
     except ValueError:
         return None
 
 
-def note_resuming(candidate: Candidate, spec: Any, starts: Any, grade: Grade) -> None:
-    """Keep this grade, unless the FMU has failed, which may have passing causes."""
-    if grade is not Grade.FAILS:
-        remember(_resuming_key(candidate, spec, starts), str(grade))
+def note_resuming(candidate: Candidate, spec: Any, starts: Any, method: SaveMethod) -> None:
+    """Keep the result of a trial."""
+    remember(_resuming_key(candidate, spec, starts), str(method))
 
 
 def _resuming_key(candidate: Candidate, spec: Any, starts: Any) -> str:

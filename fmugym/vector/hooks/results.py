@@ -60,8 +60,8 @@ def rewards(value: Any, count: int) -> FloatArray:
 def write_inputs(value: Any, inputs: FloatArray) -> None:
     """Write the result of ``_get_inputs`` to the inputs of the FMUs, shape (k, N)."""
     length, count = inputs.shape
-    is_floats = type(value) is np.ndarray and value.dtype == _FLOAT
-    if is_floats and (value.shape == inputs.shape or (length == 1 and value.shape == (count,))):
+    is_array = type(value) is np.ndarray and value.dtype.kind in _NUMBERS
+    if is_array and (value.shape == inputs.shape or (length == 1 and value.shape == (count,))):
         inputs[:] = value
         return
     given(value, "_get_inputs")
@@ -71,8 +71,9 @@ def write_inputs(value: Any, inputs: FloatArray) -> None:
     if len(rows) != length:
         raise ConfigError(f"_get_inputs returned {len(rows)} values, expected {length}")
     for row, part in zip(inputs, rows, strict=True):
-        is_row = type(part) is np.ndarray and part.dtype == _FLOAT and part.shape == (count,)
-        row[:] = part if is_row else _numbers("_get_inputs", part, count, wanted)
+        is_row = type(part) is np.ndarray and part.shape == (count,)
+        is_ready = is_row and part.dtype.kind in _NUMBERS
+        row[:] = part if is_ready else _numbers("_get_inputs", part, count, wanted)
 
 
 def _rows_of(value: Any, length: int, wanted: str) -> Any:
@@ -128,6 +129,9 @@ def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
     hook = "_get_observation"
     given(value, hook)
     if isinstance(space, spaces.Dict):
+        if type(value) is dict and value.keys() == space.spaces.keys():
+            parts = space.spaces.items()
+            return {name: observations(value[name], part, count) for name, part in parts}
         wanted = "a dict of " + ", ".join(map(repr, space.spaces))
         with _expected(hook, value, wanted):
             if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():

@@ -1,0 +1,102 @@
+"""Measure the tables of the documentation, and print them as they stand there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import cart_poles
+import gymnasium as gym
+import single
+import tasks
+import vector
+from measure import Effort, Run, Sample, by_turns, make_runs
+from tables import Table
+
+__all__ = ["DOCUMENTS"]
+
+LEFT_OUT = {
+    "fmugym, DISABLED, 2 threads",
+    "fmugym, Python pool",
+    "Gymnasium AsyncVectorEnv",
+    "EnvPool, 2 threads",
+}
+"""Rows of the section ``vector`` for which the README has no room."""
+
+TASKS = {
+    "`CartPole-v0`": "CartPole-v0",
+    "`Pendulum-v0`": "Pendulum-v0",
+    "`CloudPendulum-v0`": "CloudPendulum-v0",
+    "a [tracking task](task.md#remember-something-during-an-episode)": "tracking",
+}
+WAYS = ("auto", "array")
+SIZES = (1, 8, 64, 1024)
+
+
+def _readme(effort: Effort) -> list[Table]:
+    """The tables of the section "Speed" of the README."""
+    steps = vector.tables(effort)[0]
+    steps.rows = [row for row in steps.rows if row[0] not in LEFT_OUT]
+    return [*single.tables(effort), steps]
+
+
+def _vector(effort: Effort) -> list[Table]:
+    """The table of docs/vector.md."""
+    sizes = SIZES[:2] if effort.quick else SIZES
+    title = "Processor time of a call of step on one thread in us, compiled / on arrays"
+    table = Table(title, ["environments", *map(str, sizes)])
+    known = {task.name: task for task in tasks.TASKS}
+    for title, name in TASKS.items():
+        cells = [_two_ways(known[name], size, effort) for size in sizes]
+        table.rows.append([title, *cells])
+    return [table]
+
+
+def _two_ways(task: tasks.Task, size: int, effort: Effort) -> str:
+    with ExitStack() as stack:
+        runs = {way: tasks.fmugym_run(stack, task, size, way) for way in WAYS}
+        samples = by_turns(runs, effort)
+    return " / ".join(f"{_fastest(samples[way]) * 1e6:.0f}" for way in WAYS)
+
+
+def _fastest(samples: list[Sample]) -> float:
+    """The processor time of a call in the fastest turn: other work does not slow that down."""
+    return min(sample.cpu / sample.count for sample in samples)
+
+
+def _hooks(effort: Effort) -> list[Table]:
+    """The table of docs/hooks.md."""
+    table = Table(
+        "Processor time of a step of gymnasium.make in us, resets included",
+        ["", "compiled", "in Python", "Gymnasium's own"],
+    )
+    for name, theirs in (("CartPole-v0", "CartPole-v1"), ("Pendulum-v0", "Pendulum-v1")):
+        with ExitStack() as stack:
+            runs, _ = make_runs(_single_makers(stack, f"fmugym/{name}", theirs))
+            samples = by_turns(runs, effort)
+        table.rows.append(
+            [f"`{name}`", *(f"{_fastest(own) * 1e6:.1f}" for own in samples.values())]
+        )
+    return [table]
+
+
+def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callable[[], Run]]:
+    def make(env_id: str, **options: str) -> Run:
+        env = gym.make(env_id, **options)
+        stack.callback(env.close)
+        env.action_space.seed(0)
+        return cart_poles.environment_run(env, [env.action_space.sample() for _ in range(512)])
+
+    return {
+        "compiled": lambda: make(ours, hooks="compiled"),
+        "python": lambda: make(ours, hooks="python"),
+        "Gymnasium": lambda: make(theirs),
+    }
+
+
+DOCUMENTS: dict[str, Callable[[Effort], list[Table]]] = {
+    "readme": _readme,
+    "vector": _vector,
+    "hooks": _hooks,
+}
+"""What measures the tables of the README, of docs/vector.md and of docs/hooks.md."""
