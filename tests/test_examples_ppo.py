@@ -103,8 +103,9 @@ def test_advantages_are_sums_of_temporal_differences(ppo):
     assert actions.shape == logs.shape == advantages.shape == (10,)
     steps = observations[:, 0].tolist()
     assert sorted(steps) == [0, 1, 2, 4, 5, 100, 101, 103, 104, 105]  # without steps of resets
+    seen = [*range(7), *range(100, 107)]
     with torch.no_grad():
-        worth = {k: agent(torch.tensor([[float(k)]]))[1].item() for k in [*range(7), *range(100, 107)]}
+        worth = {k: agent(torch.tensor([[float(k)]]))[1].item() for k in seen}
 
     def delta(i, t):
         later = 0.0 if envs.terminated[t, i] else 0.9 * worth[100 * i + t + 1]
