@@ -24,7 +24,10 @@ REQUIRED = WISH == "1"
 # Results must not depend on the compiler: no contraction, no relaxed floating-point arithmetic.
 native = Extension(
     "fmugym._native",
-    sources=sorted(str(path) for path in Path("native").glob("**/*.c")),
+    # native/worker is a program of its own, which fmugym.wine builds where it is needed
+    sources=sorted(
+        str(path) for folder in (".", "python") for path in Path("native", folder).glob("*.c")
+    ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
     include_dirs=["native"],
     define_macros=[("Py_LIMITED_API", "0x030B0000")],

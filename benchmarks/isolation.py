@@ -22,7 +22,7 @@ from tables import Table, duration, share
 from fmugym.envs import CartPoleEnv
 from fmugym.vector.making import make_with_pool
 
-__all__ = ["tables"]
+__all__ = ["median_time", "tables"]
 
 CALLS = 2000
 """Calls in a row, before the turn of the other configuration."""
@@ -70,7 +70,7 @@ def _add_cost(
     table: Table, name: str, pools: list[Any], effort: Effort, calls: int = CALLS
 ) -> None:
     calls = 10 if effort.quick else calls
-    rounds = [[_median_time(pool.step_own, calls) for pool in pools] for _ in range(effort.rounds)]
+    rounds = [[median_time(pool.step_own, calls) for pool in pools] for _ in range(effort.rounds)]
     here, there = (statistics.median(times) for times in zip(*rounds, strict=True))
     added = statistics.median(b - a for a, b in rounds)
     cells = [duration(here), duration(there), duration(added), share(added / here)]
@@ -78,7 +78,8 @@ def _add_cost(
     table.data.append({"configuration": name, "in_process_s": here, "in_worker_s": there})
 
 
-def _median_time(call: Callable[[], object], count: int) -> float:
+def median_time(call: Callable[[], object], count: int) -> float:
+    """Return the median time of some calls in seconds."""
     times = []
     for _ in range(count):
         begin = time.perf_counter()

@@ -33,6 +33,7 @@ import rollouts
 import single
 import tasks
 import vector
+import windows
 from documents import DOCUMENTS
 from measure import Effort, processors
 from tables import Table
@@ -45,6 +46,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "rollouts": rollouts.tables,
     "heavy": heavy.tables,
     "isolation": isolation.tables,
+    "windows": windows.tables,
     "overlap": overlap.tables,
     "memory": memory.tables,
     "loaded": loaded.tables,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fmugym.config import EnvConfig
     from fmugym.declared import Task, TaskEnv, load
     from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-    from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMI2MEEnv, FMI3CSEnv, FMUEnv
+    from fmugym.env import FMI1CSEnv, FMI1MEEnv, FMI2CSEnv, FMI2MEEnv, FMI3CSEnv, FMI3MEEnv, FMUEnv
     from fmugym.errors import (
         ConfigError,
         ContractError,
@@ -45,9 +45,11 @@ __all__ = [
     "ContractError",
     "EnvConfig",
     "FMI1CSEnv",
+    "FMI1MEEnv",
     "FMI2CSEnv",
     "FMI2MEEnv",
     "FMI3CSEnv",
+    "FMI3MEEnv",
     "FMUEnv",
     "FMUGymError",
     "FMULoadError",
@@ -83,7 +85,10 @@ _MODULES = {
     "config": ["EnvConfig"],
     "declared": ["Task", "TaskEnv", "load"],
     "distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
-    "env": ["FMI1CSEnv", "FMI2CSEnv", "FMI2MEEnv", "FMI3CSEnv", "FMUEnv"],
+    "env": [
+        *("FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"),
+        *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
+    ],
     "errors": [
         *("ConfigError", "ContractError", "FMUGymError"),
         *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),

@@ -31,7 +31,15 @@ from fmugym.task.step import conclude
 from fmugym.task.waiting import Waiting
 from fmugym.task.warm_up import WarmUps, rows_of_one
 
-__all__ = ["FMI1CSEnv", "FMI2CSEnv", "FMI2MEEnv", "FMI3CSEnv", "FMUEnv"]
+__all__ = [
+    "FMI1CSEnv",
+    "FMI1MEEnv",
+    "FMI2CSEnv",
+    "FMI2MEEnv",
+    "FMI3CSEnv",
+    "FMI3MEEnv",
+    "FMUEnv",
+]
 
 _INTEGERS: Final = frozenset({int, np.int64})
 _WARNING: Final = int(Status.WARNING)
@@ -50,10 +58,10 @@ class FMUEnv(Constructed):
     """An FMU as a Gymnasium environment.
 
     A class for your own FMU derives from ``FMI1CSEnv``, ``FMI2CSEnv`` or ``FMI3CSEnv``, or from
-    ``FMI2MEEnv`` for model exchange, and supplies ``_is_done``; every other hook of
-    ``fmugym.task.hooks.Hooks`` has a default. A step calls the hooks once each, in the order in
-    which they stand there. All but ``_get_inputs`` and ``_update`` must be free of side effects.
-    None may draw random numbers; random values are distributions in the config.
+    ``FMI1MEEnv``, ``FMI2MEEnv`` or ``FMI3MEEnv`` for model exchange, and supplies ``_is_done``;
+    every other hook of ``fmugym.task.hooks.Hooks`` has a default. A step calls the hooks once each,
+    in the order in which they stand there. All but ``_get_inputs`` and ``_update`` must be free of
+    side effects. None may draw random numbers; random values are distributions in the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.
@@ -627,6 +635,23 @@ class FMI2CSEnv(FMUEnv):
     fmi_interface = "co_simulation"
 
 
+class FMI3CSEnv(FMUEnv):
+    """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
+
+    fmi_version = 3
+    fmi_interface = "co_simulation"
+
+
+class FMI1MEEnv(FMUEnv):
+    """Base class for FMUs of FMI 1.0 model exchange; see ``FMUEnv``.
+
+    The equations are integrated by the ``solver`` of the config, one of fmugym's own.
+    """
+
+    fmi_version = 1
+    fmi_interface = "model_exchange"
+
+
 class FMI2MEEnv(FMUEnv):
     """Base class for FMUs of FMI 2.0 model exchange; see ``FMUEnv``.
 
@@ -637,11 +662,14 @@ class FMI2MEEnv(FMUEnv):
     fmi_interface = "model_exchange"
 
 
-class FMI3CSEnv(FMUEnv):
-    """Base class for FMUs of FMI 3.0 co-simulation; see ``FMUEnv``."""
+class FMI3MEEnv(FMUEnv):
+    """Base class for FMUs of FMI 3.0 model exchange; see ``FMUEnv``.
+
+    The equations are integrated by the ``solver`` of the config, one of fmugym's own.
+    """
 
     fmi_version = 3
-    fmi_interface = "co_simulation"
+    fmi_interface = "model_exchange"
 
 
 def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:

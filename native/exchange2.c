@@ -7,15 +7,15 @@ enum { MODEL_EXCHANGE = 0 };
 
 static const Binding bindings[] = {
     SHARED_BINDINGS,
-    {"SetTime", offsetof(Functions, set_time), true},
-    {"SetContinuousStates", offsetof(Functions, set_states), true},
-    {"GetContinuousStates", offsetof(Functions, get_states), true},
-    {"GetDerivatives", offsetof(Functions, get_rates), true},
-    {"GetEventIndicators", offsetof(Functions, get_indicators), true},
-    {"GetNominalsOfContinuousStates", offsetof(Functions, get_nominals), true},
-    {"EnterEventMode", offsetof(Functions, enter_events), true},
+    {"SetTime", offsetof(Functions, equations.set_time), true},
+    {"SetContinuousStates", offsetof(Functions, equations.set_states), true},
+    {"GetContinuousStates", offsetof(Functions, equations.get_states), true},
+    {"GetDerivatives", offsetof(Functions, equations.get_rates), true},
+    {"GetEventIndicators", offsetof(Functions, equations.get_indicators), true},
+    {"GetNominalsOfContinuousStates", offsetof(Functions, equations.get_nominals), true},
+    {"EnterEventMode", offsetof(Functions, equations.enter_events), true},
     {"NewDiscreteStates", offsetof(Functions, update), true},
-    {"EnterContinuousTimeMode", offsetof(Functions, enter_continuous), true},
+    {"EnterContinuousTimeMode", offsetof(Functions, equations.enter_continuous), true},
     {"CompletedIntegratorStep", offsetof(Functions, complete), true},
     {"GetDirectionalDerivative", offsetof(Functions, differentiate), false},
 };
@@ -25,34 +25,6 @@ static bool bind(Library *library, char *error, size_t size) {
                         error, size);
 }
 
-static Status set_time(const Library *library, void *component, double time) {
-    return sane(functions_of(library)->set_time(component, time));
-}
-
-static Status set_states(const Library *library, void *component, const double *x, size_t count) {
-    return sane(functions_of(library)->set_states(component, x, count));
-}
-
-static Status get_states(const Library *library, void *component, double *x, size_t count) {
-    return sane(functions_of(library)->get_states(component, x, count));
-}
-
-static Status get_rates(const Library *library, void *component, double *rates, size_t count) {
-    return sane(functions_of(library)->get_rates(component, rates, count));
-}
-
-static Status get_indicators(const Library *library, void *component, double *z, size_t count) {
-    return sane(functions_of(library)->get_indicators(component, z, count));
-}
-
-static Status get_nominals(const Library *library, void *component, double *x, size_t count) {
-    return sane(functions_of(library)->get_nominals(component, x, count));
-}
-
-static Status enter_events(const Library *library, void *component) {
-    return sane(functions_of(library)->enter_events(component));
-}
-
 static Status update(const Library *library, void *component, Events *events) {
     EventInfo info = {0};
     const Status status = sane(functions_of(library)->update(component, &info));
@@ -60,10 +32,6 @@ static Status update(const Library *library, void *component, Events *events) {
     *events = (Events){info.needs_update != 0, info.terminate != 0, info.has_next_time != 0,
                        info.next_time};
     return status;
-}
-
-static Status enter_continuous(const Library *library, void *component) {
-    return sane(functions_of(library)->enter_continuous(component));
 }
 
 static Status complete(const Library *library, void *component, bool *event, bool *terminate) {
@@ -107,15 +75,8 @@ static const Fmi fmu = {
 
 static const Model model = {
     .fmi = &fmu,
-    .set_time = set_time,
-    .set_states = set_states,
-    .get_states = get_states,
-    .get_rates = get_rates,
-    .get_indicators = get_indicators,
-    .get_nominals = get_nominals,
-    .enter_events = enter_events,
+    .equations = offsetof(Functions, equations),
     .update = update,
-    .enter_continuous = enter_continuous,
     .complete = complete,
     .differentiate = differentiate,
 };

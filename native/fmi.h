@@ -132,7 +132,7 @@ typedef struct Fmi {
 } Fmi;
 
 /* Of co-simulation and of model exchange. */
-extern const Fmi fmi1, fmi2, fmi3, exchange2;
+extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3;
 
 static inline bool has_outputs(Outcome outcome) {
     return outcome.stage == DOING_STEP &&

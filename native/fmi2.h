@@ -8,6 +8,7 @@
 #include "fmi.h"
 #include "log.h"
 #include "shared.h"
+#include "solver.h"
 
 typedef struct {
     void (*logger)(void *environment, const char *name, int status, const char *category,
@@ -42,15 +43,8 @@ typedef struct {
     int (*get_boolean_status)(void *component, int kind, int *value);
 
     /* model exchange */
-    int (*set_time)(void *component, double time);
-    int (*set_states)(void *component, const double *x, size_t count);
-    int (*get_states)(void *component, double *x, size_t count);
-    int (*get_rates)(void *component, double *rates, size_t count);
-    int (*get_indicators)(void *component, double *z, size_t count);
-    int (*get_nominals)(void *component, double *x, size_t count);
-    int (*enter_events)(void *component);
+    Equations equations;
     int (*update)(void *component, EventInfo *info);
-    int (*enter_continuous)(void *component);
     int (*complete)(void *component, int no_set_state, int *event, int *terminate);
     int (*differentiate)(void *component, const uint32_t *unknowns, size_t number_of_unknowns,
                          const uint32_t *knowns, size_t number_of_knowns, const double *seed,
@@ -95,15 +89,15 @@ static inline void *instantiate_as(int type, const Library *library, const Ident
 }
 
 static inline Status choose_messages(const Library *library, void *component,
-                              const char *const *categories, size_t count) {
+                                     const char *const *categories, size_t count) {
     const Functions *f = functions_of(library);
     return f->set_debug_logging == NULL
                ? STATUS_OK
                : sane(f->set_debug_logging(component, count > 0, count, categories));
 }
 
-static inline Status initialize(const Library *library, void *component, const Experiment *e,
-                         StartValues start_values, const char **doing) {
+static inline Status initialize(const Library *library, void *component,
+                                const Experiment *e, StartValues start_values, const char **doing) {
     const Functions *f = functions_of(library);
 
     *doing = "setting up the experiment";

@@ -1,68 +1,11 @@
 /* FMI 3.0 for co-simulation, without event mode, early return and intermediate update. */
 
-#include <stdlib.h>
-
-#include "fmi.h"
-#include "log.h"
-#include "shared.h"
-
-typedef int Get3(void *instance, const uint32_t *references, size_t number_of_references,
-                    void *values, size_t number_of_values);
-typedef int Set3(void *instance, const uint32_t *references, size_t number_of_references,
-                         const void *values, size_t number_of_values);
-
-typedef struct {
-    Common common;
-    void *(*instantiate)(const char *name, const char *token, const char *resources, bool visible,
-                         bool logging, bool event_mode_used, bool early_return_allowed,
-                         const uint32_t *intermediate_variables, size_t number_of_variables,
-                         void *environment,
-                         void (*logger)(void *environment, int status, const char *category,
-                                        const char *text),
-                         void (*intermediate_update)(void));
-    int (*set_debug_logging)(void *instance, bool on, size_t count, const char *const *categories);
-    int (*enter_initialization)(void *instance, bool has_tolerance, double tolerance,
-                                double start_time, bool has_stop_time, double stop_time);
-    int (*exit_initialization)(void *instance);
-    int (*do_step)(void *instance, double time, double step, bool no_set_state,
-                   bool *event_handling_needed, bool *terminate, bool *early_return,
-                   double *last_successful_time);
-    Get3 *get[NUMBER_OF_TYPES];
-    Set3 *set[NUMBER_OF_TYPES];
-    int (*set_string)(void *instance, const uint32_t *references, size_t number_of_references,
-                      const char *const *values, size_t number_of_values);
-} Functions;
-
-#define VALUES(name, type)                                                                         \
-    ELEMENT("Get" name, Functions, get, type), ELEMENT("Set" name, Functions, set, type)
+#include "fmi3.h"
 
 static const Binding bindings[] = {
-    {"InstantiateCoSimulation", offsetof(Functions, instantiate), true},
-    {"SetDebugLogging", offsetof(Functions, set_debug_logging), false},
-    {"FreeInstance", offsetof(Functions, common.free_instance), true},
-    {"EnterInitializationMode", offsetof(Functions, enter_initialization), true},
-    {"ExitInitializationMode", offsetof(Functions, exit_initialization), true},
+    SHARED_BINDINGS,
+    {"InstantiateCoSimulation", offsetof(Functions, instantiate_steps), true},
     {"DoStep", offsetof(Functions, do_step), true},
-    {"Terminate", offsetof(Functions, common.terminate), false},
-    {"Reset", offsetof(Functions, common.reset), false},
-    VALUES("Float64", TYPE_FLOAT64),
-    VALUES("Float32", TYPE_FLOAT32),
-    VALUES("Int8", TYPE_INT8),
-    VALUES("Int16", TYPE_INT16),
-    VALUES("Int32", TYPE_INT32),
-    VALUES("Int64", TYPE_INT64),
-    VALUES("UInt8", TYPE_UINT8),
-    VALUES("UInt16", TYPE_UINT16),
-    VALUES("UInt32", TYPE_UINT32),
-    VALUES("UInt64", TYPE_UINT64),
-    VALUES("Boolean", TYPE_BOOLEAN),
-    {"SetString", offsetof(Functions, set_string), false},
-    {"GetFMUState", offsetof(Functions, common.get_state), false},
-    {"SetFMUState", offsetof(Functions, common.set_state), false},
-    {"FreeFMUState", offsetof(Functions, common.free_state), false},
-    {"SerializedFMUStateSize", offsetof(Functions, common.state_size), false},
-    {"SerializeFMUState", offsetof(Functions, common.serialize), false},
-    {"DeserializeFMUState", offsetof(Functions, common.deserialize), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -70,40 +13,10 @@ static bool bind(Library *library, char *error, size_t size) {
                         error, size);
 }
 
-static const Functions *functions_of(const Library *library) {
-    return library->functions;
-}
-
 static void *instantiate(const Library *library, const Identity *identity) {
-    return functions_of(library)->instantiate(
+    return functions_of(library)->instantiate_steps(
         identity->name, identity->token, identity->resources, false, identity->logging, false,
-        false, NULL, 0, (void *)(uintptr_t)identity->environment, log_message_fmi3, NULL);
-}
-
-static Status choose_messages(const Library *library, void *instance,
-                              const char *const *categories, size_t count) {
-    const Functions *f = functions_of(library);
-    return f->set_debug_logging == NULL
-               ? STATUS_OK
-               : sane(f->set_debug_logging(instance, count > 0, count, categories));
-}
-
-static Status initialize(const Library *library, void *instance, const Experiment *e,
-                         StartValues start_values, const char **doing) {
-    const Functions *f = functions_of(library);
-
-    *doing = "setting the start values";
-    Status status = start_values.set(start_values.context);
-    if (status <= STATUS_WARNING) {
-        *doing = "entering initialization";
-        status = sane(f->enter_initialization(instance, e->has_tolerance, e->tolerance,
-                                              e->start_time, e->has_stop_time, e->stop_time));
-    }
-    if (status <= STATUS_WARNING) {
-        *doing = "initialization";
-        status = sane(f->exit_initialization(instance));
-    }
-    return status;
+        false, NULL, 0, environment_of(identity), log_message_fmi3, NULL);
 }
 
 static Status do_step(const Library *library, void *instance, double time, double step,
@@ -123,33 +36,6 @@ static Status do_step(const Library *library, void *instance, double time, doubl
     return status;
 }
 
-static Status get(const Library *library, void *instance, Type type, const uint32_t *references,
-                  size_t count, void *values) {
-    Get3 *function = functions_of(library)->get[type];
-    if (function == NULL) {
-        return STATUS_ERROR;
-    }
-    return sane(function(instance, references, count, values, count));
-}
-
-static Status set(const Library *library, void *instance, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
-    Set3 *function = functions_of(library)->set[type];
-    if (function == NULL) {
-        return STATUS_ERROR;
-    }
-    return sane(function(instance, references, count, values, count));
-}
-
-static Status set_string(const Library *library, void *instance, uint32_t reference,
-                         const char *text) {
-    const Functions *f = functions_of(library);
-    if (f->set_string == NULL) {
-        return STATUS_ERROR;
-    }
-    return sane(f->set_string(instance, &reference, 1, &text, 1));
-}
-
 static bool exchange(const Library *library, const Exchange *e) {
     return exchange_by(&fmi3, library, e);
 }
@@ -162,9 +48,9 @@ const Fmi fmi3 = {
     .initialize = initialize,
     .do_step = do_step,
     .exchange = exchange,
-    .get = get,
-    .set = set,
-    .set_string = set_string,
+    .get = get3,
+    .set = set3,
+    .set_string = set_string3,
     .reset = reset,
     .terminate = terminate,
     .free_instance = free_instance,

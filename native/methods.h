@@ -23,6 +23,9 @@ typedef struct Method {
 
 extern const Method euler, rk4, dormand_prince, rosenbrock;
 
+/* NULL if there is none of this name. */
+const Method *method_of(const char *name);
+
 /* How a pool solves the equations of its instances. */
 typedef struct Solving {
     const Method *method;

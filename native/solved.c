@@ -50,6 +50,8 @@ void *solved_take(const Model *model, const Library *library, const Identity *id
 
     if (me != NULL) {
         me->solver = (Solver){.model = model,
+                              .equations = (const Equations *)((const char *)library->functions +
+                                                               model->equations),
                               .library = library,
                               .component = component,
                               .solving = identity->solving,

@@ -94,10 +94,10 @@ static void restore_floats(const Solver *me) {
 }
 
 static Status place(Solver *me, double time, const double *x) {
-    Status status = me->model->set_time(me->library, me->component, time);
+    Status status = sane(me->equations->set_time(me->component, time));
 
     if (good(status) && me->n > 0) {
-        status = me->model->set_states(me->library, me->component, x, me->n);
+        status = sane(me->equations->set_states(me->component, x, me->n));
     }
     restore_floats(me);
     return status;
@@ -106,8 +106,7 @@ static Status place(Solver *me, double time, const double *x) {
 static Status get_indicators(Solver *me, double *z) {
     const size_t count = me->solving->indicators;
     const Status status =
-        count == 0 ? STATUS_OK
-                   : me->model->get_indicators(me->library, me->component, z, count);
+        count == 0 ? STATUS_OK : sane(me->equations->get_indicators(me->component, z, count));
     restore_floats(me);
     return status;
 }
@@ -116,7 +115,7 @@ Status solver_rates(Solver *me, double time, const double *x, double *rates) {
     Status status = place(me, time, x);
 
     if (good(status) && me->n > 0) {
-        status = me->model->get_rates(me->library, me->component, rates, me->n);
+        status = sane(me->equations->get_rates(me->component, rates, me->n));
         restore_floats(me);
     }
     return status;
@@ -124,14 +123,13 @@ Status solver_rates(Solver *me, double time, const double *x, double *rates) {
 
 /* Reads the states and their nominal values, which an event may have changed. */
 static Status read_states(Solver *me) {
-    const Model *model = me->model;
     Status status = STATUS_OK;
 
     if (me->n > 0) {
-        status = model->get_states(me->library, me->component, me->x, me->n);
+        status = sane(me->equations->get_states(me->component, me->x, me->n));
     }
     if (good(status) && me->n > 0 && me->solving->method->order > 0.0) {
-        status = model->get_nominals(me->library, me->component, me->nominals, me->n);
+        status = sane(me->equations->get_nominals(me->component, me->nominals, me->n));
     }
     restore_floats(me);
     for (size_t i = 0; i < me->n; i++) {
@@ -158,16 +156,21 @@ static Status know(Solver *me) {
 
 /* Events */
 
-Status solver_enter_events(Solver *me) {
-    const Status status = me->model->enter_events(me->library, me->component);
+static Status enter(Solver *me, int (*mode)(void *component)) {
+    const Status status = mode == NULL ? STATUS_OK : sane(mode(me->component));
 
     restore_floats(me);
+    return status;
+}
+
+Status solver_enter_events(Solver *me) {
+    const Status status = enter(me, me->equations->enter_events);
+
     me->memory.mode = IN_EVENTS;
     return status;
 }
 
 Status solver_settle(Solver *me) {
-    const Model *model = me->model;
     Events events = {.again = true};
     Status status = STATUS_OK;
 
@@ -177,7 +180,7 @@ Status solver_settle(Solver *me) {
                         me->memory.time, MOST_UPDATES);
         }
         events = (Events){0};
-        status = model->update(me->library, me->component, &events);
+        status = me->model->update(me->library, me->component, &events);
         restore_floats(me);
     }
     me->memory.next_event =
@@ -186,8 +189,7 @@ Status solver_settle(Solver *me) {
     if (!good(status) || events.terminate) {
         return status;
     }
-    status = model->enter_continuous(me->library, me->component);
-    restore_floats(me);
+    status = enter(me, me->equations->enter_continuous);
     me->memory.mode = IN_CONTINUOUS_TIME;
     return good(status) ? read_states(me) : status;
 }

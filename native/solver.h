@@ -16,19 +16,23 @@ typedef struct {
     double next;    /* its time */
 } Events;
 
-/* The functions of model exchange in one FMI version; those of Fmi beside them. The numbers of
- * states and event indicators are those of the FMU. */
+/* The functions of model exchange that have one form in all FMI versions. */
+typedef struct {
+    int (*set_time)(void *component, double time);
+    int (*set_states)(void *component, const double *x, size_t count);
+    int (*get_states)(void *component, double *x, size_t count);
+    int (*get_rates)(void *component, double *rates, size_t count);
+    int (*get_indicators)(void *component, double *z, size_t count);
+    int (*get_nominals)(void *component, double *x, size_t count);
+    int (*enter_events)(void *component); /* NULL in FMI 1.0, which has no modes */
+    int (*enter_continuous)(void *component);
+} Equations;
+
+/* One FMI version of model exchange. */
 typedef struct Model {
-    const Fmi *fmi; /* of the FMU itself */
-    Status (*set_time)(const Library *library, void *component, double time);
-    Status (*set_states)(const Library *library, void *component, const double *x, size_t count);
-    Status (*get_states)(const Library *library, void *component, double *x, size_t count);
-    Status (*get_rates)(const Library *library, void *component, double *rates, size_t count);
-    Status (*get_indicators)(const Library *library, void *component, double *z, size_t count);
-    Status (*get_nominals)(const Library *library, void *component, double *x, size_t count);
-    Status (*enter_events)(const Library *library, void *component);
+    const Fmi *fmi;   /* of the FMU itself */
+    size_t equations; /* where they are in the library's table of functions */
     Status (*update)(const Library *library, void *component, Events *events);
-    Status (*enter_continuous)(const Library *library, void *component);
     /* Tells the FMU that a step is complete. It may want an event, or to stop. */
     Status (*complete)(const Library *library, void *component, bool *event, bool *terminate);
     /* The derivatives of all rates by one state; NULL in FMI 1.0. */
@@ -50,6 +54,7 @@ typedef struct {
 /* One instance. */
 typedef struct Solver {
     const Model *model;
+    const Equations *equations;
     const Library *library;
     void *component;
     const Solving *solving;

@@ -11,6 +11,9 @@ import building
 import fmu_tools
 import pytest
 import tiers
+import wine_tools
+
+from fmugym.wine.prefix import Wine
 
 # The processes of a test run share a folder: the first one makes it, and removes it.
 if building.FOLDER not in os.environ:
@@ -64,6 +67,15 @@ def probe(tmp_path_factory):
         return fmu_tools.probe_fmu(tmp_path_factory.mktemp(f"probe{version}"), version)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def wine():
+    """What FMUs with libraries for Windows need here; skips the test where something is missing."""
+    reason = wine_tools.why_not()
+    if reason:
+        pytest.skip(reason)
+    return Wine.ready()
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ OTHERS = {
 """The other variables in the order of their value references."""
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
-INPUTS = {"u", "duty"}
+INPUTS = {"u", "duty", "e"}
 OUTPUTS = {"bounces", "count", "mode", "source", "discharges"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},
@@ -78,10 +78,12 @@ def library(model, version):
 def describe(model, version, interfaces=("ModelExchange",), flags=""):
     """The model description."""
     variables = names(model)
+    if version == 3:  # event indicators are variables there
+        variables += [f"indicator {i}" for i in range(INDICATORS.get(model, 0))]
     elements = "".join(_variable(version, model, i, name) for i, name in enumerate(variables))
     inside = "".join(
         f'<{name} modelIdentifier="Model" {FLAGS[version]} {flags}{_extra(version, name)}/>'
-        for name in interfaces
+        for name in (() if version == 1 else interfaces)
     )
     inside = f'{inside}<DefaultExperiment startTime="0" stepSize="0.01"/>'
     inside += f"<ModelVariables>{elements}</ModelVariables>{_structure(version, model)}"
@@ -150,5 +152,9 @@ def _structure(version, model):
         return f"<ModelStructure><Derivatives>{unknowns}</Derivatives></ModelStructure>"
     unknowns = "".join(
         f'<ContinuousStateDerivative valueReference="{count + i}"/>' for i in range(count)
+    )
+    first = len(names(model))
+    unknowns += "".join(
+        f'<EventIndicator valueReference="{first + i}"/>' for i in range(INDICATORS.get(model, 0))
     )
     return f"<ModelStructure>{unknowns}</ModelStructure>"

@@ -16,6 +16,11 @@
 
 #include "fmi2_stubs.h"
 
+#if defined _WIN32
+#define setenv(name, value, overwrite) _putenv_s(name, value)
+#define unsetenv(name) _putenv_s(name, "")
+#endif
+
 enum { U, Y, FAULT, STAGE, AT, COUNT };
 enum fault { NONE, CRASH, ABORT, EXIT, HANG, CLOSE, PAUSE };
 enum stage { NOWHERE, STEP, RESET, TERMINATE, FREE, INITIALIZE };
@@ -40,6 +45,9 @@ static void fail(Faulty *me, int fault) {
     me->callbacks->logger(me->callbacks->environment, me->name, ERROR, "last words",
                           "this is fault %d", fault);
     if (fault == CRASH) {
+#if defined _WIN32
+        *(volatile int *)8 = 0;
+#endif
         raise(SIGSEGV);
     } else if (fault == ABORT) {
         abort();

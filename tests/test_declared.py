@@ -526,3 +526,74 @@ def test_the_tables_of_the_documentation_are_complete(heading, names):
 def test_the_id_needs_a_task():
     with pytest.raises(ConfigError, match="config"):
         gymnasium.make("fmugym/FMU-v0")
+
+
+COMMENTED = """
+# the swing of a pendulum
+fmu = { bundled = "Pendulum" }  # ours
+time_step = "20ms"
+
+[variables]  # what is used
+tau = { min = -0.01, max = 0.01 }  # N m
+
+[agent]
+actions = ["tau"]
+observations = [
+    "q",  # rad
+]
+
+# how good it is
+[reward]
+upright = "-abs(q)"  # the nearer, the better
+"""
+
+
+class TestComments:
+    def written(self, task, folder):
+        task.write(folder / "written.toml")
+        assert Task.read(folder / "written.toml") == task
+        return (folder / "written.toml").read_text()
+
+    def test_are_kept(self, tmp_path):
+        (tmp_path / "task.toml").write_text(COMMENTED)
+        task = Task.read(tmp_path / "task.toml")
+        (tmp_path / "folder").mkdir()
+        assert self.written(task, tmp_path / "folder") == COMMENTED
+
+    def test_of_what_stays_are_kept_where_something_changes(self, tmp_path):
+        (tmp_path / "task.toml").write_text(COMMENTED)
+        task = Task.read(tmp_path / "task.toml")
+        variables = {"tau": {"min": -0.01, "max": 0.02}}
+        changed = Task(
+            task.document | {"variables": variables, "episode_length": "1s", "costs": {"c": "q"}},
+            task.sources,
+        )
+        text = self.written(changed, tmp_path)
+        for line in COMMENTED.splitlines():
+            if "max" not in line:
+                assert line in text
+        assert "max = 0.02 }  # N m" in text
+
+    def test_of_a_file_that_extends_another(self, tmp_path):
+        (tmp_path / "base.toml").write_text(COMMENTED)
+        own = '# mine\nextends = "base.toml"\n[reward]\nupright = "q"  # instead\n'
+        (tmp_path / "own.toml").write_text(own)
+        text = self.written(Task.read(tmp_path / "own.toml"), tmp_path)
+        assert "# mine" in text
+        assert "# instead" in text
+        assert "extends" not in text
+
+
+def test_spawned_workers_play_a_task_file(tmp_path):
+    """Gymnasium's own vector environment, whose workers are started anew."""
+    (tmp_path / "task.toml").write_text(COMMENTED)
+    make = partial(gymnasium.make, "fmugym:fmugym/FMU-v0", config=str(tmp_path / "task.toml"))
+    theirs = gymnasium.vector.AsyncVectorEnv([make, make], context="spawn")
+    ours = gymnasium.make_vec("fmugym/FMU-v0", 2, config=str(tmp_path / "task.toml"))
+    np.testing.assert_array_equal(theirs.reset(seed=1)[0], ours.reset(seed=1)[0])
+    for _ in range(5):
+        actions = ours.action_space.sample()
+        for one, other in zip(theirs.step(actions)[:4], ours.step(actions)[:4], strict=True):
+            np.testing.assert_array_equal(one, other)
+    theirs.close()
+    ours.close()

@@ -1,5 +1,7 @@
 """Data, set points, forecasts, histories and scaled spaces of declared tasks."""
 
+import datetime
+import sys
 from functools import partial
 
 import numpy as np
@@ -251,6 +253,93 @@ class TestFiles:
         assert 'file = "../weather.csv"' in (tmp_path / "folder" / "task.toml").read_text()
         assert fmugym.Task.read(tmp_path / "folder" / "task.toml") == env.task
         env.close()
+
+
+class TestParquet(TestFiles):
+    """The same data with types."""
+
+    def load(self, folder, times=(0, 3600, 7200), values=(10.0, 20.0, 15.0), **column):
+        parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
+        pyarrow = pytest.importorskip("pyarrow")
+        table = pyarrow.table({"time": list(times), "T_C": list(values), "note": ["a", "b", "c"]})
+        parquet.write_table(table, folder / "weather.parquet")
+        data = {"T": {"file": str(folder / "weather.parquet"), "column": "T_C"} | column}
+        agent = {"actions": ["tau"], "observations": ["T", "q"]}
+        return fmugym.load(
+            BASE | {"data": data, "agent": agent, "time_step": 900, "parameters": AT_REST}
+        )
+
+    def test_dates_count_from_the_beginning_of_their_year(self, tmp_path):
+        times = [datetime.datetime(2023, 1, 1, hour) for hour in range(3)]
+        env = self.load(tmp_path, times, interpolation="previous")
+        assert self.values(env, 4) == [10] * 4 + [20]
+
+    def test_rows_at_even_times_with_commas(self, tmp_path):
+        env = self.load(tmp_path, step="30min", interpolation="previous", period="2h")
+        assert self.values(env, 8) == [10, 10, 20, 20, 15, 15, 15, 15, 10]
+
+    @pytest.mark.parametrize(
+        ("values", "column", "fact"),
+        [
+            ((1.0, None, 2.0), {}, "row 3.*None"),
+            ((1, 2, 3), {"column": "note"}, "'a'"),
+            ((1, 2, 3), {"column": "T_c"}, "'T_C'"),
+        ],
+    )
+    def test_mistakes_are_explained(self, tmp_path, values, column, fact):
+        with pytest.raises(TaskError, match=rf"data\.T.*{fact}"):
+            self.load(tmp_path, values=values, **column)
+
+    def test_a_file_of_something_else(self, tmp_path):
+        self.load(tmp_path).close()
+        (tmp_path / "weather.parquet").write_bytes(b"PAR1 but no more")
+        data = {"T": {"file": str(tmp_path / "weather.parquet"), "column": "T_C"}}
+        with pytest.raises(TaskError, match=r"^data\.T\.file: weather\.parquet"):
+            fmugym.load(BASE | {"data": data})
+
+    def test_a_task_with_data_survives_writing(self, tmp_path):
+        env = self.load(tmp_path)
+        env.task.write(tmp_path / "task.toml")
+        assert fmugym.Task.read(tmp_path / "task.toml") == env.task
+        env.close()
+
+
+def test_parquet_without_pyarrow(tmp_path, monkeypatch):
+    (tmp_path / "weather.parquet").write_bytes(b"PAR1")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    data = {"T": {"file": str(tmp_path / "weather.parquet"), "column": "T_C"}}
+    with pytest.raises(TaskError, match=r"weather\.parquet.*\[parquet\]"):
+        fmugym.load(BASE | {"data": data})
+
+
+class TestArrays:
+    def seen(self, **data):
+        agent = {"actions": ["tau"], "observations": ["T", "q"]}
+        env = fmugym.load(BASE | {"data": {"T": data}, "agent": agent})
+        values = [env.reset(seed=0)[0][0], *(env.step([0.0])[0][0] for _ in range(5))]
+        env.close()
+        return values
+
+    def test_of_numpy(self):
+        values, times = np.array([0.0, 1.0, 5.0]), np.array([0.0, 0.25, 1.25])
+        expected = np.interp(np.arange(6) * DT, times, values)
+        np.testing.assert_allclose(self.seen(values=values, times=times), expected, rtol=1e-6)
+        assert self.seen(values=values, step=DT)[:3] == [0, 1, 5]
+
+    @pytest.mark.parametrize(
+        ("data", "fact"),
+        [
+            ({"values": [1, 2]}, "'step'"),
+            ({"values": [1, 2], "times": [0]}, "1 times.*2 values"),
+            ({"values": [1, 2], "times": [0, 1], "step": 1}, "'times'"),
+            ({"values": [1.0, np.nan], "step": 1}, "finite"),
+            ({"values": 3, "step": 1}, "list"),
+            ({"values": np.ones((2, 2)), "step": 1}, "values"),
+        ],
+    )
+    def test_mistakes_are_explained(self, data, fact):
+        with pytest.raises(TaskError, match=rf"^data\.T.*{fact}"):
+            self.seen(**data)
 
 
 def test_data_are_written_to_an_input_in_its_unit():

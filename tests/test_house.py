@@ -10,8 +10,8 @@ import fmugym
 PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
-    {"errors", "lazy", "signals", "_native"},
-    {"checks"},
+    {"errors", "caching", "lazy", "signals", "_native"},
+    {"checks", "wine"},
     {"archive", "distributions", "rendering"},
     {"fmi"},
     {"pool"},

@@ -227,15 +227,6 @@ class TestOtherFacts:
 
 
 class TestRefused:
-    def test_model_exchange_only_in_fmi_3(self, tmp_path):
-        path = probe_fmu(tmp_path, 3, {"CoSimulation": "ModelExchange"})
-        refused(path, "Probe is for model exchange in FMI 3.0, .* FMI 2.0")
-
-    def test_model_exchange_only_in_fmi_1(self, tmp_path):
-        edits = {"<Implementation>": "<VendorAnnotations>", "</Implementation>": ""}
-        edits["</fmiModelDescription>"] = "</VendorAnnotations></fmiModelDescription>"
-        refused(probe_fmu(tmp_path, 1, edits), "Probe is for model exchange in FMI 1.0, .* FMI 2.0")
-
     def test_no_interface_at_all(self, tmp_path):
         path = probe_fmu(tmp_path, 3, {"CoSimulation": "ScheduledExecution"})
         refused(path, "co-simulation or model exchange.*scheduled execution")

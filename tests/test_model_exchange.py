@@ -26,7 +26,8 @@ OPTIONS = {
 }
 DERIVATIVES = 'providesDirectionalDerivative="true"'
 all_solvers = pytest.mark.parametrize("solver", SOLVERS)
-all_versions = pytest.mark.parametrize("version", [2])
+all_versions = pytest.mark.parametrize("version", [1, 2, 3])
+with_states = pytest.mark.parametrize("version", [2, 3])
 
 
 @pytest.fixture(scope="session")
@@ -163,9 +164,11 @@ class TestEvents:
             t -= 2 * v / g
 
     @all_solvers
+    @all_versions
     @pytest.mark.parametrize("kind", ["native", "python"])
-    def test_bounces_are_where_the_closed_form_has_them(self, make_pool, solver, kind):
-        pool = make_pool("ball", 0.05, kind, outputs=["h"], solver=solver, max_step=1e-3)
+    def test_bounces_are_where_the_closed_form_has_them(self, make_pool, solver, version, kind):
+        spec = {"solver": solver, "max_step": 1e-3}
+        pool = make_pool("ball", 0.05, kind, outputs=["h"], version=version, **spec)
         found = run(pool, 40)[:, 0]
         expected = [self.height(0.05 * i) for i in range(41)]
         tolerance = 2e-2 if solver == "euler" else 1e-8
@@ -189,9 +192,10 @@ class TestEvents:
         assert "t = 2.558" in pool.failure(0)
 
     @all_solvers
+    @all_versions
     @pytest.mark.parametrize("kind", ["native", "python"])
-    def test_time_events_and_the_wish_to_stop(self, make_pool, solver, kind):
-        pool = make_pool("stair", 0.3, kind, outputs=["count"], solver=solver)
+    def test_time_events_and_the_wish_to_stop(self, make_pool, solver, version, kind):
+        pool = make_pool("stair", 0.3, kind, outputs=["count"], solver=solver, version=version)
         start(pool)
         for i in range(1, 34):
             outputs, statuses = pool.step()
@@ -328,33 +332,35 @@ class TestPools:
             rows.append(outputs.copy())
         return np.array(rows)
 
-    def pool_of(self, make_pool, case, kind, n, **spec):
+    def pool_of(self, make_pool, case, kind, n, version=2, **spec):
         model, inputs, outputs, name, solver = case
         step = 1.0 if model == "robertson" else 0.04
         spec = {"solver": solver, "max_step": 0.01 if solver in ("euler", "rk4") else None} | spec
-        pool = make_pool(model, step, kind, n, inputs, outputs, **spec)
+        pool = make_pool(model, step, kind, n, inputs, outputs, version, **spec)
         start(pool, {name: np.linspace(0.4, 1.0, n)})
         return pool
 
     @every_case
+    @all_versions
     @pytest.mark.parametrize("kind", ["python", "process"])
-    def test_all_pools_give_the_same_bits(self, make_pool, case, kind):
+    def test_all_pools_give_the_same_bits(self, make_pool, case, version, kind):
         native = self.episode(self.pool_of(make_pool, case, "native", 3), 60)
-        other = self.episode(self.pool_of(make_pool, case, kind, 3), 60)
+        other = self.episode(self.pool_of(make_pool, case, kind, 3, version), 60)
         assert native.tobytes() == other.tobytes()
 
     @every_case
     def test_neighbours_and_threads_change_nothing(self, make_pool, case):
-        many = self.episode(self.pool_of(make_pool, case, "native", 200), 20)
-        again = self.episode(self.pool_of(make_pool, case, "native", 200), 20)
+        many = self.episode(self.pool_of(make_pool, case, "native", 70), 10)
+        again = self.episode(self.pool_of(make_pool, case, "native", 70), 10)
         assert many.tobytes() == again.tobytes()
-        alone = self.pool_of(make_pool, case, "python", 200)
-        assert self.episode(alone, 20).tobytes() == many.tobytes()
+        alone = self.pool_of(make_pool, case, "python", 70)
+        assert self.episode(alone, 10).tobytes() == many.tobytes()
 
     @every_case
+    @with_states
     @every_kind
-    def test_a_restored_state_goes_on_in_the_same_way(self, make_pool, case, kind):
-        pool = self.pool_of(make_pool, case, kind, 2)
+    def test_a_restored_state_goes_on_in_the_same_way(self, make_pool, case, version, kind):
+        pool = self.pool_of(make_pool, case, kind, 2, version)
         self.episode(pool, 17)
         snapshot = pool.save()
         went_on = self.episode(pool, 30, first=17)
@@ -362,9 +368,10 @@ class TestPools:
         assert self.episode(pool, 30, first=17).tobytes() == went_on.tobytes()
 
     @every_case
+    @with_states
     @pytest.mark.parametrize("kinds", [("native", "python"), ("python", "native")])
-    def test_states_pass_from_pool_to_pool(self, make_pool, case, kinds):
-        first, second = (self.pool_of(make_pool, case, kind, 1) for kind in kinds)
+    def test_states_pass_from_pool_to_pool(self, make_pool, case, version, kinds):
+        first, second = (self.pool_of(make_pool, case, kind, 1, version) for kind in kinds)
         for pool in (first, second):
             pool.save_by(lambda: SaveMethod.STATE)
         self.episode(first, 17)
@@ -373,13 +380,15 @@ class TestPools:
         went_on = self.episode(first, 30, first=17)
         assert self.episode(second, 30, first=17).tobytes() == went_on.tobytes()
 
+    @all_versions
     @every_kind
-    def test_a_reset_forgets_the_solver(self, make_pool, kind):
+    def test_a_reset_forgets_the_solver(self, make_pool, version, kind):
         case = self.CASES[0]
-        pool = self.pool_of(make_pool, case, kind, 2)
+        pool = self.pool_of(make_pool, case, kind, 2, version)
         first = self.episode(pool, 30)
         start(pool, {case[3]: np.linspace(0.4, 1.0, 2)})
         assert self.episode(pool, 30).tobytes() == first.tobytes()
+        assert pool.health()["replacements"].tolist() == [0, 0]
 
     @every_kind
     def test_tunable_parameters_change_between_steps(self, make_pool, kind):
@@ -421,14 +430,23 @@ class BallEnv(fmugym.FMI2MEEnv):
 
 
 class AnyBallEnv(BallEnv):
-    fmi_interface = None
+    fmi_version = fmi_interface = None
+
+
+class Ball1Env(BallEnv, fmugym.FMI1MEEnv):
+    fmi_version = 1
+
+
+class Ball3Env(BallEnv, fmugym.FMI3MEEnv):
+    fmi_version = 3
 
 
 class TestEnvironments:
     BOTH = ("ModelExchange", "CoSimulation")
 
-    def test_an_episode(self, fmu_path):
-        env = BallEnv(fmu_path("ball"))
+    @pytest.mark.parametrize(("env_class", "version"), [(Ball1Env, 1), (BallEnv, 2), (Ball3Env, 3)])
+    def test_an_episode(self, fmu_path, env_class, version):
+        env = env_class(fmu_path("ball", version))
         env.reset(seed=3)
         first = env.state[0]
         terminated, steps = False, 0
@@ -455,9 +473,10 @@ class TestEnvironments:
         for env in (many, *singles):
             env.close()
 
+    @all_versions  # episodes of FMI 1.0, which has no FMU states, are played again
     @pytest.mark.parametrize("isolation", ["none", "process"])
-    def test_a_snapshot(self, fmu_path, isolation):
-        env = BallEnv(fmu_path("ball"), isolation=isolation)
+    def test_a_snapshot(self, fmu_path, version, isolation):
+        env = AnyBallEnv(fmu_path("ball", version), isolation=isolation)
         env.reset(seed=1)
         for _ in range(11):
             env.step(E)
@@ -467,8 +486,9 @@ class TestEnvironments:
         assert [env.step(E)[0].tolist() for _ in range(10)] == went_on
         env.close()
 
-    def test_an_fmu_with_both_interfaces_may_choose(self, fmu_path):
-        path = fmu_path("ball", interfaces=self.BOTH)
+    @with_states
+    def test_an_fmu_with_both_interfaces_may_choose(self, fmu_path, version):
+        path = fmu_path("ball", version, interfaces=self.BOTH)
         for interface in (None, "co_simulation", "model_exchange"):
             env = AnyBallEnv(path, interface=interface)
             assert env.fmu.description.interface == (interface or "co_simulation")
@@ -487,6 +507,8 @@ class TestEnvironments:
             BallEnv(fmu_path("ball", interfaces=("CoSimulation",)))
         with pytest.raises(FMULoadError, match=r"co-simulation.*model exchange"):
             AnyBallEnv(fmu_path("ball"), interface="co_simulation")
+        with pytest.raises(ConfigError, match=r"BallEnv.*FMI 3.*FMI3MEEnv"):
+            BallEnv(fmu_path("ball", 3))
 
     @pytest.mark.parametrize(
         "config", [{"solver": "rk45"}, {"solver": 4}, {"max_step": 0}, {"interface": "me"}]

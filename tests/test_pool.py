@@ -7,10 +7,11 @@ import fmpy
 import numpy as np
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu
+from wine_tools import for_windows
 
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
-from fmugym.archive.bundled import BUNDLED, MODELS
+from fmugym.archive.bundled import BUNDLED, MODELS, is_bundled
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.trial import opening
@@ -31,19 +32,25 @@ OPTIONS = {
     "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 2},
+    "wine": {"backend": "auto", "workers": 2},
 }
 """Of ``make_pool``, by implementation."""
 
 
 @pytest.fixture(params=OPTIONS)
-def make_pool(request):
+def make_pool(request, tmp_path):
     """Make pools of one implementation that are closed after the test."""
     if request.param == "native" and not pools.has_native_pool():
         pytest.skip("the C extension was not built")
+    in_wine = request.param == "wine"
+    if in_wine:
+        request.getfixturevalue("wine")
+        monkeypatch = request.getfixturevalue("monkeypatch")
+        monkeypatch.setattr(opening, "is_bundled", is_bundled_or_copy)
     made = []
 
     def make(path, inputs, outputs, num_instances=1, time_step=0.1, strings=None, **spec):
-        fmu = FMU(path)
+        fmu = FMU(for_windows(path, tmp_path) if in_wine else path)
         spec = PoolSpec(
             inputs=tuple(map(fmu.variable, inputs)),
             outputs=tuple(map(fmu.variable, outputs)),
@@ -60,6 +67,11 @@ def make_pool(request):
     yield make
     for pool in made:
         pool.close()
+
+
+def is_bundled_or_copy(path):
+    """Whether it is a bundled FMU, or its copy for Windows."""
+    return is_bundled(path) or path.stem.removeprefix("Windows") in MODELS
 
 
 @pytest.fixture(params=BUNDLED, ids="-".join)

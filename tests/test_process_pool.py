@@ -599,7 +599,7 @@ class TestPool:
 
     def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
         monkeypatch.setattr(
-            "fmugym.pool.process.supervisor.launch",
+            "fmugym.pool.process.transport.launch",
             lambda end, memory, *_: _SpawnedProcess(end, memory),
         )
         pool = make_pool()
@@ -653,7 +653,7 @@ class WorkerThread:
 @pytest.mark.parametrize("backend", ["auto", "python"])
 def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, backend):
     here = make_pool(3, isolation="none")
-    monkeypatch.setattr("fmugym.pool.process.supervisor.launch", WorkerThread)
+    monkeypatch.setattr("fmugym.pool.process.transport.launch", WorkerThread)
     pool = make_pool(3, backend=backend)
     with pytest.raises(SimulationError):
         pool.save()  # before the first reset

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -41,6 +42,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
+    SubprocVecEnv,
     VecMonitor,
     VecNormalize,
     is_vecenv_wrapped,
@@ -546,3 +548,56 @@ def test_ppo_learns_the_same_on_a_task_file_as_on_the_class():
         venv.close()
     for one, other in zip(*weights, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def task_file(folder):
+    """A task file with a warm-up, a sensor and figures."""
+    path = folder / "task.toml"
+    path.write_text(
+        """
+        fmu = { bundled = "Pendulum" }
+        time_step = "50ms"
+        episode_length = "0.5s"
+        warm_up = { period = "0.2s", controller = "pid of=q setpoint=goal kp=0.01" }
+        reward = "-abs(goal_error)"
+        [variables]
+        tau = { min = -0.01, max = 0.01, delay = "0.1s" }
+        q = { min = -4, max = 4, noise = 0.1, drop_out = 0.1 }
+        [setpoints]
+        goal = { value = { distribution = "uniform", low = -1, high = 1 }, of = "q" }
+        [agent]
+        actions = ["tau"]
+        observations = ["q", "goal_error"]
+        [kpis]
+        worst = { max = "abs(goal_error)" }
+        """
+    )
+    return path
+
+
+def test_a_task_file_in_spawned_workers(tmp_path):
+    """Stable-Baselines3's own workers, started anew, play what our vector environment plays."""
+    make = partial(gym.make, "fmugym:fmugym/FMU-v0", config=str(task_file(tmp_path)))
+    theirs = SubprocVecEnv([make, make], start_method="spawn")
+    ours = make_sb3_env("fmugym/FMU-v0", 2, config=str(tmp_path / "task.toml"))
+    theirs.seed(3)
+    ours.seed(3)
+    np.testing.assert_array_equal(theirs.reset(), ours.reset())
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        actions = rng.uniform(-0.01, 0.01, (2, 1)).astype(np.float32)
+        first, second = theirs.step(actions), ours.step(actions)
+        for one, other in zip(first[:3], second[:3], strict=True):
+            np.testing.assert_array_equal(one.astype(np.float32), other.astype(np.float32))
+        for one, other in zip(first[3], second[3], strict=True):
+            assert one["kpis"] == other["kpis"]
+    theirs.close()
+    ours.close()
+
+
+def test_an_agent_learns_on_a_task_file(tmp_path):
+    env = make_sb3_env("fmugym/FMU-v0", 4, config=str(task_file(tmp_path)))
+    model = sb3.PPO("MlpPolicy", env, n_steps=16, batch_size=32, seed=0, device="cpu")
+    model.learn(128)
+    assert model.num_timesteps == 128
+    env.close()

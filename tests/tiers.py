@@ -18,6 +18,7 @@ SLOW_MODULES = {
     "test_fuzz_face",
     "test_fuzz_hooks",
     "test_fuzz_signals",
+    "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_native_build",
@@ -78,6 +79,7 @@ SLOW_TESTS = (
     "test_crashes.py::test_the_call",
     "test_crashes.py::test_where",
     "test_crashes.py::test_without",
+    "test_declared.py::test_spawned",
     "test_examples_mpc.py::test_a_cell",
     "test_examples_mpc.py::test_it_swings",
     "test_examples_mpc.py::test_the_program_draws",
@@ -165,6 +167,14 @@ EXHAUSTIVE_TESTS = (
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 
 
+def is_in_wine(node_id):
+    """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
+    return (
+        node_id.startswith("test_windows_fmus.py::TestInWine")
+        or "wine" in node_id.partition("[")[2]
+    )
+
+
 def is_slow(node_id, number):
     """Whether the default run leaves out a test.
 
@@ -173,7 +183,11 @@ def is_slow(node_id, number):
         number: How many combinations of the same test came before.
     """
     module = node_id.partition(".py")[0]
-    if module in SLOW_MODULES or node_id.startswith(SLOW_TESTS + EXHAUSTIVE_TESTS):
+    if (
+        module in SLOW_MODULES
+        or node_id.startswith(SLOW_TESTS + EXHAUSTIVE_TESTS)
+        or is_in_wine(node_id)
+    ):
         return True
     return number % EVERY.get(module, EVERY_OF_OTHERS) > 0
 
@@ -181,6 +195,6 @@ def is_slow(node_id, number):
 def is_exhaustive(node_id, number):
     """Whether a slow test is left to ``.ci/full``; the arguments are those of ``is_slow``."""
     module = node_id.partition(".py")[0]
-    if node_id.startswith(EXHAUSTIVE_TESTS):
+    if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
     return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0

@@ -14,7 +14,7 @@ PAGES: Final = {
         "FMI1CSEnv",
         "FMI2CSEnv",
         "FMI3CSEnv",
-        "FMI2MEEnv",
+        *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
         "EnvConfig",
         "register",
     ),

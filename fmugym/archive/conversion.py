@@ -86,11 +86,6 @@ def _choose(source: Any, interface: str | None) -> tuple[str, Any]:
         wanted = wanted if interface else "co-simulation or model exchange"
         there = ", ".join(_interfaces(source)) or "none"
         raise FMULoadError(f"{source.modelName} has no interface for {wanted}; it offers: {there}")
-    if interface == "model_exchange" and source.fmiVersion[0] != "2":
-        raise FMULoadError(
-            f"{source.modelName} is for model exchange in FMI {source.fmiVersion}, which fmugym "
-            "runs in FMI 2.0; export it for co-simulation or in FMI 2.0"
-        )
     return interface, offers[interface]
 
 

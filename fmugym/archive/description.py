@@ -209,6 +209,11 @@ class ModelDescription:
         return int(self.fmi_version.split(".")[0])
 
     @property
+    def has_reset(self) -> bool:
+        """Whether the FMI version has a function for resets: FMI 1.0 has none in model exchange."""
+        return self.fmi_major_version > 1 or self.model_exchange is None
+
+    @property
     def platform(self) -> str:
         """The folder under ``binaries/`` for this machine; FMI 3.0 has other names for them."""
         return str(fmpy.platform_tuple if self.fmi_major_version == 3 else fmpy.platform)

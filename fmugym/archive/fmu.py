@@ -28,6 +28,7 @@ from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.checks import check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
+from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
 __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
 
@@ -37,6 +38,7 @@ DEFAULT_PROBE_TIMEOUT: Final = 60.0
 """Seconds that a call may take in the trial of an unknown FMU; for an initialization, ten times."""
 
 _NEVER_NEEDED: Final = {"documentation", "sources"}
+_WINDOWS_32: Final = {"win32", "x86-windows"}
 _MOST_FINDINGS: Final = 20
 """Findings that the log repeats; ``FMU.findings`` has all."""
 
@@ -48,7 +50,12 @@ class LoadableFMU(ABC):
         path: The ``.fmu`` file.
         description: The model description.
         preload: Shared libraries to load before the FMU's: absolute paths, or bare names.
+
+    Attributes:
+        in_wine: Whether the library is one for Windows that can only run in Wine here.
     """
+
+    in_wine = False
 
     def __init__(self, path: Path, description: ModelDescription, preload: tuple[str, ...]) -> None:
         self.path = path
@@ -61,13 +68,15 @@ class LoadableFMU(ABC):
     @property
     def platform(self) -> str:
         """The folder under ``binaries/`` that this machine needs."""
+        if self.in_wine:
+            return "x86_64-windows" if self.description.fmi_major_version == 3 else "win64"
         return self.description.platform
 
     @property
     def library(self) -> str:
         """The place of the library for this machine, relative to the folder of ``extract``."""
-        file_name = self.description.model_identifier + fmpy.sharedLibraryExtension
-        return f"binaries/{self.platform}/{file_name}"
+        suffix = ".dll" if self.in_wine else fmpy.sharedLibraryExtension
+        return f"binaries/{self.platform}/{self.description.model_identifier}{suffix}"
 
     @abstractmethod
     def extract(self) -> Path:
@@ -88,8 +97,13 @@ class LoadableFMU(ABC):
 
         Raises:
             FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
-                are missing.
+                are missing; or if it is a library for Windows, which needs a process in Wine.
         """
+        if self.in_wine:
+            raise FMULoadError(
+                f"{self.path.name} has no library for this platform. Environments run its library "
+                "for Windows in worker processes in Wine, but this process cannot load it"
+            )
         library = self.extract() / self.library
         for path in self.preload:
             load_globally(path)
@@ -173,11 +187,22 @@ class FMU(LoadableFMU):
         self._archive = SafeZip(file, self.limits)
         description = read_model_description(self._archive, self.limits, interface)
         super().__init__(file, description, libraries)
-        self._library_place, note = _find_library(list(self._archive.files), self.library)
+        self._library_place, note = self._choose_library()
         self.findings = (*self._archive.notes, *note, *self.description.findings)
         self._folder: Path | None = None
         self._remove_folder: weakref.finalize[..., FMU] | None = None
         self._log_findings()
+
+    def _choose_library(self) -> tuple[str | None, list[str]]:
+        """Find the library for this platform, or else one for Windows that can run here in Wine."""
+        places = list(self._archive.files)
+        found = _find_library(places, self.library)
+        if found[0] is not None or _libraries_in(places, self.library) or not can_run_windows():
+            return found
+        self.in_wine = True
+        in_wine = _find_library(places, self.library)
+        self.in_wine = bool(_libraries_in(places, self.library))
+        return in_wine if self.in_wine else found
 
     def _log_findings(self) -> None:
         if self.findings:
@@ -220,11 +245,15 @@ class FMU(LoadableFMU):
     def obstacles(self) -> tuple[str, ...]:
         """What keeps the FMU from being loaded on this machine, as texts with the cure.
 
-        There is no library for this platform or processor, or it needs shared libraries that are
-        missing here. Nothing of the FMU is loaded.
+        There is no library for this platform or processor, or it needs Wine or shared libraries
+        that are missing here. Nothing of the FMU is loaded.
         """
         try:
             self._check_library()
+            if self.in_wine and (obstacle := obstacle_to_wine()):
+                return (
+                    f"{self.path.name} has libraries for Windows only. To run them, {obstacle}",
+                )
             missing = self.missing_libraries
         except FMULoadError as error:
             return (str(error),)
@@ -234,12 +263,13 @@ class FMU(LoadableFMU):
     def missing_libraries(self) -> tuple[str, ...]:
         """The shared libraries that the FMU needs and this system does not have.
 
-        Empty where there is no library for this platform, and on systems other than Linux.
+        Empty where there is no library for this platform, and on systems other than Linux. What
+        libraries for Windows need is not known.
 
         Raises:
             FMULoadError: If a library of the FMU is damaged.
         """
-        if self._library_place is None:
+        if self._library_place is None or self.in_wine:
             return ()
         if self._folder is not None:
             return self._missing_in(self._folder)
@@ -291,16 +321,21 @@ class FMU(LoadableFMU):
     def _no_library(self) -> str:
         """Say which library is missing, and what there is instead."""
         folder, _, name = self.library.rpartition("/")
-        there = [p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), folder)]
+        there = [
+            p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), self.library)
+        ]
         if there:
             return (
                 f"{self.path.name} has {len(there)} libraries for this platform in {folder} "
                 f"({', '.join(there)}), but none is named {name}; give the right one that name"
             )
-        return (
+        text = (
             f"{self.path.name} has no library for this platform ({self.library}); it was built "
             f"for: {', '.join(self.platforms) or 'no platform at all'}"
         )
+        if can_run_windows() and {p.casefold() for p in self.platforms} & _WINDOWS_32:
+            text += ". Those for 32-bit Windows cannot run in Wine here; export for 64-bit Windows"
+        return text
 
     def _extract_to(self, folder: Path, only: str = "") -> None:
         """Extract the files that are needed, or those of one folder of them."""
@@ -347,8 +382,7 @@ def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[
     """
     if wanted in places:
         return wanted, []
-    folder = wanted.rpartition("/")[0]
-    there = _libraries_in(places, folder)
+    there = _libraries_in(places, wanted)
     same = [place for place in there if place.casefold() == wanted.casefold()]
     candidates = same or there
     if len(candidates) != 1:
@@ -356,9 +390,9 @@ def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[
     return candidates[0], [f"the library is {candidates[0]!r}, expected {wanted!r}; it is used"]
 
 
-def _libraries_in(places: Sequence[str], folder: str) -> list[str]:
-    """The libraries right in a folder, whose name may differ in case."""
-    suffix = fmpy.sharedLibraryExtension.casefold()
+def _libraries_in(places: Sequence[str], wanted: str) -> list[str]:
+    """The libraries right in the folder of the wanted one, whose name may differ in case."""
+    folder, suffix = wanted.rpartition("/")[0], os.path.splitext(wanted)[1].casefold()
     return [
         place
         for place in places

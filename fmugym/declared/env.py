@@ -15,7 +15,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.plan import Plan
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, shown, unknown_argument, unknown_name
 
 __all__ = ["TaskEnv", "fmu_path"]
 
@@ -138,11 +138,14 @@ def fmu_path(task: Task) -> Path:
 def _description(entry: Entry, path: Path) -> ModelDescription:
     try:
         status = path.stat()
-    except OSError:
+    except (OSError, ValueError):  # there is none, or no file could have such a name
         near = sorted(file.name for file in path.parent.glob("*.fmu"))
         folder = shown(str(path.parent))
         raise entry.error(f"{unknown_name('FMU', path.name, near)}; looked in {folder}") from None
-    return _read_description(path, status.st_mtime_ns, status.st_size)
+    try:
+        return _read_description(path, status.st_mtime_ns, status.st_size)
+    except FMULoadError as error:
+        raise type(error)(str(entry.error(error))) from error
 
 
 @lru_cache(maxsize=16)

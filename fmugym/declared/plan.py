@@ -211,7 +211,11 @@ class Plan:
         section = self._root.child("config")
         if section.value is None:
             return {}
-        return {key: entry.value for key, entry in section.table(_OF_CONFIG).items()}
+        own = section.table(_OF_CONFIG)
+        for key, entry in own.items():
+            with entry.placing():
+                EnvConfig((), ("any",), **{key: entry.value})  # which checks the value
+        return {key: entry.value for key, entry in own.items()}
 
     def _times(self) -> dict[str, Any]:
         times: dict[str, Any] = {"time_step": self._time_step}

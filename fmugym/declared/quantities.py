@@ -120,7 +120,7 @@ def _conversion_by_pint(own: str, wanted: str) -> Conversion:
         )
     except pint.DimensionalityError:
         raise ConfigError(
-            f"the unit {wanted!r} does not measure what the FMU's unit {own!r} measures"
+            f"the unit {shown(wanted)} does not measure what the FMU's unit {shown(own)} measures"
         ) from None
     return Conversion((large - zero) / _LARGE, zero)
 
@@ -140,4 +140,6 @@ def _parsed(name: str) -> Any:
     try:
         return _pint()[1].Unit(text)
     except Exception as error:  # pint passes on errors of the parsers that it uses
-        raise ConfigError(f"{name!r} is no unit that is known ({type(error).__name__})") from None
+        raise ConfigError(
+            f"{shown(name)} is no unit that is known ({type(error).__name__})"
+        ) from None

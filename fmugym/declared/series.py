@@ -9,8 +9,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,12 +20,12 @@ from fmugym.checks import check_option, check_path
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, reason, shown, unknown_name
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
 DATA_KEYS: Final = (
-    *("file", "column", "time", "values", "step", "period", "interpolation"),
+    *("file", "column", "time", "values", "times", "step", "period", "interpolation"),
     *("unit", "input", "min", "max"),
 )
 """The keys of a column of data."""
@@ -33,6 +34,11 @@ _DAY: Final = 86400.0
 _INTERPOLATIONS: Final = ("linear", "previous")
 _CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
 _NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
+
+_PARQUET: Final = (".parquet", ".pq")
+
+Cells = Sequence[Any]
+"""The cells of a column: texts of a CSV file, values of a Parquet file."""
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -108,7 +114,7 @@ def _require_rising(entry: Entry, times: FloatArray, values: FloatArray, period:
 
 
 def read_data(entry: Entry) -> Series:
-    """Read a column of a CSV file, or a list of values.
+    """Read a column of a CSV or Parquet file, or a list of values.
 
     Raises:
         ConfigError: If the file or the column is missing, or a cell is no number. The text says
@@ -129,8 +135,23 @@ def read_data(entry: Entry) -> Series:
 
 
 def _rows_of_list(entry: Entry) -> tuple[FloatArray, FloatArray]:
-    values = np.array([number(one) for one in entry.child("values").elements()])
-    return _even_times(entry.required("step"), len(values)), values
+    """The values of a list or an array, and their times."""
+    values, times = _listed(entry.child("values")), entry.child("times")
+    if (times.value is None) == (entry.child("step").value is None):
+        raise entry.error("give either the 'step' between the values, or their 'times'")
+    if times.value is None:
+        return _even_times(entry.child("step"), len(values)), values
+    moments = _listed(times)
+    if len(moments) != len(values):
+        raise times.error(f"there are {len(moments)} times, but {len(values)} values")
+    return moments, values
+
+
+def _listed(entry: Entry) -> FloatArray:
+    given = entry.value
+    if isinstance(given, list) and given and all(type(one) is float for one in given):
+        return np.array(given)  # long arrays take a while element by element
+    return np.array([number(one) for one in entry.elements()])
 
 
 def _even_times(step: Entry, count: int) -> FloatArray:
@@ -141,7 +162,7 @@ def _even_times(step: Entry, count: int) -> FloatArray:
 
 
 def _rows_of_file(entry: Entry) -> tuple[FloatArray, FloatArray]:
-    rows, column = _read_csv(entry.child("file")), entry.required("column")
+    rows, column = _read_file(entry.child("file")), entry.required("column")
     if column.text() not in rows:
         raise column.error(unknown_name("column", column.value, rows))
     values = _numbers(column, rows[column.value])
@@ -150,29 +171,48 @@ def _rows_of_file(entry: Entry) -> tuple[FloatArray, FloatArray]:
     return _times(entry, rows), values
 
 
-def _numbers(entry: Entry, cells: Sequence[str]) -> FloatArray:
+def _numbers(entry: Entry, cells: Cells) -> FloatArray:
     try:
         numbers = np.array(cells, np.float64)
-    except ValueError:
+    except (TypeError, ValueError):
         numbers = np.full(len(cells), np.nan)
     if not np.isfinite(numbers).all():
         numbers = np.array([_cell(entry, i, text) for i, text in enumerate(cells)])
     return numbers
 
 
-def _read_csv(file: Entry) -> Mapping[str, Sequence[str]]:
+def _read_file(file: Entry) -> Mapping[str, Cells]:
     """The cells of each column. Environments of one task read a file once."""
     path = check_path("file", file.text())
     try:
         status = path.stat()
         with file.placing():
-            return _columns(path, status.st_mtime_ns, status.st_size)
+            read = _read_parquet if path.suffix.lower() in _PARQUET else _read_csv
+            return read(path, status.st_mtime_ns, status.st_size)
     except OSError as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
 
 @lru_cache(maxsize=16)
-def _columns(path: Path, changed: int, size: int) -> Mapping[str, Sequence[str]]:
+def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
+    """Read a Parquet file, whose cells have types."""
+    try:
+        pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ImportError:
+        raise ConfigError(
+            f'{path.name} needs pyarrow: pip install "fmugym-toolbox[parquet]"'
+        ) from None
+    try:
+        table = parquet.ParquetFile(path).read()
+    except (pyarrow.ArrowException, ValueError) as error:
+        raise ConfigError(f"{path.name} is no Parquet file: {reason(error)}") from None
+    if not table.num_rows:
+        raise ConfigError(f"{path.name} has no rows")
+    return {name: table[name].to_pylist() for name in table.column_names}
+
+
+@lru_cache(maxsize=16)
+def _read_csv(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
     """Read a file. A semicolon separates cells where the first line has one."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -191,7 +231,7 @@ def _columns(path: Path, changed: int, size: int) -> Mapping[str, Sequence[str]]
     return dict(zip(names, zip(*rows, strict=True), strict=True))
 
 
-def _times(entry: Entry, rows: Mapping[str, Sequence[str]]) -> FloatArray:
+def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:
     """The times of the rows: seconds, or dates, which count from the beginning of their year."""
     name = entry.child("time")
     if name.value is not None and name.text() not in rows:
@@ -207,10 +247,10 @@ def _times(entry: Entry, rows: Mapping[str, Sequence[str]]) -> FloatArray:
     return _seconds(name, rows[column])
 
 
-def _seconds(entry: Entry, cells: Sequence[str]) -> FloatArray:
+def _seconds(entry: Entry, cells: Cells) -> FloatArray:
     if _is_number(cells[0]):
         return _numbers(entry, cells)
-    dates = [_date(entry, i, text.strip()) for i, text in enumerate(cells)]
+    dates = [_date(entry, i, cell) for i, cell in enumerate(cells)]
     start = dates[0].replace(month=1, day=1, hour=0, minute=0, second=0, microsecond=0)
     try:
         return np.array([(date - start).total_seconds() for date in dates])
@@ -218,28 +258,30 @@ def _seconds(entry: Entry, cells: Sequence[str]) -> FloatArray:
         raise entry.error("either all dates have a time zone, or none has") from None
 
 
-def _date(entry: Entry, index: int, text: str) -> datetime.datetime:
+def _date(entry: Entry, index: int, cell: Any) -> datetime.datetime:
+    if isinstance(cell, datetime.datetime):
+        return cell
     try:
-        return datetime.datetime.fromisoformat(text)
+        return datetime.datetime.fromisoformat(str(cell).strip())
     except ValueError:
         raise entry.error(
-            f"row {index + 2} of the column with times is {shown(text)}, expected seconds, or a "
+            f"row {index + 2} of the column with times is {shown(cell)}, expected seconds, or a "
             "date such as 2023-12-31 15:00"
         ) from None
 
 
-def _is_number(text: str) -> bool:
+def _is_number(cell: Any) -> bool:
     try:
-        float(text)
-    except ValueError:
+        float(cell)
+    except (TypeError, ValueError):
         return False
     return True
 
 
-def _cell(entry: Entry, index: int, text: str) -> float:
-    value = float(text) if _is_number(text) else math.nan
+def _cell(entry: Entry, index: int, cell: Any) -> float:
+    value = float(cell) if _is_number(cell) else math.nan
     if not math.isfinite(value):
-        raise entry.error(f"row {index + 2} of the column is {shown(text)}, expected a number")
+        raise entry.error(f"row {index + 2} of the column is {shown(cell)}, expected a number")
     return value
 
 

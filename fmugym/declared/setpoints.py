@@ -101,7 +101,8 @@ class SetPoints:
         if "of" in table:
             deviation = Deviation(entry.name, table["of"].text())
             self.deviations[f"{entry.name}_error"] = deviation
-            expression = Expression.parse(f"{deviation.setpoint} - {deviation.of}")
+            with table["of"].placing():
+                expression = Expression.parse(f"{deviation.setpoint} - {deviation.of}")
             limits = (-np.inf, np.inf)
             self.derived[f"{entry.name}_error"] = Derived(table["of"], expression, limits)
 

@@ -16,7 +16,7 @@ import numpy as np
 from fmugym.checks import check_integer, check_mapping, check_path
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
-from fmugym.declared.writing import as_toml
+from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 
@@ -145,7 +145,8 @@ class Task:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the task to a new TOML file. Reading the file gives an equal task.
 
-        Paths are written relative to the new file. What the task extends is written out.
+        Paths are written relative to the new file. What the task extends is written out. If the
+        task was read from a file, the comments of that file are kept.
 
         Args:
             path: The file, which must not exist.
@@ -155,7 +156,13 @@ class Task:
             FileExistsError: If the file exists.
         """
         file = check_path("the path of a task", path).absolute()
-        text = as_toml({"version": VERSION, **_relative(dict(self.document), file.parent)})
+        document = _relative(dict(self.document), file.parent)
+        own = self.sources[0]
+        if "version" not in document and (own.path is None or "version" in own.document):
+            document = {"version": VERSION, **document}
+        text = None if own.path is None else revised(own.text, document)
+        if text is None:
+            text = as_toml(document)
         with file.open("x", encoding="utf-8", newline="\n") as stream:
             stream.write(text)
 
@@ -193,6 +200,8 @@ def _advice(path: Path) -> str:
 def _check(source: Source) -> None:
     root = _root(source)
     root.table(KEYS)
+    if root.child("description").value is not None:
+        root.child("description").text()
     version = root.child("version")
     if version.value is not None:
         with version.placing():

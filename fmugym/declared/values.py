@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,7 +35,10 @@ def number_or_distribution(entry: Entry) -> Any:
     if is_distribution(entry.value):
         return entry.value
     if not isinstance(entry.value, Mapping):
-        return number(entry)
+        value = number(entry)
+        if not math.isfinite(value):
+            raise entry.error(f"expected a finite number, got {value}")
+        return value
     with entry.placing():
         items = check_mapping(entry.name, entry.value)
         for name in items.keys() - {"distribution", "values", "probabilities"}:

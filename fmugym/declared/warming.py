@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.variables import Record
-from fmugym.errors import unknown_name
+from fmugym.errors import shown, unknown_name
 
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
@@ -99,4 +99,8 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
     with entry.placing():
         if known and len(text.split()) == 1:
             raise unknown_name("controller", text, known)
-        return controller_of(text)
+        controller = controller_of(text)
+    for name in signals_of(controller):
+        if not name.isidentifier():
+            raise entry.error(f"{shown(name)} is no name of a variable; give it an alias")
+    return controller

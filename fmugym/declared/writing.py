@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, MutableMapping
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["as_toml"]
+__all__ = ["as_toml", "revised"]
+
+Keys = tuple[str, ...]
 
 _INLINE: Final = ("fmu", "clock", "warm_up")
 """Tables that describe one value; they are written in one line."""
@@ -38,7 +41,64 @@ def as_toml(document: Mapping[str, Any]) -> str:
     return str(tomlkit.dumps(written))
 
 
-def _item(value: Any, keys: tuple[str, ...]) -> Any:
+def revised(text: str, document: Mapping[str, Any]) -> str | None:
+    """Change the values of a TOML text, and keep its comments and its form.
+
+    Args:
+        text: The text of a file.
+        document: The values that it should have.
+
+    Returns:
+        The new text; None if it cannot be changed so that it has these values.
+
+    Raises:
+        ConfigError: As ``as_toml``.
+    """
+    import tomlkit
+    from tomlkit.exceptions import TOMLKitError
+
+    try:
+        written = tomlkit.parse(text)
+        _revise(written, document, ())
+        changed = tomlkit.dumps(written)
+        return changed if _same(tomllib.loads(changed), document) else None
+    except (TOMLKitError, tomllib.TOMLDecodeError, KeyError, ValueError):
+        return None
+
+
+def _revise(table: MutableMapping[str, Any], wanted: Mapping[str, Any], keys: Keys) -> None:
+    for key in [key for key in table if key not in wanted]:
+        del table[key]
+    for key, value in wanted.items():
+        present = table.get(key)
+        if isinstance(present, MutableMapping) and isinstance(value, Mapping):
+            _revise(present, value, (*keys, key))
+        elif key not in table or not _same(present, value):
+            table[key] = _new(value, (*keys, key))
+
+
+def _new(value: Any, keys: Keys) -> Any:
+    """A value for a document that has other values already."""
+    import tomlkit
+
+    if len(keys) > 1 or not isinstance(value, Mapping) or keys[0] in _INLINE:
+        return _item(value, keys)
+    table = tomlkit.table()
+    for name, one in value.items():
+        table.add(name, _item(one, (*keys, name)))
+    return table
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Whether two values are equal, and of the same kind."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return first.keys() == second.keys() and all(_same(first[k], second[k]) for k in first)
+    if isinstance(first, list) and isinstance(second, list):
+        return len(first) == len(second) and all(map(_same, first, second))
+    return bool(isinstance(first, bool) == isinstance(second, bool) and first == second)
+
+
+def _item(value: Any, keys: Keys) -> Any:
     import tomlkit
 
     if isinstance(value, Mapping):

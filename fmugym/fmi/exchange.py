@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from fmpy.fmi1 import FMU1Model, fmi1EventInfo
 from fmpy.fmi2 import FMU2Model, fmi2EventInfo
+from fmpy.fmi3 import FMU3Model
 
+from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
+from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.log import MessageLog, fmi1_callbacks, fmi3_log_message
 from fmugym.fmi.methods import State
 from fmugym.fmi.solver import CallError, Equations, Events, Memory, Mode, Solver, Solving
 from fmugym.fmi.status import Status, sane
 
-__all__ = ["ExchangeInstance", "FMI2ExchangeInstance"]
+__all__ = [
+    "ExchangeInstance",
+    "FMI1ExchangeInstance",
+    "FMI2ExchangeInstance",
+    "FMI3ExchangeInstance",
+]
 
 
 class ExchangeInstance(Instance):
@@ -121,7 +132,7 @@ class ExchangeInstance(Instance):
 
 
 class FMUEquations(Equations):
-    """The functions that FMI 2.0 and 3.0 have in common, with arguments prepared once.
+    """The functions that FMI versions have in common, with arguments prepared once.
 
     Args:
         instance: The instance.
@@ -207,6 +218,34 @@ class FMUEquations(Equations):
         return list(self._numbers[:count])
 
 
+class _FMI1Equations(FMUEquations):
+    """FMI 1.0 has no modes and no directional derivatives."""
+
+    def enter_events(self) -> None:
+        """Do nothing."""
+
+    def enter_continuous(self) -> None:
+        """Do nothing."""
+
+    def get_nominals(self) -> State:
+        return self._get("GetNominalContinuousStates", self._numbers, self.number_of_states)
+
+    def update(self) -> Events:
+        info = fmi1EventInfo()
+        self._call("EventUpdate", ctypes.c_char(0), ctypes.byref(info))
+        return events(
+            not _truth(info.iterationConverged),
+            _truth(info.terminateSimulation),
+            _truth(info.upcomingTimeEvent),
+            info.nextEventTime,
+        )
+
+    def complete(self) -> tuple[bool, bool]:
+        event = ctypes.c_char(0)
+        self._call("CompletedIntegratorStep", ctypes.byref(event))
+        return _truth(event.value), False
+
+
 class _FMI2Equations(FMUEquations):
     def update(self) -> Events:
         info = fmi2EventInfo()
@@ -224,10 +263,80 @@ class _FMI2Equations(FMUEquations):
         return bool(event.value), bool(terminate.value)
 
 
-def events(again: int, terminate: int, has_next: int, next_event: float) -> Events:
+class _FMI3Equations(FMUEquations):
+    def get_rates(self) -> State:
+        return self._get("GetContinuousStateDerivatives", self._numbers, self.number_of_states)
+
+    def update(self) -> Events:
+        flags, next_event = (ctypes.c_bool * 5)(), ctypes.c_double()
+        first = ctypes.addressof(flags)
+        places = [ctypes.c_void_p(first + i) for i in range(5)]
+        self._call("UpdateDiscreteStates", *places, ctypes.byref(next_event))
+        return events(flags[0], flags[1], flags[4], next_event.value)
+
+    def complete(self) -> tuple[bool, bool]:
+        event, terminate = ctypes.c_bool(False), ctypes.c_bool(False)
+        self._call(
+            "CompletedIntegratorStep",
+            ctypes.c_bool(False),
+            ctypes.byref(event),
+            ctypes.byref(terminate),
+        )
+        return event.value, terminate.value
+
+
+def events(again: bool, terminate: bool, has_next: bool, next_event: float) -> Events:
     """Make ``Events``; a time that is not a number is none."""
     known = has_next and next_event == next_event
     return Events(bool(again), bool(terminate), next_event if known else float("inf"))
+
+
+def _truth(value: bytes) -> bool:
+    """FMI 1.0 has characters as Booleans."""
+    return value != b"\0"
+
+
+class _FMI1Model(FMI1Instance):
+    """The calls of FMI 1.0 model exchange that are not those of co-simulation."""
+
+    _SLAVE_FUNCTIONS: ClassVar = {"FreeInstance": "FreeModelInstance"}
+
+    @classmethod
+    def mend(cls, slave: Any) -> None:
+        """Do nothing: FMPy declares the results of these functions as it should."""
+
+    def _instantiate(self, log: MessageLog, logging: bool) -> None:
+        self._slave.component = self._slave.fmi1InstantiateModel(
+            self._slave.instanceName.encode(), self._slave.guid.encode(), fmi1_callbacks, logging
+        )
+
+    def _find_reset(self) -> Callable[[Any], int]:
+        return lambda _: Status.ERROR  # FMI 1.0 has no such function
+
+    def _prepare_initialization(self) -> Initialize:
+        set_time = self._function("SetTime", ctypes.c_void_p, ctypes.c_double)
+        initialize = self._function(
+            "Initialize", ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p
+        )
+
+        def run(span: Span, set_start_values: Callable[[], None]) -> None:
+            set_start_values()
+            has_tolerance, tolerance = span.tolerances
+            info = fmi1EventInfo()
+            status = set_time(self._component, span.start_time)
+            if sane(status) <= Status.WARNING:
+                flag, place = bytes([has_tolerance]), ctypes.byref(info)
+                status = initialize(self._component, flag, tolerance, place)
+            self.check("initialization", status)
+
+        return run
+
+
+class FMI1ExchangeInstance(ExchangeInstance, _FMI1Model):
+    """FMI 1.0 model exchange."""
+
+    slave_class = FMU1Model
+    equations_class = _FMI1Equations
 
 
 class FMI2ExchangeInstance(ExchangeInstance, FMI2Instance):
@@ -235,3 +344,26 @@ class FMI2ExchangeInstance(ExchangeInstance, FMI2Instance):
 
     slave_class = FMU2Model
     equations_class = _FMI2Equations
+
+
+class _FMI3Model(FMI3Instance):
+    """The call of FMI 3.0 model exchange that is not that of co-simulation."""
+
+    def _instantiate(self, log: MessageLog, logging: bool) -> None:
+        resources = os.path.join(self._slave.unzipDirectory, "resources", "")
+        self._slave.component = self._slave.fmi3InstantiateModelExchange(
+            self._slave.instanceName.encode(),
+            self._slave.guid.encode(),
+            resources.encode(),
+            False,  # visible
+            logging,
+            log.environment,
+            fmi3_log_message,
+        )
+
+
+class FMI3ExchangeInstance(ExchangeInstance, _FMI3Model):
+    """FMI 3.0 model exchange."""
+
+    slave_class = FMU3Model
+    equations_class = _FMI3Equations

@@ -90,7 +90,7 @@ class Instance(ABC):
         self._may_return = False  # to an earlier state; FMI tells the FMU whether this may happen
         self.step = self._prepare_step()
         self._initialize = self._prepare_initialization()
-        self._reset_function = self._function("Reset")
+        self._reset_function = self._find_reset()
 
     def _instantiate_checked(self) -> None:
         failure = self._try_to_instantiate()
@@ -178,6 +178,10 @@ class Instance(ABC):
 
     @abstractmethod
     def _prepare_initialization(self) -> Initialize: ...
+
+    def _find_reset(self) -> Callable[[Any], int]:
+        function: Callable[[Any], int] = self._function("Reset")
+        return function
 
     # The parts that the versions share.
 

@@ -12,7 +12,11 @@ import fmpy
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.fmi.exchange import FMI2ExchangeInstance
+from fmugym.fmi.exchange import (
+    FMI1ExchangeInstance,
+    FMI2ExchangeInstance,
+    FMI3ExchangeInstance,
+)
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.fmi3 import FMI3Instance
@@ -26,7 +30,9 @@ _INSTANCE_CLASSES: Final[dict[tuple[int, str], type[Instance]]] = {
     (1, "co_simulation"): FMI1Instance,
     (2, "co_simulation"): FMI2Instance,
     (3, "co_simulation"): FMI3Instance,
+    (1, "model_exchange"): FMI1ExchangeInstance,
     (2, "model_exchange"): FMI2ExchangeInstance,
+    (3, "model_exchange"): FMI3ExchangeInstance,
 }
 _load_lock = threading.Lock()
 

@@ -14,14 +14,12 @@ conversion:
 from __future__ import annotations
 
 import logging
-import math
-import os
 import shutil
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +27,7 @@ import numpy.typing as npt
 from fmugym import _native
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import LoadableFMU
-from fmugym.errors import FMULoadError, SimulationError, printable
-from fmugym.fmi.status import Status
-from fmugym.fmi.words import quoted, unpacked
+from fmugym.errors import FMULoadError, SimulationError
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
     FloatArray,
@@ -47,39 +43,24 @@ from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
 from fmugym.pool.pacing import last_initialization
+from fmugym.pool.reports import Failure, as_record, describe_failure, loading_failed
 from fmugym.pool.saving import SavingPool, Serialized
-from fmugym.pool.spec import SAMPLINGS, ResetMethod
+from fmugym.pool.settings import (
+    PlaceOfFMU,
+    experiment_settings,
+    library_settings,
+    record_from,
+    solving_settings,
+    types_and_references,
+    variable_settings,
+    variables_of,
+)
+from fmugym.pool.spec import ResetMethod
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
 
-_TYPES: Final = (
-    "Float64",
-    "Float32",
-    "Int8",
-    "Int16",
-    "Int32",
-    "Int64",
-    "UInt8",
-    "UInt16",
-    "UInt32",
-    "UInt64",
-    "Boolean",
-)
-"""The C types in the order of ``enum Type`` of ``native/fmi.h``."""
-
-_OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
-_LEVELS: Final = (
-    logging.INFO,
-    logging.WARNING,
-    logging.WARNING,
-    logging.ERROR,
-    logging.CRITICAL,
-)
 _MOST_CACHED: Final = 64
-_NO_STRING: Final = 2**32 - 1
-_SAID: Final = "\x1d"
-"""Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 
 FloatArray32 = npt.NDArray[np.float32]
 
@@ -129,6 +110,7 @@ class NativePool(SavingPool):
         mark: Mark | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
+        spec = spec.fitting(fmu.description)
         if private_libraries is None:
             once = capabilities.can_be_instantiated_only_once_per_process
             private_libraries = once and num_instances > 1
@@ -160,50 +142,29 @@ class NativePool(SavingPool):
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
-        method = spec.reset_method
         paths = [fmu.prepare_library()]
         folder = fmu.extract()
         if private_libraries:
             paths = _copy_library(folder, Path(fmu.library), self.num_instances)
+        place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
         try:
             return _native.Pool(
-                library={
-                    "version": description.fmi_major_version,
-                    "model": description.model_identifier.encode(),
-                    "token": description.instantiation_token.encode(),
-                    "resources": _resources(folder, description.fmi_major_version),
-                    "paths": tuple(os.fsencode(path) for path in paths),
-                    "private": private_libraries,
-                    "logging": log.isEnabledFor(logging.INFO),
-                    "states": description.capabilities.can_get_and_set_fmu_state,
-                    "categories": tuple(c.encode() for c in description.error_categories),
-                    "mark": None if self._mark is None else self._mark.page,
-                    "solving": _solving(description, spec),
-                },
-                experiment={
-                    "start_time": spec.start_time,
-                    "stop_time": spec.stop_time,
-                    "tolerance": spec.tolerance,
-                    "time_step": spec.time_step,
-                    "substeps": spec.substeps,
-                    "warm_up_steps": spec.warm_up_steps,
-                    "retries": spec.fault_retries,
-                    "restores": method == ResetMethod.RESTORE,
-                    "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
-                    "reloads": method == ResetMethod.LIBRARY,
-                    "one_initialization": spec.one_initialization,
-                    "pace": spec.initialization_interval,
-                    "start_outputs": (
-                        np.array(spec.start_outputs).tobytes() if spec.blind_start else None
-                    ),
-                },
-                variables={
-                    "inputs": self._access(spec.inputs),
-                    "outputs": self._access(spec.outputs),
-                    "num_observed": spec.num_observed,
-                    "strings": tuple((v.value_reference, t.encode()) for v, t in spec.strings),
-                    "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
-                },
+                library=cast(
+                    "_native.Library",
+                    library_settings(description, place)
+                    | {
+                        "private": private_libraries,
+                        "logging": log.isEnabledFor(logging.INFO),
+                        "mark": None if self._mark is None else self._mark.page,
+                        "solving": solving_settings(description, spec),
+                    },
+                ),
+                experiment=cast("_native.Experiment", experiment_settings(spec)),
+                variables=cast(
+                    "_native.Variables",
+                    variable_settings(spec)
+                    | {"inputs": self._access(spec.inputs), "outputs": self._access(spec.outputs)},
+                ),
                 arrays={
                     "inputs": self.inputs,
                     "outputs": self.outputs,
@@ -218,10 +179,7 @@ class NativePool(SavingPool):
                 listener=self._listener,
             )
         except OSError as error:
-            reason, _, said = str(error).partition(_SAID)
-            raise FMULoadError(
-                f"{fmu.path.name} cannot be loaded: {reason}{quoted(unpacked(said))}"
-            ) from None
+            raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""
@@ -230,10 +188,9 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
-            types = bytes(_type_number(variable, version) for variable in variables)
-            references = np.array([v.value_reference for v in variables], np.uint32)
             is_exchange = self._fmu.description.model_exchange is not None
-            access = _native.Access(version, types, references.tobytes(), is_exchange)
+            parts = types_and_references(variables, version)
+            access = _native.Access(version, *parts, is_exchange)
             self._accesses[variables] = access
         return access
 
@@ -288,27 +245,8 @@ class NativePool(SavingPool):
         failure = self._open_pool().failure(index)
         if failure is None:
             return ""
-        doing, in_warm_up, status, time, string, said, values = failure
-        if values is not None:
-            variables = self._spec.inputs if "inputs" in doing else self._spec.outputs
-            return f"{doing}: {_not_finite(variables, values)}"
-        text = self._sentence(index, doing, status, time, string)
-        text += quoted(unpacked(said))
-        return f"the warm-up failed: {text}" if in_warm_up else text
-
-    def _sentence(self, index: int, doing: str, status: int, time: float, string: int) -> str:
-        if not math.isnan(time):
-            doing = f"the step at t = {time:g} s"
-        elif string != _NO_STRING:
-            doing = f"setting {self._string_name(string)!r}"
-        if status < 0:  # the call was refused, and the text is a whole sentence
-            return doing
-        label = Status(status).name.capitalize()
         name = f"{self._fmu.description.model_identifier}_{self._first_index + index}"
-        return f"{name}: {doing} returned {label}"
-
-    def _string_name(self, reference: int) -> str:
-        return next(v.name for v, _ in self._spec.strings if v.value_reference == reference)
+        return describe_failure(Failure(*failure), self._spec, name)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
@@ -365,14 +303,7 @@ class NativePool(SavingPool):
         found = self._open_pool().record_of(index)
         if found is None:
             return None
-        starts, steps, inputs = found
-        types, references, values = zip(*starts, strict=True) if starts else ((), (), ())
-        variables = self._listener.variables(bytes(types), list(references))
-        return Record(
-            tuple(variable.name for variable in variables),
-            np.array(values, np.float64),
-            np.frombuffer(inputs).reshape(steps, len(self._spec.inputs)),
-        )
+        return record_from(self._fmu.description, self._spec, *found)
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
@@ -651,10 +582,9 @@ class _Receiver:
         self._log, self._model, self._first_index = log, model, first_index
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
-        level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
-        number = self._first_index + index
-        texts = printable(category), printable(message)
-        self._log.log(level, "%s_%d: [%s] %s", self._model, number, *texts)
+        name = f"{self._model}_{self._first_index + index}"
+        level, text = as_record(name, status, category, message)
+        self._log.log(level, "%s", text)
 
 
 class _Listener:
@@ -681,7 +611,7 @@ class _Listener:
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
         return Tape(
-            self.variables(types, np.frombuffer(references, np.uint32).tolist()),
+            variables_of(self._description, types, np.frombuffer(references, np.uint32).tolist()),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),
@@ -689,61 +619,9 @@ class _Listener:
             np.frombuffer(statuses, np.int8),
         )
 
-    def variables(self, types: bytes, references: list[int]) -> tuple[Variable, ...]:
-        """Find variables; aliases are as good."""
-        version = self._description.fmi_major_version
-        known = {
-            (_type_number(v, version), v.value_reference): v
-            for v in self._description.variables.values()
-            if v.numeric
-        }
-        return tuple(known[pair] for pair in zip(types, references, strict=True))
-
-
-def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
-    pairs = zip(variables, np.frombuffer(values).tolist(), strict=True)
-    bad = (f"{v.name} = {value}" for v, value in pairs if not math.isfinite(value))
-    return printable(", ".join(bad))
-
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:
     return None if mask is None else np.asarray(mask, np.bool_)
-
-
-def _type_number(variable: Variable, version: int) -> int:
-    if variable.kind == "enumeration":
-        return _TYPES.index("Int64" if version == 3 else "Int32")
-    return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
-
-
-def _resources(folder: Path, version: int) -> bytes:
-    """The location of its resources that an FMU gets; each FMI version has a different form."""
-    if version == 1:
-        return folder.as_uri().encode()
-    if version == 2:
-        return (folder / "resources").as_uri().encode()
-    return os.path.join(folder, "resources", "").encode()
-
-
-def _solving(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
-    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
-    model = description.model_exchange
-    if model is None:
-        return None
-    solving, states, rates = spec.solving, None, None
-    if description.capabilities.provides_directional_derivatives and model.state_references:
-        states = np.array(model.state_references, np.uint32).tobytes()
-        rates = np.array(model.derivative_references, np.uint32).tobytes()
-    return (
-        solving.solver.encode(),
-        solving.tolerance,
-        solving.max_step,
-        model.number_of_states,
-        model.number_of_event_indicators,
-        model.needs_completed_integrator_step,
-        states,
-        rates,
-    )
 
 
 def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:

@@ -24,7 +24,7 @@ from fmugym.pool.extension import has_native_pool
 from fmugym.pool.locks import exclusively
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["Pacer", "last_initialization"]
+__all__ = ["Pacer", "last_initialization", "pace_file"]
 
 TimeArray = npt.NDArray[np.int64]
 
@@ -44,9 +44,9 @@ def last_initialization(spec: PoolSpec) -> TimeArray:
     Raises:
         ConfigError: If the file cannot be made.
     """
-    if not spec.locks or spec.initialization_interval == 0.0:
+    path = pace_file(spec)
+    if path is None:
         return np.zeros(1, np.int64)
-    path = Path(f"{spec.locks}.pace")
     try:
         with exclusively(_mutex(spec)):
             return _opened(path)[:1]
@@ -54,6 +54,12 @@ def last_initialization(spec: PoolSpec) -> TimeArray:
         raise ConfigError(
             f"config key 'max_initializations_per_second' needs the file {path}: {error}"
         ) from None
+
+
+def pace_file(spec: PoolSpec) -> Path | None:
+    """The file of ``last_initialization``; None if the pace is not limited for all environments."""
+    is_limited = bool(spec.locks) and spec.initialization_interval > 0.0
+    return Path(f"{spec.locks}.pace") if is_limited else None
 
 
 def _mutex(spec: PoolSpec) -> Path:

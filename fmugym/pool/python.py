@@ -62,7 +62,7 @@ class PythonPool(SavingPool):
         mark: Mark | None = None,
     ) -> None:
         self.num_instances = num_instances
-        self._spec = spec
+        self._spec = spec = spec.fitting(fmu.description)
         # One row per instance, so that the FMU reads and writes this memory without a copy.
         input_rows = np.zeros((num_instances, len(spec.inputs)))
         output_rows = np.zeros((num_instances, len(spec.outputs)))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from fmugym.archive.description import Variable
+from fmugym.archive.description import ModelDescription, Variable
 from fmugym.fmi.methods import METHODS
 from fmugym.fmi.solver import Solving
 
@@ -147,6 +147,15 @@ class PoolSpec:
     def start_outputs(self) -> tuple[float, ...]:
         """The start values of the outputs in the model description; 0 where it has none."""
         return tuple(variable.start_number for variable in self.outputs)
+
+    def fitting(self, description: ModelDescription) -> PoolSpec:
+        """The spec for this FMU: one that has no function for resets is instantiated anew."""
+        if description.has_reset or self.reset_method not in (
+            ResetMethod.RESTORE,
+            ResetMethod.RESET,
+        ):
+            return self
+        return replace(self, reset_method=ResetMethod.INSTANCE)
 
     @property
     def solving(self) -> Solving:

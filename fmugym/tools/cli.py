@@ -36,6 +36,7 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``platforms``: the folders under ``binaries/``
 - ``platform``, ``library``: the folder and the file that this machine needs
 - ``runs_here``: whether nothing is known that would keep the FMU from being loaded
+- ``in_wine``: whether its library is one for Windows, which runs in Wine here
 - ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
   with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``

@@ -64,6 +64,7 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         "platform": fmu.platform,
         "library": fmu.library,
         "runs_here": fmu.runs_here,
+        "in_wine": fmu.in_wine,
         "obstacles": list(fmu.obstacles),
         "missing_libraries": [_library_row(name) for name in _missing_libraries(fmu)],
         "missing_tool": missing_tool(
@@ -213,7 +214,8 @@ def _this_machine(facts: Mapping[str, Any]) -> str:
     platform, tool = facts["platform"], facts["missing_tool"]
     if not facts["runs_here"]:
         return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
-    return f"{platform}: runs here" + (f" if it is installed: {tool}" if tool else "")
+    how = "runs here, in Wine" if facts["in_wine"] else "runs here"
+    return f"{platform}: {how}" + (f" if it is installed: {tool}" if tool else "")
 
 
 def _first_meeting(trial: Mapping[str, Any] | None) -> str:

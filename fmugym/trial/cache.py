@@ -9,10 +9,11 @@ import contextlib
 import logging
 import os
 import stat
-import sys
 import tempfile
 from pathlib import Path
 from typing import Final
+
+from fmugym.caching import cache_folder
 
 __all__ = ["cache_folder", "recall", "remember"]
 
@@ -23,27 +24,6 @@ _LARGEST: Final = 2**20
 
 _READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Do not follow links, and do not wait for a pipe's writer; Windows has no such flags."""
-
-
-def cache_folder() -> Path:
-    """Return ``FMUGYM_CACHE_DIR``, or else ``fmugym`` in the system's folder for caches.
-
-    The system's folder is ``XDG_CACHE_HOME`` or ``~/.cache``; on macOS ``~/Library/Caches``; on
-    Windows ``LOCALAPPDATA``.
-
-    Raises:
-        RuntimeError: If the user has no home folder.
-    """
-    given = os.environ.get("FMUGYM_CACHE_DIR")
-    return Path(given).expanduser() if given else _system_folder() / "fmugym"
-
-
-def _system_folder() -> Path:
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    name = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    given = os.environ.get(name, "")
-    return Path(given) if os.path.isabs(given) else Path.home() / ".cache"
 
 
 def recall(key: str) -> str | None:

@@ -23,12 +23,12 @@ from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
-from fmugym.pool.local import local_pool
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.patience import licence_errors, require_licence
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
+from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.trial import Candidate
 
@@ -136,7 +136,7 @@ def _run(
     """Step instances of a fresh copy in turn; return the outputs of the first one."""
     count = len(inputs)
     fmu = candidate.open()
-    pool = local_pool(fmu, spec, count, logger, threads=1, private_libraries=private_libraries)
+    pool = trial_pool(fmu, spec, count, logger, private_libraries=private_libraries)
     both = starts.apart()  # a caller may give each environment its own value of a fixed parameter
     values = np.hstack([both.column(0), both.column(1)])[:, :count]
     try:

@@ -41,6 +41,7 @@ from fmugym.trial.trial import (
     state_files,
 )
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
+from fmugym.wine.prefix import Wine
 
 __all__ = ["make_pool"]
 
@@ -104,11 +105,8 @@ def make_pool(
             raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
         return BackendPool(fmu, spec, num_instances, backend)
     native = _is_native(backend)
-    if isolation not in (None, *ISOLATIONS):
-        raise unknown_name("isolation", isolation, ISOLATIONS)
-    if reset_method not in (None, *ResetMethod):
-        raise unknown_name("reset method", reset_method, list(map(str, ResetMethod)))
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
+    plan = plan.checked(fmu, backend)
     spec = _with_locks(fmu, spec)
 
     def attempt() -> Pool:
@@ -132,6 +130,33 @@ def make_pool(
         return pool
 
     return Patience(spec.licence_wait, log).call(attempt)
+
+
+def _prepare_wine(
+    fmu: FMU, backend: str, private_libraries: bool | None, isolation: str | None
+) -> None:
+    """Refuse what is not possible in Wine, and make ready what every worker needs.
+
+    Raises:
+        FMULoadError: If Wine or something else is missing, or a wish cannot be granted.
+    """
+    wishes = {
+        "backend='python'": backend == "python",
+        "private_libraries": private_libraries,
+        "isolation='none'": isolation == "none",
+        "preload": fmu.preload,
+    }
+    refused = [wish for wish, is_given in wishes.items() if is_given]
+    try:
+        if refused:
+            raise FMULoadError(
+                f"{fmu.path.name} has libraries for Windows only, which run here in worker "
+                f"processes in Wine, but this leaves no choice for: {', '.join(refused)}"
+            )
+        Wine.ready()
+    except BaseException:
+        fmu.close()
+        raise
 
 
 def _with_locks(fmu: FMU, spec: PoolSpec) -> PoolSpec:
@@ -298,6 +323,17 @@ class _Plan:
     one_initialization: bool = False
     state_files: str = ""
     own_files: bool = False
+
+    def checked(self, fmu: FMU, backend: str) -> _Plan:
+        """Refuse unknown names; in Wine, refuse what is not possible there."""
+        if self.isolation not in (None, *ISOLATIONS):
+            raise unknown_name("isolation", self.isolation, ISOLATIONS)
+        if self.reset_method not in (None, *ResetMethod):
+            raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
+        if not fmu.in_wine:
+            return self
+        _prepare_wine(fmu, backend, self.private_libraries, self.isolation)
+        return replace(self, native=True, threads=1, private_libraries=None, isolation="process")
 
     @property
     def method(self) -> ResetMethod:

@@ -21,10 +21,10 @@ from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import FloatArray, Pool
-from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import moving_inputs
+from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import Candidate
 from fmugym.trial.verdict import Grade
 
@@ -203,12 +203,11 @@ class Rehearsal:
 
     def _open(self, method: ResetMethod) -> AttendedPool:
         log = logging.getLogger(__name__)
-        return local_pool(
+        return trial_pool(
             self._candidate.open(),
             replace(self._spec, reset_method=method),
             1,
             log,
-            threads=1,
             private_libraries=method is ResetMethod.LIBRARY,
         )
 

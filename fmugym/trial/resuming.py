@@ -18,12 +18,12 @@ from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.bundle import Bundle, SaveMethod
-from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.saving import SavingPool
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.inputs import moving_inputs
+from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.trial import Candidate, Request, known_resuming, note_resuming, run
 from fmugym.trial.verdict import Grade
@@ -143,7 +143,7 @@ def _open(request: Request) -> SavingPool:
         reset_method=ResetMethod.RESTORE,
         state_files="",
     )
-    return local_pool(request.candidate.open(), spec, 1, logger, threads=1)
+    return trial_pool(request.candidate.open(), spec, 1, logger)
 
 
 def _play(pool: SavingPool, request: Request, amplitude: float) -> Halfway | None:

@@ -21,19 +21,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
-from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.process.output import print_line_by_line
+from fmugym.pool.process.windows import ProgramCoding
 from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
+from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
 from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
 from fmugym.trial.trial import FRUGAL, Request, Stage, patience
@@ -126,7 +127,7 @@ def _try(request: Request, notes: Notes) -> None:
 
 def _initializations() -> int:
     """How many initializations this process has begun."""
-    count: int = Instance.initializations
+    count: int = Instance.initializations + ProgramCoding.initializations
     if has_native_pool():
         from fmugym import _native
 
@@ -179,7 +180,7 @@ def _step_once(request: Request, native: bool, notes: Notes) -> None:
         interval, locks = request.spec.initialization_interval, request.spec.locks
         spec = replace(spec, initialization_interval=interval, locks=locks)
     notes.stage("loading and instantiation")
-    pool = local_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native, threads=1)
+    pool = trial_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native)
     try:
         _reset_and_step(pool, spec, notes)
     finally:
@@ -263,10 +264,15 @@ def _try_resuming(request: Request, notes: Notes) -> None:
 
 def _methods(request: Request) -> list[ResetMethod]:
     """The methods to try in this process; only the native pool can load libraries anew."""
-    able = request.candidate.open().description.capabilities.can_get_and_set_fmu_state
+    fmu = request.candidate.open()
+    able = fmu.description.capabilities.can_get_and_set_fmu_state
     methods = [ResetMethod.RESTORE] if able else []
     methods += [ResetMethod.RESET, ResetMethod.INSTANCE]
-    return [*methods, ResetMethod.LIBRARY] if has_native_pool() else methods
+    return [*methods, ResetMethod.LIBRARY] if _can_copy_libraries(fmu) else methods
+
+
+def _can_copy_libraries(fmu: FMU) -> bool:
+    return has_native_pool() and not fmu.in_wine
 
 
 def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
@@ -287,7 +293,8 @@ def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
 def _need_of_several(request: Request, notes: Notes) -> Neighbours:
     """Find the cheapest way to keep instances from disturbing each other."""
     if request.alone or _disturbed(request, notes, private_libraries=False):
-        copies = has_native_pool() and not _disturbed(request, notes, private_libraries=True)
+        copies = _can_copy_libraries(request.candidate.open())
+        copies = copies and not _disturbed(request, notes, private_libraries=True)
         return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
     if not _disturbed_in_threads(request, notes, Stage.THREADS):
         return Neighbours.INDEPENDENT

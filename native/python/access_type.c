@@ -5,7 +5,8 @@
 PyTypeObject *access_type;
 
 const Fmi *fmi_of(int version, bool exchange) {
-    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3}, {NULL, &exchange2, NULL}};
+    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3},
+                                              {&exchange1, &exchange2, &exchange3}};
 
     if (version < 1 || version > 3) {
         PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);

@@ -374,19 +374,14 @@ static bool take_strings(PyPool *self, PyObject *strings) {
 }
 
 static bool take_method(const char *name, Solving *solving) {
-    static const Method *const methods[] = {&euler, &rk4, &dormand_prince, &rosenbrock};
-
-    for (size_t i = 0; i < sizeof methods / sizeof *methods; i++) {
-        if (strcmp(methods[i]->name, name) == 0) {
-            solving->method = methods[i];
-            return true;
-        }
+    solving->method = method_of(name);
+    if (solving->method == NULL) {
+        PyErr_Format(PyExc_ValueError, "there is no solver %s", name);
     }
-    PyErr_Format(PyExc_ValueError, "there is no solver %s", name);
-    return false;
+    return solving->method != NULL;
 }
 
-/* Takes the tuple that fmugym/pool/native.py makes. The references stay in the pool's arguments. */
+/* Takes the tuple that fmugym/pool/settings.py makes. The references stay in the pool's arguments. */
 static bool take_solving(PyObject *tuple, Solving *solving) {
     const char *method, *states, *rates;
     Py_ssize_t count, indicators, states_size, rates_size;

@@ -178,3 +178,52 @@ int core_do_step(Model *me, double time, double step) {
     }
     return OK;
 }
+
+/* FMU states */
+
+int core_get_state(Model *me, void **state) {
+    if (*state == NULL) {
+        *state = malloc(sizeof *me);
+    }
+    memcpy(*state, me, sizeof *me);
+    return OK;
+}
+
+int core_set_state(Model *me, const void *state) {
+    Model kept = *me;
+
+    memcpy(me, state, sizeof *me);
+    memcpy(me->name, kept.name, sizeof kept.name);
+    me->logger = kept.logger;
+    me->environment = kept.environment;
+    return OK;
+}
+
+int core_free_state(void **state) {
+    free(*state);
+    *state = NULL;
+    return OK;
+}
+
+int core_to_bytes(const void *state, char *bytes, size_t size) {
+    memcpy(bytes, state, size);
+    return OK;
+}
+
+int core_from_bytes(const char *bytes, size_t size, void **state) {
+    *state = malloc(size);
+    memcpy(*state, bytes, size);
+    return OK;
+}
+
+/* Derivatives in the direction of a seed. */
+int core_differentiate(Model *me, const unsigned *unknowns, size_t count, const unsigned *knowns,
+                       size_t number_of_knowns, const double *seed, double *result) {
+    for (size_t i = 0; i < count; i++) {
+        result[i] = 0.0;
+        for (size_t j = 0; j < number_of_knowns; j++) {
+            result[i] += model_partial(me, unknowns[i], knowns[j]) * seed[j];
+        }
+    }
+    return OK;
+}

@@ -54,3 +54,10 @@ int core_nominals(Model *me, double *x, size_t count);
 int core_get(Model *me, const unsigned *references, size_t count, double *values);
 int core_set(Model *me, const unsigned *references, size_t count, const double *values);
 int core_do_step(Model *me, double time, double step);
+int core_get_state(Model *me, void **state);
+int core_set_state(Model *me, const void *state);
+int core_free_state(void **state);
+int core_to_bytes(const void *state, char *bytes, size_t size);
+int core_from_bytes(const char *bytes, size_t size, void **state);
+int core_differentiate(Model *me, const unsigned *unknowns, size_t count, const unsigned *knowns,
+                       size_t number_of_knowns, const double *seed, double *result);

@@ -3,7 +3,6 @@
 #include "exchange.h"
 
 #include <stdlib.h>
-#include <string.h>
 
 typedef struct {
     void *logger, *allocate, *release, *finished, *environment;
@@ -117,37 +116,19 @@ int fmi2GetNominalsOfContinuousStates(Model *me, double *x, size_t count) {
 int fmi2GetDirectionalDerivative(Model *me, const unsigned *unknowns, size_t count,
                                  const unsigned *knowns, size_t number_of_knowns,
                                  const double *seed, double *result) {
-    for (size_t i = 0; i < count; i++) {
-        result[i] = 0.0;
-        for (size_t j = 0; j < number_of_knowns; j++) {
-            result[i] += model_partial(me, unknowns[i], knowns[j]) * seed[j];
-        }
-    }
-    return OK;
+    return core_differentiate(me, unknowns, count, knowns, number_of_knowns, seed, result);
 }
 
 int fmi2GetFMUstate(Model *me, void **state) {
-    if (*state == NULL) {
-        *state = malloc(sizeof *me);
-    }
-    memcpy(*state, me, sizeof *me);
-    return OK;
+    return core_get_state(me, state);
 }
 
 int fmi2SetFMUstate(Model *me, const void *state) {
-    Model kept = *me;
-
-    memcpy(me, state, sizeof *me);
-    memcpy(me->name, kept.name, sizeof kept.name);
-    me->logger = kept.logger;
-    me->environment = kept.environment;
-    return OK;
+    return core_set_state(me, state);
 }
 
 int fmi2FreeFMUstate(Model *me, void **state) {
-    free(*state);
-    *state = NULL;
-    return OK;
+    return core_free_state(state);
 }
 
 int fmi2SerializedFMUstateSize(Model *me, void *state, size_t *size) {
@@ -156,14 +137,11 @@ int fmi2SerializedFMUstateSize(Model *me, void *state, size_t *size) {
 }
 
 int fmi2SerializeFMUstate(Model *me, void *state, char *bytes, size_t size) {
-    memcpy(bytes, state, size);
-    return OK;
+    return core_to_bytes(state, bytes, size);
 }
 
 int fmi2DeSerializeFMUstate(Model *me, const char *bytes, size_t size, void **state) {
-    *state = malloc(size);
-    memcpy(*state, bytes, size);
-    return OK;
+    return core_from_bytes(bytes, size, state);
 }
 
 const char *fmi2GetVersion(void) {

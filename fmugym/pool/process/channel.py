@@ -1,8 +1,8 @@
 """Messages between the pool of processes and one of its workers, over a pair of sockets.
 
-A message is a code of one byte, or a code and a pickled object. The step of a trivial FMU takes a
-microsecond, so the most frequent messages are bare codes. Both ends trust each other, because they
-run the same program of the same user.
+A message is a code of one byte, or a code and an object. The step of a trivial FMU takes a
+microsecond, so the most frequent messages are bare codes. Between processes of Python, objects are
+pickled: both ends trust each other, because they run the same program of the same user.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from fmugym.pool.process.output import Output
 
-__all__ = ["Channel", "Code"]
+__all__ = ["Channel", "Code", "Coding", "Pickled"]
 
 _LENGTH: Final = struct.Struct("<Q")
 
@@ -58,6 +58,32 @@ class Code:
     """The object is what the method raised."""
     LOG = b"L"
     """The object is a message of the FMU and its level. It may come at any time."""
+    FAULT = b"X"
+    """The object is the exit status of the process, which ends now. Only programs tell it."""
+
+
+class Coding(Protocol):
+    """Turns objects into bytes and back."""
+
+    def dumps(self, code: bytes, content: Any) -> bytes:
+        """Turn the object of a message with this code into bytes."""
+        ...
+
+    def loads(self, code: bytes, data: bytearray) -> Any:
+        """Turn bytes into the object of a message with this code."""
+        ...
+
+
+class Pickled:
+    """The coding between processes of Python; see ``Coding``."""
+
+    def dumps(self, code: bytes, content: Any) -> bytes:
+        """See ``Coding.dumps``."""
+        return pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
+
+    def loads(self, code: bytes, data: bytearray) -> Any:
+        """See ``Coding.loads``."""
+        return pickle.loads(data)
 
 
 class Channel:
@@ -71,15 +97,21 @@ class Channel:
         sentinel: A file descriptor that becomes readable when the other process has ended; None
             where there is none.
         output: What the other process prints; passed on while this one waits.
+        coding: How objects are sent.
 
     Attributes:
         end: The socket.
     """
 
     def __init__(
-        self, end: socket.socket, sentinel: int | None = None, output: Output | None = None
+        self,
+        end: socket.socket,
+        sentinel: int | None = None,
+        output: Output | None = None,
+        coding: Coding | None = None,
     ) -> None:
         self.end = end
+        self._coding = Pickled() if coding is None else coding
         self._send, self._receive = end.send, end.recv
         self._descriptor, self._sentinel = end.fileno(), sentinel
         self._lock = threading.Lock()
@@ -128,7 +160,7 @@ class Channel:
 
     def send_object(self, code: bytes, content: Any) -> None:
         """Send a code and an object; messages of several threads do not mix."""
-        data = pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
+        data = self._coding.dumps(code, content)
         with self._lock:
             self._send_all(b"".join((code, _LENGTH.pack(len(data)), data)))
 
@@ -145,14 +177,14 @@ class Channel:
     def _has_ended(self) -> bool:
         return self._sentinel is not None and bool(_poller(self._sentinel)(0.0))
 
-    def receive_object(self) -> Any:
-        """Receive the object that follows a code.
+    def receive_object(self, code: bytes) -> Any:
+        """Receive the object that follows this code.
 
         Raises:
             EOFError: If the other end is gone before the whole object has come.
         """
         (length,) = _LENGTH.unpack(self._receive_exactly(_LENGTH.size))
-        return pickle.loads(self._receive_exactly(length))
+        return self._coding.loads(code, self._receive_exactly(length))
 
     def _receive_exactly(self, count: int) -> bytearray:
         data = bytearray(count)

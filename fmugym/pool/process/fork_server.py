@@ -23,14 +23,14 @@ import signal
 import socket
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple, NoReturn
 
 from fmugym.pool.process.output import redirect
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
-__all__ = ["ANSWER", "LARGEST_REQUEST", "main"]
+__all__ = ["ANSWER", "LARGEST_REQUEST", "PROGRAM", "Program", "main"]
 
 LARGEST_REQUEST: Final = 65536
 """In bytes. A request is sent and received as a whole."""
@@ -38,7 +38,12 @@ LARGEST_REQUEST: Final = 65536
 ANSWER: Final = struct.Struct("<q")
 """First the process number or minus an error number, then the exit status, negative for signals."""
 
+PROGRAM: Final = -1
+"""In the place of the size of the memory: the worker is a program, and the descriptor of the memory
+that of a file with the pickled ``Program``."""
+
 _PR_SET_PDEATHSIG: Final = 1
+_MOST_DESCRIPTORS: Final = 4096
 _DESCRIPTORS: Final = 5
 """The descriptors of a request: the lifeline, the channel, the memory, and two pipes for what the
 worker prints."""
@@ -67,6 +72,23 @@ def _kill_group(leader: int) -> None:
     """Kill what is left of a worker's process group."""
     with contextlib.suppress(ProcessLookupError, PermissionError):  # nothing is left
         os.killpg(leader, signal.SIGKILL)
+
+
+class Program(NamedTuple):
+    """A program to start, with its arguments, environment variables and working directory."""
+
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    directory: str
+
+    def become(self, channel: int) -> NoReturn:
+        """Replace this process; the channel becomes its standard input and output."""
+        os.dup2(channel, 0)
+        os.dup2(channel, 1)
+        os.closerange(3, _MOST_DESCRIPTORS)
+        with contextlib.suppress(OSError):  # it may have been removed
+            os.chdir(self.directory)
+        os.execve(self.command[0], list(self.command), self.environment)
 
 
 class _Worker(NamedTuple):
@@ -132,6 +154,8 @@ class _Server:
             pid = -(error.errno or 1)
         if pid == 0:
             answers.close()
+            if size == PROGRAM:
+                self._become_program(server, channel, memory, pipes)
             self._become_worker(server, channel, Memory(size, memory), pipes)
         for descriptor in (channel, memory, *pipes):
             os.close(descriptor)
@@ -156,6 +180,19 @@ class _Server:
                 status = run_worker(socket.socket(fileno=channel), memory)
         finally:
             os._exit(status)
+
+    def _become_program(
+        self, server: int, channel: int, order: int, pipes: Sequence[int]
+    ) -> NoReturn:
+        try:
+            self._let_go()
+            program = pickle.loads(os.pread(order, os.fstat(order).st_size, 0))
+            redirect(*pipes)
+            os.setpgid(0, 0)
+            if _end_with_parent(server):
+                program.become(channel)
+        finally:
+            os._exit(1)
 
     def _let_go(self) -> None:
         """Close what belongs to the server, as a fork of it."""

@@ -13,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import weakref
 from collections.abc import Sequence
@@ -20,11 +21,11 @@ from multiprocessing.reduction import DupFd
 from pathlib import Path
 from typing import Any, Protocol
 
-from fmugym.pool.process.fork_server import ANSWER
+from fmugym.pool.process.fork_server import ANSWER, PROGRAM, Program
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
 
-__all__ = ["Process", "launch"]
+__all__ = ["Process", "launch", "launch_program"]
 
 
 class Process(Protocol):
@@ -67,6 +68,26 @@ def launch(end: socket.socket, memory: Memory, folder: Path, pipes: Sequence[int
     if sys.platform == "win32":
         return _SpawnedProcess(end, memory)
     return _start(folder, memory.size, (end.fileno(), memory.descriptor, *pipes))
+
+
+def launch_program(
+    end: socket.socket, program: Program, folder: Path, pipes: Sequence[int]
+) -> Process:
+    """Start a worker that is a program; the channel is its standard input and output.
+
+    Args:
+        end: The worker's end of the channel. The caller may close it afterwards.
+        program: What to start.
+        folder: Where its FMU was extracted to. It is removed if this process is killed.
+        pipes: Two, of which the second gets its standard error.
+
+    Raises:
+        OSError: If the system refuses.
+    """
+    with tempfile.TemporaryFile() as order:  # a request of the fork server is limited
+        order.write(pickle.dumps(program))
+        order.flush()
+        return _start(folder, PROGRAM, (end.fileno(), order.fileno(), *pipes))
 
 
 class _ForkServer:

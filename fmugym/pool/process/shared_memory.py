@@ -20,13 +20,13 @@ import numpy.typing as npt
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import HEALTH_COUNTS, HealthArray
 
-__all__ = ["Arrays", "Memory", "make_arrays", "make_echo", "size_for"]
+__all__ = ["ECHO_SIZE", "Arrays", "Memory", "make_arrays", "make_echo", "offsets_of", "size_for"]
 
 _ALIGNMENT: Final = 64
 """The alignment of each array, in bytes: a cache line."""
 
 
-_ECHO_SIZE: Final = 4096
+ECHO_SIZE: Final = 4096
 """Bytes for the last words of a worker's FMUs."""
 
 
@@ -73,29 +73,35 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
     return int(-(-size // _ALIGNMENT) * _ALIGNMENT)
 
 
-def _size_of_arrays(spec: PoolSpec, count: int) -> int:
-    return sum(_padded_size(*row) for row in _layout(spec, count))
-
-
 def size_for(spec: PoolSpec, count: int, workers: int) -> int:
     """Return the bytes that a pool of ``count`` instances needs."""
-    return _size_of_arrays(spec, count) + workers * _ECHO_SIZE
+    return offsets_of(spec, count, workers)[-1]
 
 
 def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
     """Place the arrays of a pool of ``count`` instances in memory, which they keep alive."""
-    arrays: list[Any] = []
-    offset = 0
-    for shape, dtype in _layout(spec, count):
-        arrays.append(np.ndarray(shape, dtype, memory.map, offset))
-        offset += _padded_size(shape, dtype)
+    arrays: list[Any] = [
+        np.ndarray(shape, dtype, memory.map, offset)
+        for (shape, dtype), offset in zip(
+            _layout(spec, count), offsets_of(spec, count), strict=False
+        )
+    ]
     return Arrays(*arrays)
+
+
+def offsets_of(spec: PoolSpec, count: int, worker: int = 0) -> list[int]:
+    """Where the arrays begin, in the order of ``Arrays``, and then the last words of a worker."""
+    offsets = [0]
+    for row in _layout(spec, count):
+        offsets.append(offsets[-1] + _padded_size(*row))
+    offsets[-1] += worker * ECHO_SIZE
+    return offsets
 
 
 def make_echo(memory: Memory, spec: PoolSpec, count: int, worker: int) -> npt.NDArray[np.uint8]:
     """Return where a worker's FMUs leave their last words, a text that ends with a zero byte."""
-    offset = _size_of_arrays(spec, count) + worker * _ECHO_SIZE
-    return np.ndarray(_ECHO_SIZE, np.uint8, memory.map, offset)
+    offset = offsets_of(spec, count, worker)[-1]
+    return np.ndarray(ECHO_SIZE, np.uint8, memory.map, offset)
 
 
 class Memory:

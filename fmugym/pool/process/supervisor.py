@@ -17,9 +17,10 @@ from fmugym.errors import printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.last_words import describe_exit, is_crash
-from fmugym.pool.process.launcher import Process, launch
+from fmugym.pool.process.launcher import Process
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo
+from fmugym.pool.process.transport import transport_for
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 
@@ -87,7 +88,8 @@ class Supervisor:
         self.is_new = True
         self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
-        self._setup, self._memory, self._log = setup, memory, log
+        self._setup, self._log = setup, log
+        self._transport = transport_for(setup, memory)
         self._note_crash = note_crash
         self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
         self._output = Output()
@@ -115,6 +117,7 @@ class Supervisor:
             raise LostError(f"no worker process can be started: {error}") from None
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
+        self._fault: int | None = None
         self.growth, self.is_new = 0, True
         self.known.clear()
         self.tell("open", self._setup)
@@ -126,14 +129,14 @@ class Supervisor:
         try:
             with other_end:
                 output.open()
-                process = launch(other_end, self._memory, self._setup.folder, output.writing_ends)
+                process = self._transport.launch(other_end, output.writing_ends)
         except BaseException:
             end.close()
             output.close()
             raise
         output.release_writing_ends()
         self._output = output
-        return process, Channel(end, process.sentinel, output)
+        return process, Channel(end, process.sentinel, output, self._transport.coding())
 
     def revive(self) -> None:
         """Start a process if there is none, with longer and longer pauses between deaths.
@@ -306,12 +309,15 @@ class Supervisor:
                 code = self._channel.receive_code()
                 if code == Code.FINE or code == Code.TROUBLE:
                     return code
-                content = self._channel.receive_object()
+                content = self._channel.receive_object(code)
             except (EOFError, OSError):
                 self._explain_death(doing)
-            if code != Code.LOG:
+            if code == Code.LOG:
+                self._pass_on(*content)
+            elif code == Code.FAULT:
+                self._fault = content
+            else:
                 return content
-            self._pass_on(*content)
 
     def _pass_on(self, level: int, message: str) -> None:
         self._tail.append(message)
@@ -323,6 +329,7 @@ class Supervisor:
         if status is None:
             self._process.kill()
             self._process.exit_status(_LONGEST_KILL)
+        status = status if self._fault is None else self._fault
         self._output.drain()
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))

@@ -36,6 +36,7 @@ from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
+from fmugym.wine.prefix import Wine
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
 
@@ -69,6 +70,8 @@ class Setup:
         threads: See ``NativePool``.
         own_files: Whether the worker has a copy of the folder, which is also its working
             directory, because instances would share files otherwise.
+        library: The place of the FMU's library in the folder.
+        wine: What the worker needs to run in Wine; None for a worker of Python.
     """
 
     path: Path
@@ -86,6 +89,8 @@ class Setup:
     native: bool = False
     threads: int = 1
     own_files: bool = False
+    library: str = ""
+    wine: Wine | None = None
 
     @classmethod
     def of(cls, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> Setup:
@@ -102,6 +107,8 @@ class Setup:
             directory=_working_directory(),
             environment=dict(os.environ),
             block=slice(num_instances),
+            library=fmu.library,
+            wine=Wine.ready() if fmu.in_wine else None,
         )
 
     @property
@@ -185,7 +192,7 @@ class BlockWorker:
             actions[code]()
 
     def _answer(self) -> None:
-        name, arguments = self._channel.receive_object()
+        name, arguments = self._channel.receive_object(Code.REQUEST)
         try:
             result = getattr(self, name)(*arguments)
             code = Code.RESULT
@@ -221,7 +228,7 @@ class BlockWorker:
         np.copyto(block.statuses, pool.statuses)
 
     def _release(self) -> None:
-        for number in self._channel.receive_object():
+        for number in self._channel.receive_object(Code.RELEASE):
             del self._snapshots[number]
 
     # The methods that the parent calls by name.

@@ -1,0 +1,202 @@
+"""What the C code needs to know of an FMU and of the specification of a pool.
+
+``NativePool`` tells it to ``fmugym._native``, and ``fmugym.pool.process.windows`` to the worker
+program for Windows.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.pool.bundle import Record
+from fmugym.pool.spec import SAMPLINGS, PoolSpec, ResetMethod
+from fmugym.wine.loader import windows_path, windows_uri
+
+__all__ = [
+    "PlaceOfFMU",
+    "experiment_settings",
+    "library_settings",
+    "record_from",
+    "solving_settings",
+    "types_and_references",
+    "variable_settings",
+    "variables_of",
+]
+
+_TYPES: Final = (
+    "Float64",
+    "Float32",
+    "Int8",
+    "Int16",
+    "Int32",
+    "Int64",
+    "UInt8",
+    "UInt16",
+    "UInt32",
+    "UInt64",
+    "Boolean",
+)
+"""The C types in the order of ``enum Type`` of ``native/fmi.h``."""
+
+_OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
+
+
+@dataclass(frozen=True)
+class PlaceOfFMU:
+    """Where the files of an FMU are, as its process names them.
+
+    Attributes:
+        paths: Those of its library, or of the private copies.
+        resources: The location of its resources in the form of its FMI version.
+    """
+
+    paths: tuple[bytes, ...]
+    resources: bytes
+
+    @classmethod
+    def here(cls, folder: Path, paths: Sequence[Path], version: int) -> PlaceOfFMU:
+        """For a process of this system.
+
+        Args:
+            folder: That of the extracted FMU.
+            paths: As the attribute.
+            version: The major FMI version.
+        """
+        if version == 3:
+            resources = os.path.join(folder, "resources", "")
+        else:
+            resources = _place_of_resources(folder, version).as_uri()
+        return cls(tuple(os.fsencode(path) for path in paths), resources.encode())
+
+    @classmethod
+    def in_wine(cls, folder: Path, library: Path, version: int) -> PlaceOfFMU:
+        """For a process in Wine; see ``here``."""
+        if version == 3:
+            resources = windows_path(folder / "resources") + "\\"
+        else:
+            resources = windows_uri(_place_of_resources(folder, version))
+        return cls((os.fsencode(windows_path(library)),), os.fsencode(resources))
+
+
+def _place_of_resources(folder: Path, version: int) -> Path:
+    return folder if version == 1 else folder / "resources"
+
+
+def library_settings(description: ModelDescription, place: PlaceOfFMU) -> dict[str, Any]:
+    """What to load, and what is known of it."""
+    return {
+        "version": description.fmi_major_version,
+        "model": description.model_identifier.encode(),
+        "token": description.instantiation_token.encode(),
+        "resources": place.resources,
+        "paths": place.paths,
+        "states": description.capabilities.can_get_and_set_fmu_state,
+        "categories": tuple(c.encode() for c in description.error_categories),
+    }
+
+
+def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
+    """How instances are initialized and stepped, and how episodes begin."""
+    method = spec.reset_method
+    return {
+        "start_time": spec.start_time,
+        "stop_time": spec.stop_time,
+        "tolerance": spec.tolerance,
+        "time_step": spec.time_step,
+        "substeps": spec.substeps,
+        "warm_up_steps": spec.warm_up_steps,
+        "retries": spec.fault_retries,
+        "restores": method == ResetMethod.RESTORE,
+        "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
+        "reloads": method == ResetMethod.LIBRARY,
+        "one_initialization": spec.one_initialization,
+        "pace": spec.initialization_interval,
+        "start_outputs": np.array(spec.start_outputs).tobytes() if spec.blind_start else None,
+    }
+
+
+def variable_settings(spec: PoolSpec) -> dict[str, Any]:
+    """What is to be known of variables besides the lists of inputs and outputs."""
+    return {
+        "num_observed": spec.num_observed,
+        "strings": tuple((v.value_reference, text.encode()) for v, text in spec.strings),
+        "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
+    }
+
+
+def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
+    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    model = description.model_exchange
+    if model is None:
+        return None
+    solving, states, rates = spec.solving, None, None
+    if description.capabilities.provides_directional_derivatives and model.state_references:
+        states = np.array(model.state_references, np.uint32).tobytes()
+        rates = np.array(model.derivative_references, np.uint32).tobytes()
+    return (
+        solving.solver.encode(),
+        solving.tolerance,
+        solving.max_step,
+        model.number_of_states,
+        model.number_of_event_indicators,
+        model.needs_completed_integrator_step,
+        states,
+        rates,
+    )
+
+
+def types_and_references(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes]:
+    """The C types of variables, a byte each, and their value references, four bytes each."""
+    types = bytes(_type_number(variable, version) for variable in variables)
+    references = np.array([v.value_reference for v in variables], np.uint32)
+    return types, references.tobytes()
+
+
+def _type_number(variable: Variable, version: int) -> int:
+    if variable.kind == "enumeration":
+        return _TYPES.index("Int64" if version == 3 else "Int32")
+    return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
+
+
+def variables_of(
+    description: ModelDescription, types: Sequence[int], references: Sequence[int]
+) -> tuple[Variable, ...]:
+    """Find variables by C type and value reference; aliases are as good."""
+    version = description.fmi_major_version
+    known = {
+        (_type_number(v, version), v.value_reference): v
+        for v in description.variables.values()
+        if v.numeric
+    }
+    return tuple(known[pair] for pair in zip(types, references, strict=True))
+
+
+def record_from(
+    description: ModelDescription,
+    spec: PoolSpec,
+    starts: Sequence[tuple[int, int, float]],
+    steps: int,
+    inputs: bytes,
+) -> Record:
+    """Make the record of an episode of what the C code tells.
+
+    Args:
+        description: That of the FMU.
+        spec: That of the pool.
+        starts: The C type, value reference and value of each start value.
+        steps: The number of steps.
+        inputs: Those of each step, float64.
+    """
+    types, references, values = zip(*starts, strict=True) if starts else ((), (), ())
+    return Record(
+        tuple(variable.name for variable in variables_of(description, types, references)),
+        np.array(values, np.float64),
+        np.frombuffer(inputs).reshape(steps, len(spec.inputs)),
+    )

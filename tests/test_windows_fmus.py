@@ -1,0 +1,293 @@
+"""FMUs that have only a library for Windows: in Wine they run as any other does.
+
+That pools in Wine keep the contract of all pools is shown by test_pool.py.
+"""
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmu_tools import PlainEnv, edited_fmu, probe_config, read_fmu, write_fmu
+from process_tools import FaultyEnv, faulty_fmu, start_values
+from wine_tools import for_windows
+
+import fmugym
+from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.spec import PoolSpec
+from fmugym.tools import cli
+from fmugym.trial import opening
+from fmugym.wine import program
+from fmugym.wine.loader import can_run_windows, windows_path, windows_uri
+
+LOG = logging.getLogger("fmugym.test")
+
+pytestmark = pytest.mark.skipif(
+    not can_run_windows(), reason="Windows libraries run in Wine on Linux on x86_64 only"
+)
+
+
+@pytest.fixture(name="cart_pole")
+def fixture_cart_pole(tmp_path):
+    return for_windows(bundled_fmu("CartPole"), tmp_path)
+
+
+@pytest.fixture(name="bare")
+def fixture_bare(monkeypatch, tmp_path):
+    """A machine without Wine and ziglang."""
+    monkeypatch.setenv("FMUGYM_WINE", "/nowhere/wine64")
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(program, "_compiler_version", lambda: "")
+
+
+def open_pool(path, num_instances=1, inputs=("f",), outputs=("x", "theta"), **options):
+    fmu = FMU(path)
+    spec = PoolSpec(
+        tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), time_step=0.05
+    )
+    return opening.make_pool(fmu, spec, num_instances, LOG, **options)
+
+
+class TestWithoutWine:
+    def test_obstacles_tell_what_to_install(self, cart_pole, bare):
+        fmu = FMU(cart_pole)
+        assert fmu.in_wine
+        assert not fmu.runs_here
+        (text,) = fmu.obstacles
+        assert "apt install wine64" in text
+        assert "fmugym-toolbox[windows]" in text
+
+    def test_a_pool_is_refused_with_the_same_words(self, cart_pole, bare):
+        with pytest.raises(FMULoadError, match=r"wine64.*\[windows\]"):
+            open_pool(cart_pole)
+
+    def test_info_says_how_to_get_there(self, cart_pole, bare, capsys):
+        assert cli.main(["info", str(cart_pole)]) == 0
+        (line,) = (r for r in capsys.readouterr().out.splitlines() if "this machine" in r)
+        assert "does NOT run here" in line
+        assert "wine64" in line
+
+
+class TestChoice:
+    def test_a_library_for_this_system_is_preferred(self):
+        assert not FMU(bundled_fmu("CartPole")).in_wine
+
+    @pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
+    def test_of_the_library(self, tmp_path, version):
+        fmu = FMU(for_windows(bundled_fmu("CartPole", version), tmp_path))
+        folder = "x86_64-windows" if version == "3.0" else "win64"
+        assert fmu.library == f"binaries/{folder}/CartPole.dll"
+        assert (fmu.extract() / fmu.library).stat().st_size > 0
+        fmu.close()
+
+    def test_libraries_for_32_bits_are_refused(self, tmp_path):
+        files = read_fmu(bundled_fmu("CartPole"))
+        library = files.pop("binaries/win64/CartPole.dll")
+        files = {n: c for n, c in files.items() if not n.startswith("binaries")}
+        path = write_fmu(tmp_path / "Old.fmu", files | {"binaries/win32/CartPole.dll": library})
+        (text,) = FMU(path).obstacles
+        assert "32-bit Windows" in text
+
+    @pytest.mark.parametrize(
+        "wish", [{"backend": "python"}, {"isolation": "none"}, {"private_libraries": True}]
+    )
+    def test_what_is_impossible_in_wine_is_refused(self, cart_pole, wish):
+        with pytest.raises(FMULoadError, match=next(iter(wish))):
+            open_pool(cart_pole, **wish)
+
+    def test_this_process_cannot_load_it(self, cart_pole):
+        fmu = FMU(cart_pole)
+        with pytest.raises(FMULoadError, match="Wine"):
+            fmu.prepare_library()
+        fmu.close()
+
+
+class TestPaths:
+    def test_of_files(self):
+        assert windows_path("/tmp/a b/c") == r"Z:\tmp\a b\c"
+
+    def test_uris(self):
+        assert windows_uri("/tmp/a b/ä") == "file:///Z:/tmp/a%20b/%C3%A4"
+
+
+class TestProgram:
+    def test_its_sources_are_found(self):
+        names = {path.name for path in program.sources()}
+        assert {"main.c", "requests.c", "fmi1.c", "fmi2.c", "fmi3.c", "pool.h"} <= names
+
+    def test_without_a_compiler_one_that_was_built_before_is_used(self, bare, tmp_path):
+        assert program.known_program() is None
+        built = program.wine_folder() / f"worker-{program._digest()}-0.0.0.exe"
+        built.touch()
+        assert program.known_program() == built
+
+    def test_a_compiler_that_fails_is_quoted(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))
+        broken = tmp_path / "broken.c"
+        broken.write_text("#error nonsense\n")
+        monkeypatch.setattr(program, "sources", lambda: (broken,))
+        with pytest.raises(FMULoadError, match="nonsense"):
+            program.worker_program()
+        assert not list(tmp_path.glob("wine/*.exe"))
+
+
+@pytest.fixture(name="faulty", scope="module")
+def fixture_faulty(tmp_path_factory, wine):
+    folder = tmp_path_factory.mktemp("faulty")
+    return for_windows(faulty_fmu(folder), folder)
+
+
+@pytest.fixture(name="opened")
+def fixture_opened():
+    with contextlib.ExitStack() as stack:
+        yield lambda closable: stack.enter_context(contextlib.closing(closable))
+
+
+class ForcedCartPole(fmugym.FMI2CSEnv):
+    """Pushes a cart with a pole that begins at a random angle."""
+
+    def __init__(self, path):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot", "theta", "theta_dot"],
+            "model_parameters": {"theta_0": fmugym.Uniform(-0.1, 0.1)},
+            "time_step": 0.05,
+            "bounds": {"f": (-10, 10)},
+        }
+        super().__init__(path, config)
+
+    def _is_done(self):
+        return abs(self.state[0]) > 2.4
+
+
+@pytest.mark.usefixtures("wine")
+class TestInWine:
+    @pytest.mark.parametrize(
+        ("fault", "cause"),
+        [
+            ("crash", "Windows error 0xc0000005"),
+            ("exit", "exit status 0"),
+            ("abort", "exit status"),
+            ("hang", "took longer than call_timeout"),
+        ],
+    )
+    def test_a_death_is_told_with_last_words(self, faulty, opened, fault, cause):
+        timeout = 0.7 if fault == "hang" else 30.0
+        env = opened(FaultyEnv(faulty, fault, call_timeout=timeout))
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        *_, truncated, info = env.step(env.action_space.sample())
+        assert truncated
+        assert cause in info["fault"]
+        assert "the FMU said: [last words] this is fault" in info["fault"]
+
+    def test_the_others_go_on_and_a_reset_replaces_the_worker(self, faulty, opened):
+        pool = opened(open_pool(faulty, 4, ["u"], ["y"], workers=2, call_timeout=30.0))
+        fmu = FMU(faulty)
+        names = tuple(start_values())
+        columns = [list(start_values(f, at=2).values()) for f in ("crash", *["none"] * 3)]
+        variables = tuple(map(fmu.variable, names))
+        pool.reset(variables, np.array(columns, float).T)
+        before = pool.processes()
+        for _ in range(3):
+            pool.step(np.ones((1, 4)))
+        assert pool.statuses.tolist() == [4, 4, 0, 0]
+        assert pool.outputs[0, 2:].tolist() == pytest.approx([0.15, 0.15])
+        healthy = np.array([list(start_values().values())] * 4, float).T
+        pool.reset(variables, healthy, np.array([True, True, False, False]))
+        pool.step(np.ones((1, 4)))
+        assert pool.statuses.tolist() == [0] * 4
+        assert pool.outputs[0].tolist() == pytest.approx([0.05, 0.05, 0.2, 0.2])
+        after = pool.processes()
+        assert before[0] != after[0]
+        assert before[1] == after[1]
+
+    def test_a_snapshot_is_lost_with_its_process(self, cart_pole, opened):
+        pool = opened(open_pool(cart_pole, 2, workers=1))
+        pool.reset((), np.zeros((0, 2)))
+        snapshot = pool.save()
+        os.kill(pool.processes()[0], signal.SIGKILL)
+        pool.step(np.zeros((1, 2)))
+        pool.reset((), np.zeros((0, 2)))
+        with pytest.raises(SimulationError, match="replaced"):
+            pool.restore(snapshot)
+
+    def test_it_ends_with_its_parent(self, cart_pole):
+        script = """
+            import sys
+            from test_windows_fmus import open_pool
+            pool = open_pool(sys.argv[1], 2, workers=1)
+            print(pool.processes()[0], flush=True)
+            sys.stdin.read()
+        """
+        command = [sys.executable, "-c", textwrap.dedent(script), str(cart_pole)]
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+        ) as parent:
+            worker = int(parent.stdout.readline())
+            assert Path(f"/proc/{worker}").exists()
+            parent.kill()
+        deadline = time.monotonic() + 20
+        while Path(f"/proc/{worker}").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+    def test_messages_of_the_fmu_are_logged(self, probe, tmp_path, opened, caplog):
+        path = for_windows(probe(2), tmp_path)
+        env = opened(PlainEnv(path, probe_config(model_parameters={"log_status": 1})))
+        env.reset(seed=0)
+        env.step(np.zeros(1, np.float32))
+        assert "Probe_0: [" in caplog.text
+
+    def test_an_environment_gives_the_native_results(self, cart_pole, opened):
+        """The libraries differ in their sine and cosine by rounding."""
+        ours = opened(ForcedCartPole(cart_pole))
+        native = opened(ForcedCartPole(bundled_fmu("CartPole")))
+        for env in (ours, native):
+            env.action_space.seed(1)
+        starts = [env.reset(seed=3)[0] for env in (ours, native)]
+        np.testing.assert_array_equal(*starts)
+        for _ in range(20):
+            rows = [env.step(env.action_space.sample())[0] for env in (ours, native)]
+            np.testing.assert_allclose(*rows, rtol=1e-6, atol=1e-9)
+
+    def test_a_vector_environment(self, cart_pole, opened):
+        make = lambda: ForcedCartPole(cart_pole)  # noqa: E731
+        env = opened(fmugym.FMUVectorEnv(make, 4, workers=2))
+        single = opened(make())
+        first, _ = env.reset(seed=5)
+        np.testing.assert_array_equal(first[0], single.reset(seed=5)[0])
+        actions = np.full((4, 1), 3.0, np.float32)
+        for _ in range(10):
+            rows = env.step(actions)[0]
+        for _ in range(10):
+            row = single.step(actions[0])[0]
+        np.testing.assert_array_equal(rows[0], row)
+
+    def test_the_trial_runs_there_too(self, cart_pole, opened, monkeypatch, caplog):
+        monkeypatch.setenv("FMUGYM_PROBE", "on")
+        with caplog.at_level(logging.INFO, "fmugym"):
+            env = opened(fmugym.FMUVectorEnv(lambda: ForcedCartPole(cart_pole), 2))
+        assert isinstance(env._pool, ProcessPool)
+        (line,) = (r.getMessage() for r in caplog.records if "was tried with 2" in r.getMessage())
+        assert " 0 initialization" not in line
+
+    def test_info_says_that_it_runs_in_wine(self, cart_pole, capsys):
+        assert cli.main(["info", str(cart_pole)]) == 0
+        assert "win64: runs here, in Wine" in capsys.readouterr().out
+
+    def test_a_path_with_blanks_and_umlauts(self, tmp_path, opened):
+        folder = tmp_path / "a folder, ü"
+        folder.mkdir()
+        pool = opened(open_pool(for_windows(edited_fmu("CartPole", folder), folder)))
+        pool.reset((), np.zeros((0, 1)))
+        assert not pool.statuses.any()
