@@ -231,7 +231,9 @@ class Subject:
             self.pool.deserialize_states(bundled, sources, indices)
 
     def record(self):
-        self.pool.record_of(int(self.rng.integers(self.n)))
+        record = self.pool.record_of(int(self.rng.integers(self.n)))
+        if record is not None:
+            self.pool.replace_record(int(self.rng.integers(self.n)), record)
 
     def write(self):
         self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))

@@ -16,6 +16,7 @@ from fmugym import pool as pools
 from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
+from fmugym.pool.bundle import Record
 from fmugym.pool.health import no_counts
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
@@ -84,6 +85,48 @@ class TestArrays:
         np.testing.assert_array_equal(with_these.step(actions)[0], expected)
         with_these.close()
         with_others.close()
+
+
+class TestRecords:
+    @pytest.fixture(name="pool")
+    def fixture_pool(self):
+        fmu = FMU(bundled_fmu("CartPole"))
+        spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
+        pool = NativePool(fmu, spec, 2, LOG)
+        start = fmu.variable("x_0")
+        pool.reset((start,), np.full((1, 2), 0.25))
+        pool.step(np.ones((1, 2)))
+        yield pool, start
+        pool.close()
+
+    def test_are_given_to_another_instance(self, pool):
+        pool, start = pool
+        pool.replace_record(1, Record((start.name,), np.array([0.5]), np.arange(40.0)[:, None]))
+        pool.step(np.full((1, 2), 9.0))
+        first, second = pool.record_of(0), pool.record_of(1)
+        assert (first.starts.tolist(), first.inputs.tolist()) == ([0.25], [[1.0], [9.0]])
+        assert (second.names, second.starts.tolist()) == (("x_0",), [0.5])
+        assert second.inputs[:, 0].tolist() == [*range(40), 9.0]
+
+    @pytest.mark.parametrize(
+        ("index", "starts", "inputs", "steps"),
+        [
+            (2, bytes(8), b"", 0),
+            (-1, bytes(8), b"", 0),
+            (0, bytes(7), b"", 0),
+            (0, bytes(16), b"", 0),
+            (0, bytes(8), bytes(8), 2),
+            (0, bytes(8), bytes(9), 1),
+            (0, bytes(8), b"", -1),
+        ],
+    )
+    def test_that_do_not_fit(self, pool, index, starts, inputs, steps):
+        pool, start = pool
+        with pytest.raises((ValueError, IndexError, OverflowError)):
+            pool._pool.replace_record(index, pool._access((start,)), starts, inputs, steps)
+        assert len(pool.record_of(0).inputs) == 1
+        with pytest.raises(TypeError):
+            pool._pool.replace_record(0, None, starts, inputs, 0)
 
 
 # Programs

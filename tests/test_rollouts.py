@@ -158,6 +158,21 @@ class TestValues:
         envs.close()
 
 
+def test_from_one_root_no_state_is_serialized(monkeypatch):
+    """Planning costs one saved state, however many candidates there are."""
+    env, envs = halfway(), vector_of(Track, N)
+    snapshot, saved = env.save_state(), []
+    kept = envs._pool.serialize_states
+    monkeypatch.setattr(envs._pool, "serialize_states", lambda i: saved.append(len(i)) or kept(i))
+    envs.rollout(snapshot, actions_for(env, 3 * N))
+    assert not saved
+    envs.reset(seed=0)  # now there are episodes to return to
+    envs.rollout(snapshot, actions_for(env, 3 * N))
+    assert saved == [N]
+    envs.close()
+    env.close()
+
+
 class TestParameters:
     @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
     @pytest.mark.parametrize("version", ["2.0", "3.0"])

@@ -1,5 +1,6 @@
 """Linear models along a trajectory, compared with equations, scipy and each other."""
 
+import gymnasium
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -71,6 +72,19 @@ class TestDifferences:
         assert (found.states, found.outputs) == (("q", "q_dot"), ("q", "q_dot"))
         assert found.method == "differences"
 
+    def test_at_rest(self):
+        """The states are not exactly zero then."""
+
+        class Hanging(Precise):
+            def __init__(self):
+                super().__init__(model_parameters={"q_0": 1e-17, "q_dot_0": -3e-16})
+
+        found = along(Hanging, np.zeros((30, 1)), states=STARTS, method="differences")
+        directional = along(Hanging, np.zeros((30, 1)))
+        assert np.abs(found.x).max() < 1e-14
+        assert pytest.approx(directional.A, abs=1e-5) == found.A
+        assert pytest.approx(directional.B, abs=1e-5) == found.B
+
     def test_chained_are_those_by_all_actions(self):
         """``derivatives`` gives the effect of each action on each later observation."""
         with Precise() as env:
@@ -121,6 +135,30 @@ class TestDifferences:
         assert found.A.tobytes() == along(states=STARTS, method="differences").A.tobytes()
         with pytest.raises(ConfigError, match=r"FMI 1\.0"):
             along(Old, states=STARTS, method="directional")
+
+
+@pytest.mark.parametrize("method", ["directional", "differences"])
+@pytest.mark.parametrize("shape", [(), (2, 2)])
+def test_of_actions_of_any_shape(method, shape):
+    class Shaped(Precise):
+        def _get_action_space(self):
+            return gymnasium.spaces.Box(-1.0, 1.0, shape, np.float64)
+
+        def _get_inputs(self):
+            first, last = (self.action[0, 0], self.action[1, 1]) if shape else [self.action] * 2
+            return 0.01 * (first + 2 * last**2)
+
+    actions = np.full((3, *shape), 0.25)
+    found = along(Shaped, actions, states=STARTS if method == "differences" else None)
+    torque = along(exact if method == "directional" else Precise, np.full((3, 1), 0.00375))
+    wanted = 0.01 * torque.B[:, :, 0]
+    slopes = [1.0, 0.0, 0.0, 1.0] if shape else [2.0]
+    assert found.method == method
+    if method == "directional":
+        assert pytest.approx(wanted[:, :, None] * np.array(slopes), rel=1e-2, abs=1e-3) == found.B
+    else:
+        by_torque = 0.01 * DT / (M * L**2) * np.array(slopes)
+        assert found.B[:, 1] == pytest.approx(np.tile(by_torque, (3, 1)), abs=1e-7)
 
 
 class TestDirectional:
@@ -260,6 +298,9 @@ class TestRefusals:
             ({"states": ["q"], "method": "directional"}, "theta"),
             ({"states": STARTS, "step": 0.0, "method": "differences"}, "step"),
             ({"actions": np.zeros(3)}, "shape"),
+            ({"actions": np.full((3, 1), np.nan)}, "step 0.*nan"),
+            ({"actions": [[0.0], [0.5]]}, "step 1.*0.5"),
+            ({"states": ["theta", 3]}, "3"),
         ],
     )
     def test_of_what_does_not_fit(self, arguments, reason):
@@ -283,6 +324,22 @@ class TestRefusals:
                 along(lambda: Precise(max_episode_steps=2), states=states, method=method)
             found = along(lambda: Precise(max_episode_steps=HORIZON), states=states, method=method)
             assert len(found.A) == HORIZON
+
+    def test_of_other_environments_and_snapshots(self):
+        envs = vector_of(Precise, 2)
+        envs.reset(seed=0)
+        snapshot, zeros = envs.save_state(), np.zeros((3, 1))
+        for function in (linearize_along, fmugym.derivatives):
+            with pytest.raises(ConfigError, match="FMUVectorEnv"):
+                function(Precise, snapshot[0], zeros)
+            with pytest.raises(ConfigError, match="2 environments"):
+                function(envs, snapshot, zeros)
+            with pytest.raises(ConfigError, match="save_state"):
+                function(envs, None, zeros)
+        envs.close()
+        for function in (linearize_along, fmugym.derivatives):
+            with pytest.raises(SimulationError, match="closed"):
+                function(envs, snapshot[0], zeros)
 
     def test_of_discrete_actions(self):
         with pytest.raises(ConfigError, match="Box"):

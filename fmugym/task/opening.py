@@ -69,16 +69,18 @@ def open_fmu(
     """
     file = _find_file(cls, check_path("fmu_path", path))
     preload = [_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload]
-    limits, timeout = config.archive_limits, config.probe_timeout
-    interface = _interface_of(cls, config.interface, interface)
+    arguments: dict[str, Any] = {
+        "limits": config.archive_limits,
+        "preload": preload,
+        "probe_timeout": config.probe_timeout,
+        "interface": _interface_of(cls, config.interface, interface),
+    }
     known = _fmus.get()
     if known is None:
-        known = {}
-    key = file, limits, tuple(map(str, preload)), timeout, interface
+        return FMU(file, **arguments)
+    key = file, repr(arguments)
     if key not in known:
-        known[key] = FMU(
-            file, limits=limits, preload=preload, probe_timeout=timeout, interface=interface
-        )
+        known[key] = FMU(file, **arguments)
     return known[key]
 
 

@@ -23,6 +23,10 @@ __all__ = ["Matrices", "differentiate_by_starts"]
 _AGREEMENT: Final = 1e-3
 """By how much a step may differ after a start at the state before it, as a fraction of scales."""
 
+_LEAST: Final = 1e-3
+"""The least magnitude of a state, as a fraction of its nominal value: states at rest have rounding
+errors instead of zeros, which are no measure of how far to move them."""
+
 _FIRST: Final = np.zeros(1, np.int64)
 
 
@@ -116,14 +120,10 @@ class _Perturbation:
         before, after = (
             np.concatenate(part)[: len(trials.at)] for part in zip(*rounds, strict=True)
         )
-        horizon, n = len(nominal), len(self._x)
-        by_step = after.reshape(horizon, -1, after.shape[1])
-        self._require_agreement(x, by_step[:, 0, :n], scales)
-        moved = before.reshape(horizon, -1, n)[:, 1 : 1 + 2 * n].reshape(horizon, n, 2, n)
-        apart = np.einsum("kipi->kpi", moved)  # of each pair, the state that was moved
-        widths = np.concatenate([apart[:, 0] - apart[:, 1], widths], axis=1)
-        pairs = by_step[:, 1:].reshape(horizon, -1, 2, after.shape[1])
-        slopes = np.swapaxes((pairs[:, :, 0] - pairs[:, :, 1]) / widths[:, :, None], 1, 2)
+        n = len(self._x)
+        before, after = (rows.reshape(len(nominal), -1, rows.shape[1]) for rows in (before, after))
+        self._require_agreement(x, after[:, 0, :n], scales)
+        slopes = _slopes(before[:, 1:], after[:, 1:], widths)
         (a, b), (c, d) = (
             (rows[:, :, :n], rows[:, :, n:]) for rows in (slopes[:, :n], slopes[:, n:])
         )
@@ -154,8 +154,8 @@ class _Perturbation:
     def _scales(self, x: FloatArray) -> FloatArray:
         """The magnitude of each state."""
         nominals = np.array([abs(v.nominal or 1.0) for v in self._x])
-        largest = np.abs(x).max(axis=0)
-        return np.where(largest > 0.0, largest, nominals)
+        scales: FloatArray = np.maximum(np.abs(x).max(axis=0), _LEAST * nominals)
+        return scales
 
     def _trials(
         self, nominal: npt.NDArray[Any], x: FloatArray, deltas: FloatArray, step: float
@@ -241,3 +241,23 @@ class _Perturbation:
                 f"{self._x[index].name} is {x[step + 1, index]:g} after step {step + 1}, but "
                 f"{after[step, index]:g} after a start at the states before that step"
             )
+
+
+def _slopes(before: FloatArray, after: FloatArray, widths: FloatArray) -> FloatArray:
+    """The differences of pairs of trials, divided by how far they are apart.
+
+    Args:
+        before: The states before the step, shape (horizon, 2 (n_x + n_u), n_x); the first n_x pairs
+            have moved states.
+        after: What follows, shape (horizon, 2 (n_x + n_u), k).
+        widths: How far pairs of actions are apart, shape (horizon, n_u).
+
+    Returns:
+        Shape (horizon, k, n_x + n_u).
+    """
+    horizon, _, n = before.shape
+    moved = before[:, : 2 * n].reshape(horizon, n, 2, n)
+    ends = np.einsum("kipi->kpi", moved)  # of each pair, the state that was moved
+    apart = np.concatenate([ends[:, 0] - ends[:, 1], widths], axis=1)
+    pairs = after.reshape(horizon, -1, 2, after.shape[2])
+    return np.swapaxes((pairs[:, :, 0] - pairs[:, :, 1]) / apart[:, :, None], 1, 2)

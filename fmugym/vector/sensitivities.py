@@ -21,6 +21,7 @@ __all__ = [
     "float_box",
     "moved_both_ways",
     "precise_step",
+    "require_vector",
 ]
 
 
@@ -70,6 +71,7 @@ def derivatives(
         SimulationError: If an episode ends before the last step, where nothing can be
             differentiated.
     """
+    require_vector(envs, "derivatives")
     space = float_box(envs.single_action_space, "action")
     seen = float_box(envs.single_observation_space, "observation")
     checked_snapshot(snapshot, length=1)
@@ -114,7 +116,7 @@ def checked_trajectory(space: spaces.Box, actions: Any) -> npt.NDArray[Any]:
     """Return nominal actions as an array of shape (horizon, ...) and of the type of the space.
 
     Raises:
-        ConfigError: If they do not fit.
+        ConfigError: If they do not fit, or are not in the space.
     """
     try:
         nominal = np.array(actions, space.dtype)
@@ -124,7 +126,23 @@ def checked_trajectory(space: spaces.Box, actions: Any) -> npt.NDArray[Any]:
         raise ConfigError(
             f"expected actions of shape (horizon, ...) for {space}, got {shown(actions)}"
         )
+    outside = ~((space.low <= nominal) & (nominal <= space.high))
+    for step, *place in np.argwhere(outside)[:1].tolist():
+        value = nominal[(step, *place)]
+        raise ConfigError(f"the action of step {step} is not in {space}: it has {value}")
     return nominal
+
+
+def require_vector(envs: Any, name: str) -> None:
+    """Refuse what is no open vector environment.
+
+    Raises:
+        ConfigError: If it is something else.
+        SimulationError: If it is closed, or a step is under way.
+    """
+    if not isinstance(envs, FMUVectorEnv):
+        raise ConfigError(f"{name} needs an FMUVectorEnv, got {shown(envs)}")
+    envs._open_pool(name)
 
 
 def _moved(

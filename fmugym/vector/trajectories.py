@@ -16,7 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import start_variable
-from fmugym.task.snapshot import Snapshot
+from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.env import FMUVectorEnv
 from fmugym.vector.perturbations import Matrices, differentiate_by_starts
 from fmugym.vector.sensitivities import (
@@ -24,6 +24,7 @@ from fmugym.vector.sensitivities import (
     float_box,
     moved_both_ways,
     precise_step,
+    require_vector,
 )
 
 __all__ = ["LinearTrajectory", "linearize_along"]
@@ -100,19 +101,20 @@ def linearize_along(
         method: By default ``"directional"`` where the FMU offers it for these states, otherwise
             ``"differences"``.
         step: For differences: how far a state is moved, as a fraction of its largest magnitude in
-            the trajectory (of its nominal value if that is 0), and an action, as a fraction of the
-            width of its space. By default the cube root of the precision of the numbers. An FMU
-            whose solver has a tolerance needs more: about the square root of the tolerance.
+            the trajectory (at least a thousandth of its nominal value), and an action, as a
+            fraction of the width of its space. By default the cube root of the precision of the
+            numbers. An FMU whose solver has a tolerance needs more: about the square root of it.
 
     Raises:
         ConfigError: If the arguments do not fit, or the FMU does not offer the method.
         SimulationError: If a step fails, if the episode ends before the last step, or if the states
             do not determine what follows.
     """
+    require_vector(envs, "linearize_along")
     env = envs._prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)
-    start = envs._start_of_rollout(snapshot, None, 1)
+    start = envs._start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
     chosen = _states(env, states)
     if method is not None:
         check_option("method", method, _METHODS)
@@ -187,15 +189,11 @@ def _require_starts(env: FMUEnv, states: States, obstacle: str) -> None:
     """Refuse states that cannot be set."""
     description = env.fmu.description
     for name, start in states.items():
-        variable = description.variable(start)
-        if not variable.settable_at_start:
+        if not description.variable(start).settable_at_start:
+            hint = f"; directional derivatives need none, but {obstacle}" if obstacle else ""
             raise ConfigError(
-                f"{start!r} cannot be set before initialization, so that differences by the state "
-                f"{name!r} are not possible; states={{{name!r}: ...}} takes the name of its start "
-                f"variable (directional derivatives are not possible either: {obstacle})"
-                if obstacle
-                else f"{start!r} cannot be set before initialization; states={{{name!r}: ...}} "
-                "takes the name of the start variable of the state"
+                f"{start!r} cannot be set before initialization; states={{{name!r}: ...}} takes "
+                f"the name of the start variable of the state{hint}"
             )
         start_variable(description, start, 0.0)
 
@@ -304,7 +302,7 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
 
 
 def _replaced(action: npt.NDArray[Any], place: tuple[int, ...], value: Any) -> npt.NDArray[Any]:
-    moved = action.copy()
+    moved = np.array(action)
     moved[place] = value
     return moved
 

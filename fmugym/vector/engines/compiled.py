@@ -153,7 +153,7 @@ class CompiledEngine(BatchEngine):
         )
         self._play_with_resets = self._pool.watched(self._play)
         self._start = self._pool.start_of_play()
-        self._is_attended = self._pool.is_attended
+        self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
         self._prepared = True
 
     def _make_rows(self, task: TracedTask) -> None:
@@ -277,7 +277,7 @@ class CompiledEngine(BatchEngine):
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Engine.reset``."""
-        if options or not self._prepared or self._any_foreign or self._is_attended:
+        if options or not self._prepared or self._any_foreign or self._resets_apart:
             return super().reset(mask, seeds, options)
         self.has_moved = False
         if seeds is not None:
