@@ -23,6 +23,7 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import exchange
 import heavy
 import isolation
 import loaded
@@ -45,6 +46,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "reset": reset.tables,
     "rollouts": rollouts.tables,
     "heavy": heavy.tables,
+    "exchange": exchange.tables,
     "isolation": isolation.tables,
     "windows": windows.tables,
     "overlap": overlap.tables,

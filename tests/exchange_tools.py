@@ -13,6 +13,7 @@ STATES = {
     "robertson": ["y1", "y2", "y3"],
     "friction": ["x", "v"],
     "circuit": ["voltage"],
+    "tank": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -24,12 +25,13 @@ OTHERS = {
     "robertson": [],
     "friction": ["belt", "static", "kinetic", "mode"],
     "circuit": ["duty", "limit", "source", "discharges", "period", "tau"],
+    "tank": ["u", "discards"],
 }
 """The other variables in the order of their value references."""
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
-OUTPUTS = {"bounces", "count", "mode", "source", "discharges"}
+OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},
     "ball": {"h": 1, "v": 0, "g": -9.81, "e": 0.7, "v_min": 0.1},
@@ -37,6 +39,7 @@ START = {
     "stair": {"period": 1, "last": 10},
     "robertson": {"y1": 1, "y2": 0, "y3": 0},
     "friction": {"x": 0, "v": 0.1, "belt": 0.1, "static": 1, "kinetic": 0.6},
+    "tank": {"x": 0.01, "u": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

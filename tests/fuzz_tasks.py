@@ -73,7 +73,12 @@ PENDULUM = {
     "agent": {
         "actions": ["torque"],
         "observations": ["angle", "goal", "goal_error", "wave", "steps", "total", "far"],
-        "forecast": {"of": ["price", "load"], "horizon": "0.4s", "step": "0.2s", "error": 0.1},
+        "forecast": {
+            "of": ["price", "load"],
+            "horizon": "0.4s",
+            "step": "0.2s",
+            "error": {"std": 0.1},
+        },
         "history": {"of": ["angle", "torque"], "length": "0.1s"},
         "rescale": True,
         "normalize": "nominal",

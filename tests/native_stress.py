@@ -24,11 +24,13 @@ import threading
 import time
 
 import numpy as np
+from exchange_tools import exchange_fmu
 
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
+from fmugym.pool.spec import SOLVERS
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
@@ -134,6 +136,8 @@ class Subject:
             tuple(map(fmu.variable, outputs)),
             0.05,
             num_observed=len(outputs),
+            solver=str(rng.choice(SOLVERS)),
+            max_step=0.01,
         )
         self.pool = NativePool(fmu, spec, self.n, log, threads=int(rng.integers(1, 5)))
         receiver.pool = self.pool
@@ -324,6 +328,13 @@ def recipes(folder, with_python):
     for version in ("2.0", "3.0"):
         path = bundled_fmu("CartPole", version)
         yield path, (["f"], ["x", "theta"]), ["m_cart"]
+    for version, model, input_, output, start in (
+        (1, "ball", "e", "h", "h"),
+        (2, "circuit", "duty", "voltage", "limit"),
+        (3, "van_der_pol", "mu", "x1", "x2"),
+    ):
+        path = exchange_fmu(f"{folder}/{model}.fmu", model, version)
+        yield path, ([input_], [output]), [start]
     if with_python:
         import foreign_tank
         from pythonfmu.builder import FmuBuilder

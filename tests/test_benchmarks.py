@@ -61,6 +61,14 @@ def test_tables_are_at_most_100_columns_wide(ended):
     assert max(map(len, ended[0].stdout.splitlines())) <= 100
 
 
+def test_model_exchange_is_compared_with_fmpy():
+    result = run("--only", "exchange")
+    assert (result.returncode, result.stderr) == (0, "")
+    rows = tables_in(result.stdout)
+    assert rows["model exchange, FMPy's CVode in a loop"][1] == "1.00x"
+    assert all(rows["model exchange, Rosenbrock"])
+
+
 def test_the_base_is_compared_with_itself(ended):
     assert tables_in(ended[0].stdout)["Gymnasium CartPole-v1, gym.make"][3] == "1.00x"
 

@@ -372,7 +372,7 @@ MISTAKES = {
     "sample of an action": ("max = 1", 'max = 1, sample = "mean"', "line 5", "read from"),
     "read twice": (
         '"-abs(q)"\n[variables]',
-        '"p"\n[variables]\np = { name = "q" }',
+        '"p"\n[variables]\np = { name = "q", sample = "max" }',
         "line 5|variables.q",
         "'q'.*'p'|'p'.*'q'",
     ),

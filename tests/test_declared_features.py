@@ -409,3 +409,62 @@ def test_mistakes_of_the_agent(change, fact):
 def test_mistakes_of_set_points(setpoint, fact):
     with pytest.raises(TaskError, match=rf"^setpoints\.goal.*{fact}"):
         fmugym.load(BASE | {"setpoints": {"goal": setpoint}})
+
+
+TWICE = BASE | {
+    "variables": BASE["variables"]
+    | {
+        "angle": {"name": "q", "unit": "deg", "min": -230, "max": 230, "noise": 1.0},
+        "rough": {"name": "q", "unit": "deg", "noise": 30.0, "delay": "0.5s"},
+        "turned": {"name": "q_dot", "unit": "deg/s"},
+    },
+    "agent": {
+        "actions": ["tau"],
+        "observations": ["q", "angle", "rough"],
+        "history": {"of": ["angle", "q"], "length": "0.5s"},
+    },
+    "reward": "angle + turned + q_dot - previous(angle)",
+}
+
+
+def test_a_variable_may_have_several_names():
+    env = fmugym.load(TWICE, hooks="compiled")
+    assert len(env.config.model_output_names + env.config.monitor_names) == 2
+    errors = []
+    for seed in range(30):
+        q, angle, rough, *_ = env.reset(seed=seed)[0]
+        errors.append((angle - np.rad2deg(q), rough - np.rad2deg(q)))
+        before = env.state[0]
+        for _ in range(3):
+            observation, reward, *_ = env.step(np.zeros(1, np.float32))
+            (now,), rate = env.state, env.out["q_dot"]
+            expected = np.rad2deg(now) + np.rad2deg(rate) + rate - np.rad2deg(before)
+            assert reward == pytest.approx(expected, rel=1e-9)
+            assert observation[5] == np.float32(before)
+            before = now
+    fine, rough = np.array(errors).T
+    assert fine.std() == pytest.approx(1, rel=0.4)
+    assert rough.std() == pytest.approx(30, rel=0.4)
+    assert abs(np.corrcoef(fine, rough)[0, 1]) < 0.6
+    env.close()
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_several_names_in_many_environments(hooks):
+    make = partial(fmugym.load, TWICE)
+    envs, single = FMUVectorEnv(make, 2, hooks=hooks), make()
+    np.testing.assert_array_equal(envs.reset(seed=3)[0][0], single.reset(seed=3)[0])
+    for _ in range(6):
+        actions = envs.action_space.sample()
+        first, second = envs.step(actions), single.step(actions[0])
+        np.testing.assert_array_equal(first[0][0], second[0])
+        assert first[1][0] == second[1]
+    envs.close()
+    single.close()
+
+
+def test_several_names_are_sampled_in_one_way():
+    variables = BASE["variables"] | {"mean": {"name": "q", "sample": "mean"}}
+    agent = {"actions": ["tau"], "observations": ["q", "mean"]}
+    with pytest.raises(TaskError, match=r"'q' and 'mean' .*'sample'"):
+        fmugym.load(BASE | {"variables": variables, "agent": agent})

@@ -387,6 +387,55 @@ def test_errors_of_forecasts_belong_to_times_and_fall():
     np.testing.assert_allclose(later / np.sqrt(2), sooner, atol=1e-5)
 
 
+def forecast_errors(error, episodes=60):
+    """The errors of forecasts of ``load``, shape (episodes, steps, times ahead)."""
+    forecast = {"of": "load", "horizon": "0.4s", "step": "0.1s", "error": error}
+    agent = RANDOM["agent"] | {"forecast": forecast}
+    env, errors = fmugym.load(RANDOM | {"agent": agent}), []
+    for seed in range(episodes):
+        rows = [env.reset(seed=seed)[0]]
+        rows += [env.step([0.0])[0] for _ in range(8)]
+        times = DT * np.arange(9)[:, None] + 0.1 * np.arange(1, 5)
+        true = np.interp(times % 1.5, [0, 0.5, 1, 1.5], [0, 10, 5, 0])
+        errors.append((np.array(rows)[:, 2:6] - true) / (true if "relative" in error else 1))
+    env.close()
+    return np.array(errors)
+
+
+PARTS = np.array([0.25, 0.5, 0.75, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("error", "sizes"),
+    [
+        ({"std": 2.0}, 2 * np.sqrt(PARTS)),
+        ({"std": 2.0, "growth": "linear"}, 2 * PARTS),
+        ({"std": 2.0, "growth": "none"}, [2, 2, 2, 2]),
+        ({"std": 0.2, "relative": True}, 0.2 * np.sqrt(PARTS)),
+        ({"bias": 3.0}, 3 * np.sqrt(PARTS)),
+    ],
+)
+def test_sizes_of_errors_of_forecasts(error, sizes):
+    errors = forecast_errors(error)
+    np.testing.assert_allclose(np.std(errors, axis=(0, 1)), sizes, rtol=0.25)
+    within = np.std(errors, axis=1).mean()
+    assert (within < 1e-5) == ("bias" in error)
+
+
+@pytest.mark.parametrize(
+    ("error", "fact"),
+    [
+        ({"std": -1}, r"std: .*-1"),
+        ({"growth": "cubic"}, "'cubic'"),
+        ({"sdt": 1}, "'std'"),
+        ("x", "'x'"),
+    ],
+)
+def test_mistakes_in_errors_of_forecasts(error, fact):
+    with pytest.raises(TaskError, match=rf"^agent\.forecast\.error.*{fact}"):
+        forecast_errors(error, 1)
+
+
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_random_steps_of_many_environments(hooks):
     make = partial(fmugym.load, RANDOM)

@@ -227,6 +227,12 @@ class TestOtherFacts:
 
 
 class TestRefused:
+    @pytest.mark.parametrize("count", ["-1", "99999999999"])
+    def test_a_number_of_equations_that_cannot_be(self, tmp_path, count):
+        edits = {"CoSimulation": "ModelExchange"}
+        edits["<fmiModelDescription "] = f'<fmiModelDescription numberOfEventIndicators="{count}" '
+        refused(probe_fmu(tmp_path, 2, edits), f"numberOfEventIndicators is {count}")
+
     def test_no_interface_at_all(self, tmp_path):
         path = probe_fmu(tmp_path, 3, {"CoSimulation": "ScheduledExecution"})
         refused(path, "co-simulation or model exchange.*scheduled execution")

@@ -137,6 +137,24 @@ class TestSolvers:
             x = u + (x - u) * math.exp(-0.1)
             assert outputs[0, 0] == pytest.approx(x, abs=2e-4 if solver == "euler" else 1e-6)
 
+    @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_adaptive_steps_get_shorter_where_the_fmu_discards(self, make_pool, solver, kind):
+        outputs = ["x", "discards"]
+        pool = make_pool("tank", 0.19, kind, outputs=outputs, solver=solver, tolerance=0.01)
+        x, discards = run(pool, 1)[-1]
+        assert x == pytest.approx(0.005**2, abs=2e-5)
+        assert discards > 0
+
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_fixed_steps_are_retried_where_the_fmu_discards(self, make_pool, kind):
+        pool = make_pool("tank", 0.09, kind, solver="rk4")
+        start(pool)
+        assert [int(pool.step()[1][0]) for _ in range(2)] == [0, Status.DISCARD]
+        pool = make_pool("tank", 0.09, kind, solver="rk4", fault_retries=3)
+        assert run(pool, 2)[-1, 0] == pytest.approx(0.01**2, abs=1e-5)
+        assert pool.health()["retries"].tolist() == [2]  # with 2 parts, and with 4
+
     @pytest.mark.parametrize("kind", ["native", "python"])
     def test_a_step_that_gets_too_small_is_a_fault(self, make_pool, kind):
         pool = make_pool("van_der_pol", 0.1, kind=kind)
@@ -305,6 +323,15 @@ def stick_and_slip(step, count, belt=0.1, static=1.0, kinetic=0.6):
         else:
             rows.append([place + belt * since, belt, 0.0])
     return rows
+
+
+@with_states
+def test_linear_models(fmu_path, version):
+    """The FMU's derivatives can be read in continuous time, too."""
+    plural = "s" if version == 3 else ""
+    flags = f'providesDirectionalDerivative{plural}="true"'
+    model = fmugym.linearize(fmu_path("dahlquist", version, flags=flags), inputs=[], at={"k": 3})
+    assert model.A.tolist() == [[-3.0]]
 
 
 class TestPools:

@@ -27,6 +27,7 @@ _POSITIVE: Final = {"tolerance", "stepSize", "fixedInternalStepSize"}
 _IDENTIFIER: Final = re.compile(r"[^/\\:]{1,200}")
 _OF_ERRORS: Final = re.compile("error|fatal|discard|warning", re.IGNORECASE)
 _MOST_CATEGORIES: Final = 32
+_MOST_EQUATIONS: Final = 1_000_000
 _BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
@@ -94,12 +95,19 @@ def _model_exchange(source: Any, root: Any) -> ModelExchange:
     states = [variable.derivative for variable in derivatives]
     scalar = all(state and not state.shape for state in states)
     return ModelExchange(
-        source.numberOfContinuousStates,
-        source.numberOfEventIndicators,
+        _count(source, "numberOfContinuousStates"),
+        _count(source, "numberOfEventIndicators"),
         _needs_completed_step(source, root),
         tuple(int(state.valueReference) for state in states) if scalar else (),
         tuple(int(variable.valueReference) for variable in derivatives) if scalar else (),
     )
+
+
+def _count(source: Any, attribute: str) -> int:
+    count = int(getattr(source, attribute))
+    if not 0 <= count <= _MOST_EQUATIONS:
+        raise FMULoadError(f"{attribute} is {count}, expected 0 to {_MOST_EQUATIONS}")
+    return count
 
 
 def _needs_completed_step(source: Any, root: Any) -> bool:

@@ -33,7 +33,7 @@ def named_values(declared: Declarations, naming: Naming) -> dict[str, tuple[Quan
 
 def _quantities(declared: Declarations, naming: Naming) -> Iterator[Quantity]:
     actions = [record.alias for record in declared.actions]
-    for alias in [*actions, *naming.outputs, *naming.monitors]:
+    for alias in [*actions, *naming.read_names]:
         yield _of_record(declared, alias, "action" if alias in actions else "output")
     setpoints = declared.root.child("setpoints").value or {}
     targets = _targets(declared)

@@ -92,22 +92,48 @@ class Naming:
         used = sorted(set().union(*(e.names for e in expressions)))
         wanted = dict.fromkeys(filter(declared.is_output, observed + previous))
         others = [name for name in used if declared.is_output(name) and name not in wanted]
-        self._check_distinct([*wanted, *others])
+        self._places = self._find_places([*wanted, *others])
+        wanted = {name: None for name in wanted if self._is_first(name)}
+        others = [name for name in others if self._is_first(name)]
         if not wanted and not others:
             raise declared.agent("observations").error("the task reads no variable of the FMU")
         return (list(wanted), others) if wanted else (others, [])
 
-    def _check_distinct(self, names: list[str]) -> None:
-        """A step gives one value of each variable of the FMU."""
-        seen: dict[str, str] = {}
+    def _find_places(self, names: list[str]) -> dict[str, int]:
+        """Where the values of names are: several may stand for one variable of the FMU.
+
+        Raises:
+            ConfigError: If they are sampled in different ways: a step gives one value of each.
+        """
+        records, first = self._declared.records, dict[str, str]()
         for name in names:
-            record = self._declared.records[name]
-            first = seen.setdefault(record.fmu_name, name)
-            if first != name:
-                raise record.entry.error(
-                    f"{first!r} and {name!r} are both {record.fmu_name!r} of the FMU, which can be "
-                    "read in one way only; write one as an expression of the other"
+            known = first.setdefault(records[name].fmu_name, name)
+            if records[known].sample != records[name].sample:
+                raise records[name].entry.error(
+                    f"{known!r} and {name!r} are both {records[name].fmu_name!r} of the FMU, which "
+                    "has one 'sample' only"
                 )
+        order = list(first.values())
+        return {name: order.index(first[records[name].fmu_name]) for name in names}
+
+    def _is_first(self, name: str) -> bool:
+        """Whether no name before stands for the same variable of the FMU."""
+        return name == next(n for n, p in self._places.items() if p == self._places[name])
+
+    @property
+    def read_names(self) -> list[str]:
+        """The names of all values that are read from the FMU."""
+        return list(self._places)
+
+    def _is_output(self, name: str) -> bool:
+        """Whether a name stands for one of the values in ``state``."""
+        return self._places.get(name, len(self.outputs)) < len(self.outputs)
+
+    def channel_of(self, name: str) -> int:
+        """The number of the sensor of a value, from which its noise follows."""
+        place = self._places[name]
+        aliases = [n for n in self._places if not self._is_first(n)]
+        return place if name not in aliases else len(self.outputs) + aliases.index(name)
 
     def code(
         self,
@@ -268,7 +294,7 @@ class Naming:
             return converted(record.conversion, f"env.inputs[{declared.written.index(name)}]")
         if name in declared.parameters:
             return converted(record.conversion, f"env.parameters[{record.fmu_name!r}]")
-        place = [*self.outputs, *self.monitors].index(name)
+        place = self._places[name]
         return converted(record.conversion, f"env._values[{place}]")
 
     def _previous_code_of(self, name: str) -> Code | None:
@@ -276,9 +302,9 @@ class Naming:
         if record is not None and record in declared.actions:
             is_known = record.is_direct
             return Code(self.action_code(record, "previous_action")) if is_known else None
-        if record is None or name not in self.outputs:
+        if record is None or not self._is_output(name):
             return None
-        place = self.outputs.index(name)
+        place = self._places[name]
         return Code(converted(record.conversion, f"env.previous_state[{place}]"))
 
     def action_code(self, record: Record, attribute: str) -> str:
@@ -394,7 +420,7 @@ class Naming:
             no history of this name.
         """
         declared, record = self._declared, self._declared.records.get(name)
-        if record is None or name not in [*self.outputs, *(one.alias for one in declared.actions)]:
+        if record is None or not (record in declared.actions or self._is_output(name)):
             return None
         if record not in declared.actions:
             before = self._previous_code_of(name)

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from fmugym.checks import check_option
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import DEVICE_KEYS, NOISE
 from fmugym.declared.entries import Entry
@@ -35,6 +36,10 @@ _MOST_VALUES: Final = 2000
 """A history or a forecast has at most so many values of a name."""
 
 _CHANNELS_OF_FORECASTS: Final = 10_000
+_CHANNELS_OF_BIASES: Final = 5_000
+
+_GROWTHS: Final = {"sqrt": 0.5, "linear": 1.0, "none": 0.0}
+_ERROR_KEYS: Final = ("std", "bias", "growth", "relative")
 
 
 @dataclass(frozen=True)
@@ -220,7 +225,7 @@ class _Past:
         return device.distorted(code, f"(env.step_count - {ago})", self._channel(name))
 
     def _channel(self, name: str) -> int:
-        return self._naming.outputs.index(name)
+        return self._naming.channel_of(name)
 
     def _kept(self, entry: Entry, record: Record, ago: int) -> str:
         """The variable with what a sensor with a memory has given, the latest first."""
@@ -271,15 +276,14 @@ def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iter
         table = entry.table(("of", "horizon", "step", "error"))
         step = table["step"].check(duration) if "step" in table else time_step
         count = _count(entry.required("horizon"), step)
-        error = number(table["error"]) if "error" in table else 0.0
+        error = _error_of(table["error"]) if "error" in table else None
         for channel, one in enumerate(_named(entry), _CHANNELS_OF_FORECASTS):
             name = one.text()
             for index in range(1, count + 1):
                 ahead = index * step
                 code = naming.forecast(one, name, ahead)
-                if error:
-                    size = error * np.sqrt(index / count)
-                    code = _with_error(code, float(size), round(ahead / time_step), channel)
+                if error is not None:
+                    code = error.added(code, index / count, round(ahead / time_step), channel)
                 yield Seen(one, name, code, *declared.limits_of(name), f"[+{ahead:g} s]")
 
 
@@ -288,13 +292,61 @@ def _named(entry: Entry) -> list[Entry]:
     return [names] if isinstance(names.value, str) else names.elements()
 
 
-def _with_error(code: str, size: float, ahead: int, channel: int) -> str:
-    """Code for a forecast with an error that belongs to the time that it is made for.
+class ForecastError(NamedTuple):
+    """How forecasts err.
 
-    Forecasts of one time err in the same direction, and less and less as the time comes near.
+    Attributes:
+        std: The standard deviation of the error at the horizon.
+        bias: That of an error which stays the same in an episode.
+        growth: The exponent with which errors grow with the time ahead.
+        relative: Whether errors are parts of the value.
     """
-    count = f"(env.step_count + {ahead})"
-    return f"({code} + {size!r} * noise(env.variables[{NOISE!r}], {count}, {channel}))"
+
+    std: float
+    bias: float = 0.0
+    growth: float = 0.5
+    relative: bool = False
+
+    def added(self, code: str, part: float, ahead: int, channel: int) -> str:
+        """Code for a forecast with errors.
+
+        The errors belong to the time that the forecast is made for: forecasts of one time err in
+        the same direction, and less and less as the time comes near.
+
+        Args:
+            code: Code for the true value.
+            part: The time ahead as a part of the horizon.
+            ahead: The time ahead in steps.
+            channel: The number of the forecast.
+        """
+        size, key = part**self.growth, f"env.variables[{NOISE!r}]"
+        count = f"(env.step_count + {ahead})"
+        error = f"({self.std * size!r} * noise({key}, {count}, {channel}))"
+        if self.bias:
+            lasting = f"noise({key}, (env.step_count * 0), {channel + _CHANNELS_OF_BIASES})"
+            error = f"({error} + {self.bias * size!r} * {lasting})"
+        return f"({code} + {code} * {error})" if self.relative else f"({code} + {error})"
+
+
+def _error_of(entry: Entry) -> ForecastError | None:
+    if not isinstance(entry.value, Mapping):
+        std = _deviation(entry)
+        return ForecastError(std) if std else None
+    table = entry.table(_ERROR_KEYS)
+    growth = table["growth"].check(check_option, _GROWTHS) if "growth" in table else "sqrt"
+    return ForecastError(
+        _deviation(table["std"]) if "std" in table else 0.0,
+        _deviation(table["bias"]) if "bias" in table else 0.0,
+        _GROWTHS[growth],
+        "relative" in table and table["relative"].flag(),
+    )
+
+
+def _deviation(entry: Entry) -> float:
+    value = number(entry)
+    if not 0 <= value < np.inf:
+        raise entry.error(f"a standard deviation is 0 or positive, got {value:g}")
+    return value
 
 
 def has_errors(declared: Declarations) -> bool:

@@ -77,9 +77,9 @@ class Pilot(NamedTuple):
 
     def act(self, env: Any) -> Any:
         """Choose the next action, as the agent would write it, shape (M,)."""
-        count = len(env.step_count)
-        parts = [np.broadcast_to(value, (count,)) for value in self.signals(env)]
-        rows = np.array(parts, np.float32).reshape(len(parts), count).T
+        rows = np.empty((len(env.step_count), len(self.names)), np.float32)
+        for place, signal in enumerate(self.signals(env)):
+            rows[:, place] = signal
         value = self._decided(env, rows)
         if self.record.levels:
             distance = np.abs(np.array(self.record.levels)[:, None] - value)

@@ -106,9 +106,10 @@ int core_get_states(Model *me, double *x, size_t count) {
 
 int core_rates(Model *me, double *rates, size_t count) {
     REQUIRE((me->mode == CONTINUOUS || me->mode == EVENT) && count == STATES);
+    me->status = OK;
     model_rates(me);
     memcpy(rates, me->v + STATES, count * sizeof *rates);
-    return OK;
+    return me->status;
 }
 
 int core_indicators(Model *me, double *z, size_t count) {

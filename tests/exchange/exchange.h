@@ -19,6 +19,7 @@ typedef struct {
     double next_event;
     double stop; /* when the model asks to stop */
     int mode;
+    int status;        /* of computing the derivatives */
     bool exchange;     /* by model exchange, not co-simulation */
     bool stops;        /* whether it asks to stop now */
     bool again;        /* whether the discrete states need another update */
