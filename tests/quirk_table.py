@@ -156,6 +156,8 @@ QUIRKS = (
         "values of the model description)",
         log="cannot be read before its first step",
     ),
+    Quirk("no reading of inputs", "returns Error if an input is read"),
+    Quirk("no reading of parameters", "returns Error if a parameter is read"),
     Quirk("reads a table", "has `\\` in the names of its archive"),
 )  # fmt: skip
 

@@ -211,6 +211,58 @@ def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu, backend):
     env.close()
 
 
+@pytest.mark.parametrize("demand", [{"reset_method": "reset"}, {"probe_timeout": None}], ids=str)
+@pytest.mark.parametrize("way", ["compiled", "array", "python", "process"])
+def test_no_instance_is_reset_before_its_first_episode(make_fmu, way, demand):
+    """Not even the one with which the hooks of a vector environment were checked."""
+    path = make_fmu("reset does nothing")
+    options = {"backend": "python"} if way == "python" else {}
+    options |= {"isolation": "process"} if way == "process" else {"private_libraries": False}
+    options |= {"hooks": way} if way in ("compiled", "array") else {}
+    envs = fmugym.FMUVectorEnv(lambda: QuirkEnv(path, gain=1.5, **demand), 3, **options)
+    observations, _ = envs.reset()
+    assert not observations.any()
+    assert not envs.health["replacements"].any()
+    observations, *_ = envs.step(np.full((3, 1), 0.5, np.float32))
+    assert len(set(map(tuple, observations.tolist()))) == 1
+    envs.close()
+
+
+@pytest.mark.parametrize("way", ["native", "python", "process"])
+def test_reading_what_can_only_be_written(make_fmu, way):
+    """The message names it; the FMU then needs a reset, as the standard says."""
+    options = {"isolation": "process"} if way == "process" else {"way": way}
+    env = QuirkEnv(make_fmu("no reading of inputs"), gain=1.5, **options)
+    env.reset()
+    env.step(np.array([0.5], np.float32))
+    first = env.read_variables("gain", "y")
+    with pytest.raises(fmugym.SimulationError, match=r"reading u, gain returned Error"):
+        env.read_variables("u", "gain")
+    assert env.step(np.array([0.5], np.float32))[3]
+    env.reset()
+    env.step(np.array([0.5], np.float32))
+    assert env.read_variables("gain", "y") == first
+    env.close()
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_the_trial_names_outputs_that_cannot_be_read(make_fmu, version, caplog):
+    path = make_fmu("no reading of calls", version)
+    for _ in range(2):  # the second time from the cache
+        caplog.clear()
+        env = QuirkEnv(path)
+        assert "Quirks.fmu: its trial could not read the output(s) calls" in caplog.text
+        with pytest.raises(fmugym.SimulationError, match="reading the outputs returned Error"):
+            env.reset()
+        env.close()
+    caplog.clear()
+    env = QuirkEnv(path, model_output_names=["y", "clock"])
+    env.reset()
+    env.step(np.array([0.5], np.float32))
+    env.close()
+    assert "could not read" not in caplog.text
+
+
 class HiddenEnv(QuirkEnv):
     """Observes the output only, rounded."""
 
@@ -322,7 +374,7 @@ class TestVerdict:
         "text",
         [
             *("", "true", "[]", "{}", "null", '{"format": 1}', "[" * 100_000, "\0", "NaN"),
-            Verdict().to_text().replace('"format": 3', '"format": 2'),
+            Verdict().to_text().replace('"format": 4', '"format": 3'),
             Verdict().to_text().replace("false", '"no"'),
         ],
     )

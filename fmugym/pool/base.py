@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Final, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import Variable
-from fmugym.errors import SimulationError
+from fmugym.errors import SimulationError, printable
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
@@ -26,6 +26,7 @@ __all__ = [
     "SingleCalls",
     "StatusArray",
     "available_processors",
+    "names_of",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -34,6 +35,9 @@ MaskArray = npt.NDArray[np.bool_]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+_MOST_NAMES: Final = 5
+"""The most variables that a message names."""
 
 
 class SingleCalls(NamedTuple):
@@ -182,6 +186,12 @@ class Pool(ABC):
     def forget_health(self) -> None:
         """Set all counters to zero."""
 
+    def renew(self) -> None:  # noqa: B027 (most pools need none)
+        """Let each instance that was used be replaced by a new one at its next reset.
+
+        This is no replacement that ``health`` counts. Others than FMUs need none.
+        """
+
     @abstractmethod
     def close(self) -> None:
         """Free all instances. It may be called more than once."""
@@ -322,3 +332,10 @@ class Pool(ABC):
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """Return facts about the last step by name, each of shape (N,)."""
         return {}
+
+
+def names_of(variables: tuple[Variable, ...]) -> str:
+    """The names of variables, for a message; of many, the first ones."""
+    names = ", ".join(variable.name for variable in variables[:_MOST_NAMES])
+    more = len(variables) - _MOST_NAMES
+    return printable(f"{names} and {more} more" if more > 0 else names)

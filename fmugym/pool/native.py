@@ -36,6 +36,7 @@ from fmugym.pool.base import (
     SingleCalls,
     StatusArray,
     available_processors,
+    names_of,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import require_refusal
@@ -253,7 +254,8 @@ class NativePool(SavingPool):
         values = np.empty((len(variables), self.num_instances))
         failed = self._open_pool().read(self._access(variables), values)
         if failed >= 0:
-            raise SimulationError(self.failure(failed))
+            reading = f"reading {names_of(variables)}"
+            raise SimulationError(self.failure(failed).replace("reading variables", reading, 1))
         return values
 
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
@@ -336,6 +338,10 @@ class NativePool(SavingPool):
         self._mistrust_states()
         self._spec = replace(self._spec, reset_method=method)
         return True
+
+    def renew(self) -> None:
+        """See ``Pool.renew``."""
+        self._open_pool().renew()
 
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""

@@ -272,6 +272,11 @@ class PythonPool(SavingPool):
         self._mistrust_states()
         return True
 
+    def renew(self) -> None:
+        """See ``Pool.renew``."""
+        for slot in self._slots:
+            slot.is_used = True
+
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""
         _recycle(self._slots)

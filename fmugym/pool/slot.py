@@ -15,7 +15,7 @@ from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.attendant import InitialState
-from fmugym.pool.base import FloatArray, PoolSpec
+from fmugym.pool.base import FloatArray, PoolSpec, names_of
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
@@ -72,7 +72,8 @@ class Slot:
 
     Attributes:
         failure: Why the last status was worse than a warning.
-        is_due: Whether the next reset replaces the instance.
+        is_due: Whether the next reset replaces the instance because it leaks.
+        is_used: Whether the next reset replaces the instance because others have used it.
         keeps_record: Whether the inputs of its episodes are kept.
     """
 
@@ -86,7 +87,7 @@ class Slot:
         pacer: Pacer,
     ) -> None:
         self.failure = ""
-        self.is_due = self.keeps_record = False
+        self.is_due = self.is_used = self.keeps_record = False
         self._played: tuple[tuple[str, ...], FloatArray, list[bytes]] | None = None
         self._unexplained = False
         self._counts, self._pacer = counts, pacer
@@ -155,6 +156,7 @@ class Slot:
     def _make_anew_if_due(self) -> None:
         """Replace an instance that has leaked memory, or that no reset can make like new."""
         is_due, self.is_due = self.is_due, False
+        is_used, self.is_used = self.is_used, False
         unexplained, self._unexplained = self._unexplained, False
         if self._instance.phase in (Phase.DEAD, Phase.INSTANTIATED):
             return
@@ -163,7 +165,11 @@ class Slot:
             self._replace()
         elif unexplained and not self._has_snapshots and self._instance.can_say_more:
             self._rebuild(hear_all=True)
-        elif self._spec.reset_method not in _REUSING or self._instance.hears_more_than_wanted:
+        elif (
+            is_used
+            or self._spec.reset_method not in _REUSING
+            or self._instance.hears_more_than_wanted
+        ):
             self._rebuild()
 
     @property
@@ -513,5 +519,5 @@ class Slot:
         if not self._instance.can_read:
             raise SimulationError("the instance needs a reset before anything can be read")
         access = Access(self._instance, variables)
-        self._instance.check("reading variables", access.get())
+        self._instance.check(f"reading {names_of(variables)}", access.get())
         return access.values

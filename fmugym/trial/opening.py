@@ -11,7 +11,14 @@ from typing import Any, Final
 
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import FMU
-from fmugym.errors import ConfigError, FMULoadError, LicenceError, SimulationError, unknown_name
+from fmugym.errors import (
+    ConfigError,
+    FMULoadError,
+    LicenceError,
+    SimulationError,
+    printable,
+    unknown_name,
+)
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
@@ -119,8 +126,7 @@ def make_pool(
             _note_crash(fmu, spec, starts, verdict, how, log)
 
         actual = replace(spec, blind_start=verdict.blind_start)
-        if verdict.blind_start:
-            log.warning(_BLIND, fmu.path.name)
+        _tell_of_reading(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)
             pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
@@ -445,6 +451,15 @@ def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
         )
     elif verdict.resets:
         log.info("%s: episodes begin by the method %r", fmu.path.name, str(verdict.reset_method))
+
+
+def _tell_of_reading(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
+    """Log what cannot be read, or not at any time."""
+    if verdict.blind_start:
+        log.warning(_BLIND, fmu.path.name)
+    if verdict.unreadable:
+        names = printable(", ".join(verdict.unreadable))
+        log.warning("%s: its trial could not read the output(s) %s", fmu.path.name, names)
 
 
 def _verdict(

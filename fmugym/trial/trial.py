@@ -485,6 +485,7 @@ class _Notes:
             instances=int(answer.get("instances", 1)),
             initializations=self._initializations,
             blind_start=bool(answer.get("blind_start")),
+            unreadable=tuple(answer.get("unreadable", ())),
             isolate=any(death.stage in _ALONE for death in self._deaths),
             reasons=(FRUGAL,) * bool(answer.get("frugal"))
             + tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),

@@ -12,7 +12,7 @@ from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 3
+_FORMAT: Final = 4
 
 
 class Grade(StrEnum):
@@ -56,6 +56,7 @@ class Verdict:
         isolate: Whether a lone instance has harmed its process.
         states: The grade of an initial state in a second process; None if it was not tried.
         blind_start: Whether the FMU cannot be read before its first step.
+        unreadable: The names of outputs that could not be read at all.
         instances: How many instances the trial used at once, each of which may take a licence.
         initializations: How many initializations the trial took, which may be slow.
         reasons: The observations, one sentence each, for the log and ``fmugym info``.
@@ -68,6 +69,7 @@ class Verdict:
     isolate: bool = False
     states: Grade | None = None
     blind_start: bool = False
+    unreadable: tuple[str, ...] = ()
     instances: int = 1
     initializations: int = 0
     reasons: tuple[str, ...] = ()
@@ -93,6 +95,7 @@ class Verdict:
                 "isolate": self.isolate,
                 "states": None if self.states is None else str(self.states),
                 "blind_start": self.blind_start,
+                "unreadable": list(self.unreadable),
                 "instances": self.instances,
                 "initializations": self.initializations,
                 "reasons": list(self.reasons),
@@ -111,12 +114,12 @@ class Verdict:
     def _from_data(cls, data: dict[str, Any]) -> Verdict | None:
         names = ("complete", "deterministic", "isolate", "blind_start")
         flags = [data[name] for name in names]
-        reasons = data["reasons"]
+        reasons, unreadable = data["reasons"], data["unreadable"]
         if data["format"] != _FORMAT or not all(isinstance(flag, bool) for flag in flags):
             return None
         if data["instances"] not in (1, 2):
             return None
-        if not isinstance(reasons, list) or not all(isinstance(one, str) for one in reasons):
+        if not _are_texts(reasons) or not _are_texts(unreadable):
             return None
         given = data["neighbours"]
         return cls(
@@ -127,7 +130,12 @@ class Verdict:
             isolate=flags[2],
             states=None if data["states"] is None else Grade(data["states"]),
             blind_start=flags[3],
+            unreadable=tuple(unreadable),
             instances=data["instances"],
             initializations=int(data["initializations"]),
             reasons=tuple(reasons),
         )
+
+
+def _are_texts(data: Any) -> bool:
+    return isinstance(data, list) and all(isinstance(one, str) for one in data)

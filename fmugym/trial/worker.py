@@ -21,6 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.archive.description import Variable
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.instance import Instance
@@ -43,6 +44,9 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 _NO_DIALOGUES: Final = 0x0003
 """``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""
 
+
+_MOST_UNREADABLE: Final = 5
+"""The most outputs that a verdict names because they cannot be read."""
 
 _GRACE: Final = 1.0
 """Seconds that the parent has to end this process before it ends itself."""
@@ -232,9 +236,33 @@ def _rehearsal(request: Request, notes: Notes) -> Rehearsal:
         return rehearsal
     blind = Rehearsal(request.candidate, replace(request.spec, blind_start=True), starts)
     if not blind.possible:
+        notes.answer(unreadable=[v.name for v in _unreadable(request, request.spec.outputs)])
         return rehearsal
     notes.answer(blind_start=True)
     return blind
+
+
+def _unreadable(request: Request, outputs: tuple[Variable, ...]) -> tuple[Variable, ...]:
+    """Find the outputs that cannot be read after an initialization, by halves."""
+    if not outputs or _can_read(request, outputs):
+        return ()
+    if len(outputs) == 1:
+        return outputs
+    middle = len(outputs) // 2
+    halves = outputs[:middle], outputs[middle:]
+    found = tuple(v for half in halves for v in _unreadable(request, half))
+    return found[:_MOST_UNREADABLE]
+
+
+def _can_read(request: Request, outputs: tuple[Variable, ...]) -> bool:
+    spec = replace(request.spec, outputs=outputs, samplings=(), num_observed=0)
+    starts = request.starts or Starts()
+    pool = trial_pool(request.candidate.open(), spec, 1, logging.getLogger(__name__))
+    try:
+        _, statuses = pool.reset(starts.variables, starts.column(0))
+        return bool(statuses[0] <= Status.WARNING)
+    finally:
+        pool.close()
 
 
 def _make_sample(rehearsal: Rehearsal, request: Request, notes: Notes) -> None:

@@ -215,8 +215,23 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
     return me->stopped && FMI_VERSION == 2 ? DISCARD : OK;
 }
 
+/* Whether a variable that cannot be read is among those that are asked for. */
+static bool asks_in_vain(const Animal *me, const unsigned *references, size_t count) {
+    for (size_t i = 0; i < count; i++) {
+        if ((is(me, "no reading of inputs") && references[i] == U) ||
+            (is(me, "no reading of parameters") && (references[i] == GAIN || references[i] == TAU)) ||
+            (is(me, "no reading of calls") && references[i] == CALLS)) {
+            return true;
+        }
+    }
+    return false;
+}
+
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
     zoo_read(me->values, references, count, values);
+    if (asks_in_vain(me, references, count)) {
+        return ERROR;
+    }
     if (is(me, "no early reading") && !me->ready) {
         return ERROR;
     }
