@@ -371,6 +371,10 @@ class FMUEnv(Constructed):
         elements = self._elements
         if elements is None or type(action) not in _INTEGERS or action not in elements:
             self._require_usable(action)
+        self._take_usable(action)
+
+    def _take_usable(self, action: Any) -> None:
+        """Write the inputs for an action that was checked already."""
         before = self.previous_action, self.previous_state
         self.previous_action, self.previous_state, self.action = self.action, self.state, action
         try:
@@ -401,8 +405,17 @@ class FMUEnv(Constructed):
             return False
         return is_misfit(action, self.action_space, error)
 
-    def _conclude(self, pool: Pool, status: int) -> Result:
-        """Make the result of a step of the FMU."""
+    def _conclude(
+        self, pool: Pool, status: int, values: tuple[float, ...] | None = None, observed: Any = None
+    ) -> Result:
+        """Make the result of a step of the FMU.
+
+        Args:
+            pool: The FMU.
+            status: That of the step.
+            values: The outputs; None for those that the pool has.
+            observed: The default observation; None for a copy of the pool's.
+        """
         stopped = False
         if status:
             stopped = status == _TERMINATED
@@ -410,9 +423,12 @@ class FMUEnv(Constructed):
                 return self._fault(pool.failure(0))
         variables = self.variables.copy() if self._own.update else None
         before = self._values
-        self._values = values = tuple(self._output_row.tolist())  # Python's floats are faster
+        if values is None:
+            values = tuple(self._output_row.tolist())  # Python's floats are faster
+        self._values = values
         self.state = values if self._no_monitors else values[: self._output_count]
-        observed = self._observation_row.copy() if self._pool_observes else None
+        if observed is None and self._pool_observes:
+            observed = self._observation_row.copy()
         cut_off = self.step_count >= self._step_limit
         result = conclude(self, self._form, stopped, cut_off, observed)
         observation, reward, terminated, truncated = result

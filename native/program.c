@@ -32,6 +32,8 @@ static size_t number_of_operands(const Program *program, Instruction i) {
         return 2;
     case STORE_ROW:
     case STORE_SEEN:
+    case CALL_SINE:
+    case CALL_COSINE:
     case CAST:
     case TAKE:
     case INTERPOLATE:
@@ -56,6 +58,12 @@ static size_t number_of_operands(const Program *program, Instruction i) {
     }
 }
 
+/* Whether an instruction calls a loop with one result that has so many inputs. */
+static bool calls_with(const Program *program, Instruction i, size_t inputs) {
+    return i.extra < program->number_of_calls && program->calls[i.extra].inputs == inputs &&
+           program->calls[i.extra].values == inputs + 1;
+}
+
 static bool extra_is_sound(const Program *program, size_t action_elements, Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
@@ -70,8 +78,10 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
         return i.extra < program->number_of_calls;
     case CALL_SQUARE:
     case CALL_REMAINDER:
-        return i.extra < program->number_of_calls && program->calls[i.extra].inputs == 2 &&
-               program->calls[i.extra].values == 3;
+        return calls_with(program, i, 2);
+    case CALL_SINE:
+    case CALL_COSINE:
+        return calls_with(program, i, 1);
     case CAST:
         return i.extra < VALUE_TYPES * VALUE_TYPES;
     case TAKE:
@@ -298,6 +308,8 @@ static void store_seen(const Slot *slot, const Source *s, size_t begin, size_t c
 
 /* Operations of numpy */
 
+enum { FEW = 8 };
+
 WIDE static bool is_any_set(const uint8_t *flags, size_t lanes) {
     uint8_t any = 0;
 
@@ -342,6 +354,7 @@ static void call_where(const Called *called, size_t count, const uint8_t *doubtf
         number += doubtful[j];
     }
     char *data[] = {(char *)first, (char *)second, (char *)found};
+    data[called->inputs] = (char *)found;
     if (number > 0) {
         called->loop(called->context, data, &number, called->sizes, called->auxiliary);
     }
@@ -350,19 +363,56 @@ static void call_where(const Called *called, size_t count, const uint8_t *doubtf
     }
 }
 
-static void call_quick(const Called *called, size_t count, size_t lanes, uint16_t operation,
-                       const double *x, const double *y, Register *to) {
-    const size_t blocks = lanes / PROGRAM_BLOCK;
+static void compute_quickly(uint16_t operation, const double *x, const double *y, size_t blocks,
+                            double *to, uint8_t *doubtful) {
+    switch (operation) {
+    case CALL_SQUARE:
+        quick_square(x, blocks, to, doubtful);
+        break;
+    case CALL_REMAINDER:
+        quick_remainder(x, y, blocks, to, doubtful);
+        break;
+    case CALL_SINE:
+        quick_sine(x, blocks, to, doubtful);
+        break;
+    default:
+        quick_cosine(x, blocks, to, doubtful);
+    }
+}
+
+static void call_quick(const Called *called, size_t count, size_t lanes,
+                       const Registers *registers, Instruction i) {
+    const double *x = registers->places[i.a], *y = registers->places[i.b];
+    double *to = registers->own[i.to].doubles;
     _Alignas(64) uint8_t doubtful[PROGRAM_WIDTH];
 
-    if (operation == CALL_SQUARE) {
-        quick_square(x, blocks, to->doubles, doubtful);
-    } else {
-        quick_remainder(x, y, blocks, to->doubles, doubtful);
+    if (called->inputs == 1 && count < FEW) { /* for a few, a block takes more time */
+        call(called, count, lanes, registers, i);
+        return;
     }
+    compute_quickly(i.operation, x, called->inputs == 1 ? x : y, lanes / PROGRAM_BLOCK, to,
+                    doubtful);
     if (is_any_set(doubtful, lanes)) {
-        call_where(called, count, doubtful, x, y, to->doubles);
+        call_where(called, count, doubtful, x, called->inputs == 1 ? x : y, to);
     }
+}
+
+/* Whether two instructions compute the sine and the cosine of the same values, and the second one
+ * does not overwrite what the first one reads or writes. */
+static bool are_pair(Instruction first, Instruction second) {
+    return first.operation == CALL_SINE && second.operation == CALL_COSINE && first.a == second.a &&
+           first.to != second.to;
+}
+
+static void call_pair(const Program *program, size_t count, size_t lanes,
+                      const Registers *registers, const Instruction *pair) {
+    const double *x = registers->places[pair[0].a];
+    double *sine = registers->own[pair[0].to].doubles, *cosine = registers->own[pair[1].to].doubles;
+    _Alignas(64) uint8_t doubtful[2][PROGRAM_WIDTH];
+
+    quick_sine_and_cosine(x, lanes / PROGRAM_BLOCK, sine, cosine, doubtful[0], doubtful[1]);
+    call_where(&program->calls[pair[0].extra], count, doubtful[0], x, x, sine);
+    call_where(&program->calls[pair[1].extra], count, doubtful[1], x, x, cosine);
 }
 
 #define CAST_LOOP(number, From, To)                                                                \
@@ -682,7 +732,9 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
     const size_t lanes = whole_blocks(count);
     const void **places = registers->places;
 
-    for (const Instruction *next = program->code; next < program->code + program->length; next++) {
+    const Instruction *end = program->code + program->length;
+
+    for (const Instruction *next = program->code; next < end; next++) {
         const Instruction i = *next;
         if (move(program, source, begin, count, registers, i, notes)) {
             continue;
@@ -701,10 +753,19 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
         case CALL:
             call(&program->calls[i.extra], count, lanes, registers, i);
             break;
+        case CALL_SINE:
+            if (count >= FEW && next + 1 < end && are_pair(i, next[1])) {
+                places[next[1].to] = &registers->own[next[1].to];
+                call_pair(program, count, lanes, registers, next);
+                next++;
+                break;
+            }
+            call_quick(&program->calls[i.extra], count, lanes, registers, i);
+            break;
         case CALL_SQUARE:
         case CALL_REMAINDER:
-            call_quick(&program->calls[i.extra], count, lanes, i.operation, places[i.a],
-                       places[i.b], to);
+        case CALL_COSINE:
+            call_quick(&program->calls[i.extra], count, lanes, registers, i);
             break;
         case CAST:
             cast(i.extra, places[i.a], lanes / PROGRAM_BLOCK, to);

@@ -30,6 +30,8 @@ enum {
     X(CALL, "call")                                                                                \
     X(CALL_SQUARE, "call_square")                                                                  \
     X(CALL_REMAINDER, "call_remainder")                                                            \
+    X(CALL_SINE, "call_sine")                                                                      \
+    X(CALL_COSINE, "call_cosine")                                                                  \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \

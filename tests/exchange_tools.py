@@ -14,6 +14,8 @@ STATES = {
     "friction": ["x", "v"],
     "circuit": ["voltage"],
     "tank": ["x"],
+    "prothero": ["x"],
+    "relay": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -26,12 +28,14 @@ OTHERS = {
     "friction": ["belt", "static", "kinetic", "mode"],
     "circuit": ["duty", "limit", "source", "discharges", "period", "tau"],
     "tank": ["u", "discards"],
+    "prothero": ["k"],
+    "relay": ["turns", "last", "speed"],
 }
 """The other variables in the order of their value references."""
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
-OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards"}
+OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},
     "ball": {"h": 1, "v": 0, "g": -9.81, "e": 0.7, "v_min": 0.1},
@@ -40,6 +44,8 @@ START = {
     "robertson": {"y1": 1, "y2": 0, "y3": 0},
     "friction": {"x": 0, "v": 0.1, "belt": 0.1, "static": 1, "kinetic": 0.6},
     "tank": {"x": 0.01, "u": 0},
+    "prothero": {"x": 1, "k": 1},
+    "relay": {"x": 0, "last": 1e9, "speed": 1},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

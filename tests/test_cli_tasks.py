@@ -109,6 +109,19 @@ DEFECTS = {
         {"parameters": {"v_c": {"distribution": "uniform", "low": 0.1, "high": 0.2}, "c": 0}},
         ("warning", "parameters", "v_c"),
     ),
+    "useless constant": (
+        {"parameters": {"v_c": 0.1, "c": 0}},
+        ("warning", "parameters", "v_c"),
+    ),
+    "idle inputs": (
+        {
+            "fmu": {"bundled": "DoublePendulum"},
+            "variables": {"tau1": {"min": -0.01, "max": 0.01}},
+            "agent": {"actions": ["tau1"], "observations": ["q1"]},
+            "reward": "-abs(q1 - 1)",
+        },
+        ("warning", "inputs", "tau2"),
+    ),
     "fault": ({"reward": "1 / (step - 3)"}, ("error", "run", "step 3")),
 }
 
@@ -124,6 +137,7 @@ class TestValidate:
         assert text in finding.text
         assert finding.cure
         assert report.verdict == verdict
+        assert report.recommended.get("normalize", False) == ("big reaches" in text)
 
     def test_a_sound_task(self):
         report = validate(lambda: fmugym.load(TASK))
@@ -131,6 +145,9 @@ class TestValidate:
         assert report.hooks == "compiled"
         assert 0 < report.costs["step"] < 1
         assert 0 < report.costs["reset"] < 1
+        assert 0 < report.costs["restore"] < 1
+        assert report.recommended["envs"] in (8, 16, 64)
+        assert report.recommended["reset_method"] == report.reset_method
 
     def test_an_error_gives_the_exit_code(self, tmp_path, capsys):
         fmugym.Task.from_dict(TASK | {"reward": "1 / (step - 3)"}).write(tmp_path / "a.toml")

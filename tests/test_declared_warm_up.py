@@ -301,3 +301,14 @@ def test_a_fault_in_it_is_an_error():
     with pytest.raises(SimulationError, match="warm-up"):
         env.reset(seed=0)
     env.close()
+
+
+def test_it_shares_no_time_with_an_excluded_scenario():
+    task = house(
+        clock={"from": "01-10", "to": "01-20", "exclude": "scenarios"},
+        scenarios={"peak": {"start": "01-14", "length": "1d"}},
+    )
+    env = fmugym.load(task)
+    days = {round(env.reset(seed=s)[1]["drawn"]["clock"] / 86400) + 1 for s in range(60)}
+    assert days == {10, 11, 12, 13, 16, 17, 18, 19, 20}
+    env.close()

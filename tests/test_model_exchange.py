@@ -2,9 +2,11 @@
 
 import logging
 import math
+import re
 
 import exchange_tools
 import fmpy
+import fmu_tools
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -118,6 +120,20 @@ class TestSolvers:
         assert errors < 30 * tolerance
         assert errors > 1e-4 * tolerance  # a method that ignored it would be much better or worse
 
+    @all_solvers
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_equations_may_depend_on_time(self, make_pool, solver, kind):
+        pool = make_pool("prothero", 0.25, kind, solver=solver, max_step=0.002)
+        found = run(pool, 20)[:, 0]
+        error = np.abs(found - np.cos(0.25 * np.arange(21))).max()
+        assert error < (2e-3 if solver == "euler" else 2e-6)
+
+    @pytest.mark.parametrize("flags", ["", DERIVATIVES], ids=["differences", "derivatives"])
+    def test_stiff_equations_may_depend_on_time(self, make_pool, flags):
+        pool = make_pool("prothero", 0.25, solver="rosenbrock", tolerance=1e-5, flags=flags)
+        found = run(pool, 20, {"k": 1e6})[:, 0]
+        np.testing.assert_allclose(found, np.cos(0.25 * np.arange(21)), atol=2e-5)
+
     @pytest.mark.parametrize("flags", ["", DERIVATIVES], ids=["differences", "derivatives"])
     def test_stiff_kinetics_agree_with_scipy(self, make_pool, flags):
         pool = make_pool("robertson", 4.0, solver="rosenbrock", tolerance=1e-7, flags=flags)
@@ -222,6 +238,32 @@ class TestEvents:
         outputs, statuses = pool.step()
         assert (outputs[0, 0], statuses[0]) == (10, Status.TERMINATED)
 
+    @all_solvers
+    @all_versions
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_events_after_complete_steps(self, make_pool, solver, version, kind):
+        outputs = ["x", "turns"]
+        spec = {"solver": solver, "max_step": 0.1, "version": version}
+        pool = make_pool("relay", 0.5, kind, outputs=outputs, **spec)
+        found = run(pool, 7)
+        expected = [[0, 0], [0.5, 0], [1, 1], [0.5, 1], [0, 2], [0.5, 2], [1, 3], [0.5, 3]]
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+    @with_states
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_the_wish_to_stop_after_a_step(self, make_pool, version, kind):
+        pool = make_pool("relay", 0.5, kind, outputs=["x", "turns"], max_step=0.1, version=version)
+        start(pool, {"last": 2})
+        statuses = [int(pool.step()[1][0]) for _ in range(5)]
+        assert statuses == [0, 0, 0, 0, Status.TERMINATED]
+        np.testing.assert_allclose(pool.outputs[:, 0], [0.1, 2], atol=1e-12)
+
+    @pytest.mark.parametrize("kind", ["native", "python"])
+    def test_an_fmu_may_do_without_telling_of_steps(self, make_pool, kind):
+        flags = 'completedIntegratorStepNotNeeded="true"'
+        pool = make_pool("relay", 0.5, kind, outputs=["x", "turns"], flags=flags)
+        np.testing.assert_allclose(run(pool, 7)[-1], [3.5, 0], atol=1e-12)
+
     @pytest.mark.parametrize("solver", ["rk4", "dormand_prince", "rosenbrock"])
     def test_a_switched_circuit(self, make_pool, solver):
         pool = make_pool("circuit", 0.02, solver=solver, max_step=0.02)
@@ -233,6 +275,32 @@ class TestEvents:
         pool = make_pool("friction", 0.1, outputs=["x", "v", "mode"], solver=solver, max_step=0.05)
         found = run(pool, 600)
         np.testing.assert_allclose(found, stick_and_slip(0.1, 600), atol=3e-6)
+
+    def test_states_in_arrays(self, tmp_path, make_pool):
+        """The states of FMI 3.0 may be elements of arrays; their number is what counts."""
+        path = exchange_tools.exchange_fmu(tmp_path / "friction.fmu", "friction", 3)
+        edits = {
+            re.compile('<Float64 name="x"[^>]*/>'): '<Float64 name="x" valueReference="0" '
+            'causality="local" initial="exact" start="0 0.1"><Dimension start="2"/></Float64>',
+            re.compile('<Float64 name="der.x."[^>]*/>'): '<Float64 name="der(x)" derivative="0" '
+            'valueReference="2" causality="local"><Dimension start="2"/></Float64>',
+            re.compile('<Float64 name="(v|der.v.)"[^>]*/>'): "",
+            re.compile('<ContinuousStateDerivative valueReference="3"/>'): "",
+        }
+        files = fmu_tools.read_fmu(path)
+        text = files["modelDescription.xml"].decode()
+        for old, new in edits.items():
+            text, count = old.subn(new, text)
+            assert count
+        fmu_tools.write_fmu(path, files | {"modelDescription.xml": text})
+        fmu = FMU(path)
+        assert fmu.description.model_exchange.number_of_states == 2
+        spec = PoolSpec((), (fmu.variable("mode"),), 0.1)
+        pool = opening.make_pool(fmu, spec, 1, LOG)
+        pool.variable = fmu.variable
+        found = run(pool, 600)[:, 0]
+        pool.close()
+        assert found.tolist() == [row[2] for row in stick_and_slip(0.1, 600)]
 
     def test_agreement_with_fmpy(self, fmu_path, make_pool):
         for model, outputs in (("ball", ["h", "v"]), ("circuit", ["voltage"])):

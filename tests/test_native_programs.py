@@ -6,7 +6,7 @@ import pytest
 from fmugym.pool import has_native_pool
 from fmugym.vector.hooks import loops, lowering
 from fmugym.vector.hooks.graph import Graph
-from fmugym.vector.hooks.loops import loop_of, squares_nearly_exactly
+from fmugym.vector.hooks.loops import has_known_sines, loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
 
 pytestmark = pytest.mark.skipif(not has_native_pool(), reason="programs run in the native pool")
@@ -143,6 +143,82 @@ def test_remainders_are_those_of_numpy():
         np.testing.assert_array_equal(found, expected)
         numbers = expected == expected
         np.testing.assert_array_equal(np.signbit(found)[numbers], np.signbit(expected)[numbers])
+
+
+def waves(function, x, operation):
+    """Compute sines or cosines in C."""
+    loop = loop_of(function, (DOUBLE,) * 2), 1, (8, 8), 1
+    code = ("load_row", 0, 0), (operation, 0, 1, 0), ("store_row", 1, 0, 1)
+    stored = np.zeros_like(x)
+    evaluate(code, (x, stored), x, calls=(loop,))
+    return stored
+
+
+def hard_angles(count):
+    """Angles of all magnitudes, and those next to multiples of a quarter of a turn."""
+    rng = np.random.default_rng(3)
+    whole = rng.integers(-(2**19), 2**19, count) * (np.pi / 2)
+    near = np.arange(-400, 400) * (np.pi / 2)
+    parts = [
+        rng.uniform(-np.pi, np.pi, 4 * count),
+        rng.uniform(-30.0, 30.0, 4 * count),
+        rng.normal(size=count) * 10.0 ** rng.uniform(-12, 8, count),
+        whole,
+        *(near + offset for offset in (0.0, 1e-16, -1e-9, 1e-6, -1e-5, 1e-3)),
+        np.linspace(-0.9, 0.9, count),
+        np.arange(-3000.0, 3000.0) / 4,
+        [0.0, -0.0, np.inf, -np.inf, np.nan, 5e-324, -1e-200, 1e-160, 2.0**20, 1e300, 1e-8],
+    ]
+    return np.concatenate(parts)
+
+
+@pytest.mark.skipif(not has_known_sines(), reason="the error of this system's sine is not known")
+@pytest.mark.parametrize(
+    ("function", "operation"), [(np.sin, "call_sine"), (np.cos, "call_cosine")]
+)
+def test_sines_are_those_of_numpy(function, operation):
+    x = hard_angles(100_000)
+    with np.errstate(all="ignore"):
+        expected = function(x)
+    for name in ("call", operation):
+        found = waves(function, x, name)
+        np.testing.assert_array_equal(found, expected)
+        numbers = expected == expected
+        assert found[numbers].tobytes() == expected[numbers].tobytes()
+
+
+@pytest.mark.skipif(not has_known_sines(), reason="the error of this system's sine is not known")
+@pytest.mark.parametrize("first", [np.sin, np.cos])
+def test_the_sine_and_the_cosine_of_an_angle_stand_side_by_side(first):
+    graph = Graph()
+    angle = graph.load("row", ("output", 0), DOUBLE, None)
+    other = np.cos if first is np.sin else np.sin
+    one = graph.apply(first, (angle,), DOUBLE)
+    between = graph.apply(np.square, (one,), DOUBLE)
+    last = graph.apply(other, (angle,), DOUBLE)
+    stores = [lowering.Store(cell.node, ("input", 0)) for cell in (between, last)]
+    compiled = lowering.compile_graph(graph, stores, [], 0)
+    names = [OPERATIONS[line[0]] for line in compiled.code]
+    assert names[:3] == ["load_row", "call_sine", "call_cosine"]
+    assert len(names) == 6
+
+
+@pytest.mark.skipif(not has_known_sines(), reason="the error of this system's sine is not known")
+@pytest.mark.parametrize("n", LENGTHS)
+def test_both_at_once_are_those_of_numpy(n):
+    x = np.resize(hard_angles(7)[::-1], n)
+    stored = np.zeros((2, n))
+    loops_of = [(loop_of(f, (DOUBLE,) * 2), 1, (8, 8), 1) for f in (np.sin, np.cos)]
+    code = (
+        ("load_row", 0, 0),
+        ("call_sine", 0, 1, 0),
+        ("call_cosine", 1, 2, 0),
+        ("store_row", 1, 0, 1),
+        ("store_row", 2, 0, 2),
+    )
+    evaluate(code, (x, *stored), x, calls=tuple(loops_of))
+    with np.errstate(all="ignore"):
+        np.testing.assert_array_equal(stored, np.stack([np.sin(x), np.cos(x)]))
 
 
 def hard_numbers(count):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import fields
 from functools import cached_property
 from typing import Any, Final
 
@@ -11,14 +10,20 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
-from fmugym.config import EnvConfig
+from fmugym.declared.configuring import (
+    bounds_of,
+    clock_of,
+    own_config,
+    samplings_of,
+    time_step_of,
+    times_of,
+)
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
-from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import function_of
 from fmugym.declared.kpis import kpi_name
 from fmugym.declared.named import named_values
-from fmugym.declared.naming import CLOCK, Moment, Naming, switch_names
+from fmugym.declared.naming import Moment, Naming, switch_names
 from fmugym.declared.observing import (
     History,
     NoiseKey,
@@ -32,8 +37,6 @@ from fmugym.declared.observing import (
 )
 from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
-from fmugym.declared.quantities import duration
-from fmugym.declared.seasons import read_clock, read_scenarios
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
@@ -42,16 +45,6 @@ from fmugym.pool.spec import whole_number_of_steps
 from fmugym.task.quantity import Quantities
 
 __all__ = ["Plan"]
-
-_OF_SECTIONS: Final = frozenset(
-    {"model_input_names", "model_output_names", "model_parameters", "monitor_names"}
-    | {"samplings"}
-    | {"episode_variables", "bounds", "time_step", "substeps", "max_episode_steps", "warm_up"}
-    | {"start_time", "positive_reward", "negative_reward"}
-)
-"""Keys of a config that other sections of a task determine."""
-
-_OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
 
 WORST: Final = "worst reward"
 """The episode variable with the lowest reward until now, or 0."""
@@ -90,7 +83,7 @@ class Plan:
         self._declared = declared = Declarations.read(task.root, description)
         if needs_reward and not declared.rewards:
             raise task.root.error('the task has no reward; say one, for example: reward = "1"')
-        self._time_step = _time_step(task.root, description)
+        self._time_step = time_step_of(task.root, description)
         self._warm_steps = self._steps_of_warm_up()
         self._naming = Naming(declared, self._time_step, self._warm_steps)
         for name in declared.derived:
@@ -145,15 +138,15 @@ class Plan:
     def _make_config(self) -> dict[str, Any]:
         declared, records = self._declared, self._declared.records
         return {
-            **self._own_config(),
-            **self._times(),
+            **own_config(self._root),
+            **times_of(declared, self._time_step),
             "model_input_names": [records[name].fmu_name for name in declared.written],
             "model_output_names": [records[name].fmu_name for name in self._naming.outputs],
             "monitor_names": [records[name].fmu_name for name in self._naming.monitors],
             "model_parameters": {r.fmu_name: value for r, value in declared.parameters.values()},
             "episode_variables": self._variables(),
-            "bounds": self._bounds(),
-            "samplings": self._samplings(),
+            "bounds": bounds_of(declared, self._naming),
+            "samplings": samplings_of(declared, self._naming),
         }
 
     def _variables(self) -> dict[str, Any]:
@@ -166,7 +159,14 @@ class Plan:
             switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
         kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
-        variables = remembered | self._clock() | histories | switches | worst | kpis
+        variables = (
+            remembered
+            | clock_of(self._declared, self._time_step, self._warm_steps)
+            | histories
+            | switches
+            | worst
+            | kpis
+        )
         return variables | self._noise(variables)
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
@@ -178,14 +178,6 @@ class Plan:
         parameters = [value for _, value in self._declared.parameters.values()]
         draws = any(map(is_distribution, [*parameters, *variables.values()]))
         return {NOISE: NoiseKey(draws=not draws)}
-
-    def _clock(self) -> dict[str, Any]:
-        """When episodes begin, if the task has a clock of its own."""
-        clock, scenarios = self._root.child("clock"), read_scenarios(self._root.child("scenarios"))
-        if clock.value is None:
-            return {}
-        length = self._times().get("max_episode_steps", 0) * self._time_step
-        return {CLOCK: read_clock(clock, scenarios, length)}
 
     @property
     def _switched(self) -> list[Record]:
@@ -206,54 +198,6 @@ class Plan:
         if own.value is not None or not rewards:
             return False
         return any(not _is_number(code) for code in self._terms(rewards).values())
-
-    def _own_config(self) -> dict[str, Any]:
-        section = self._root.child("config")
-        if section.value is None:
-            return {}
-        own = section.table(_OF_CONFIG)
-        for key, entry in own.items():
-            with entry.placing():
-                EnvConfig((), ("any",), **{key: entry.value})  # which checks the value
-        return {key: entry.value for key, entry in own.items()}
-
-    def _times(self) -> dict[str, Any]:
-        times: dict[str, Any] = {"time_step": self._time_step}
-        start = self._root.child("start_time")
-        if isinstance(start.value, Mapping | list):
-            raise start.error(
-                "start_time is one time; 'clock' takes lists, seasons and what is drawn"
-            )
-        if self._declared.warm_up.period:
-            times["warm_up"] = self._declared.warm_up.period
-        if start.value is not None:
-            times["start_time"] = start.check(duration)
-        if self._root.child("substeps").value is not None:
-            times["substeps"] = self._root.child("substeps").value
-        if self._root.child("episode_length").value is not None:
-            times["max_episode_steps"] = self._episode_steps(self._root.child("episode_length"))
-        return times
-
-    def _episode_steps(self, entry: Entry) -> int:
-        length, step = entry.check(duration), self._time_step
-        count = whole_number_of_steps(length, step)
-        if not count:
-            raise entry.error(
-                f"episode_length must be a multiple of the time step of {step:g} s, got {length:g} "
-                "s"
-            )
-        return count
-
-    def _samplings(self) -> dict[str, str]:
-        names = [*self._naming.outputs, *self._naming.monitors]
-        records = [self._declared.records[name] for name in names]
-        return {r.fmu_name: r.sample for r in records if r.sample != "last"}
-
-    def _bounds(self) -> dict[str, tuple[float, float]]:
-        """The limits that the base class needs in order to make spaces."""
-        names = [*self._declared.written, *self._naming.outputs]
-        records = [self._declared.records[name] for name in names]
-        return {r.fmu_name: (r.low, r.high) for r in records if _has_own_limits(r)}
 
     # Spaces, and what leads into and out of them.
 
@@ -492,18 +436,6 @@ def _in_turn(updates: list[Hook]) -> Hook:
     return update
 
 
-def _time_step(root: Entry, description: ModelDescription) -> float:
-    entry = root.child("time_step")
-    if entry.value is not None:
-        step = entry.check(duration)
-        if step > 0:
-            return step
-        raise entry.error("time_step must be positive, got 0")
-    if description.step_size is None:
-        raise root.error("the key 'time_step' is missing, and the FMU has no default step size")
-    return description.step_size
-
-
 def _is_number(code: str) -> bool:
     """Whether code is a constant."""
     try:
@@ -511,11 +443,6 @@ def _is_number(code: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _has_own_limits(record: Record) -> bool:
-    given = record.entry.value or {}
-    return is_plain(record) and ("min" in given or "max" in given)
 
 
 def _box(limits: list[tuple[float, float]]) -> spaces.Box:

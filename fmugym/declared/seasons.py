@@ -62,13 +62,16 @@ def _scenario(entry: Entry) -> Scenario:
     return Scenario(_moment(entry.required("start")), length)
 
 
-def read_clock(entry: Entry, scenarios: Mapping[str, Scenario], length: float) -> Any:
+def read_clock(
+    entry: Entry, scenarios: Mapping[str, Scenario], length: float, before: float = 0.0
+) -> Any:
     """Read when episodes begin.
 
     Args:
         entry: A time or date, a distribution of seconds, a list of times and dates, or a season.
         scenarios: What a season may exclude.
         length: The length of an episode in seconds; 0 if it has no limit.
+        before: The length of a warm-up with the data of the time before an episode.
 
     Returns:
         Seconds since the beginning of the year, or a distribution of them.
@@ -85,7 +88,8 @@ def read_clock(entry: Entry, scenarios: Mapping[str, Scenario], length: float) -
         return _moment(entry)
     starts = list(_starts(entry))
     excluded = [] if entry.child("exclude").value is None else _excluded(entry, scenarios)
-    free = [s for s in starts if not any(one.overlaps(s, length) for one in excluded)]
+    span = before + length
+    free = [s for s in starts if not any(one.overlaps(s - before, span) for one in excluded)]
     if not free:
         raise entry.error("no day of the season is left for an episode")
     return Choice(free)

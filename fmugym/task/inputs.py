@@ -15,7 +15,7 @@ from fmugym.task.actions import flat_inputs
 
 __all__ = ["InputWriter"]
 
-_FLOATS: Final = frozenset({float, np.float64})
+_FLOATS: Final = frozenset({float, np.float64, np.float32})
 
 
 class InputWriter:

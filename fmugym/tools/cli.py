@@ -7,7 +7,7 @@
     fmugym validate TASK|model.fmu
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
     fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
-        [--episodes N] [--no-normalize] [KEY=VALUE ...]
+        [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb] [KEY=VALUE ...]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
@@ -18,7 +18,7 @@
 
 TASK is a task file, a registered id or ``module:Class``. WHO is ``--action random|NUMBERS``,
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
-``--steps N``. All commands but ``train`` take ``--json``.
+``--steps N``. All commands take ``--json``.
 
 ``info``, ``new``, ``skeleton`` and ``stand-in`` execute nothing of the FMU, the others do. Output
 is printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the error stream
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: With the code 2 if the arguments are wrong, 0 after ``--help``.
     """
-    arguments = _parser().parse_args(argv)
+    arguments = _parsed(argv)
     try:
         code: int = arguments.run(arguments) or 0
         sys.stdout.flush()
@@ -108,6 +108,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         note(str(error), "error")
         return 1
     return 0
+
+
+def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    more = [text for text in rest if "=" in text and not text.startswith("-")]
+    if rest and (len(more) < len(rest) or not hasattr(arguments, "arguments")):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        arguments.arguments = [*arguments.arguments, *more]
+    return arguments
 
 
 def _parser() -> argparse.ArgumentParser:

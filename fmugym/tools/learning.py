@@ -3,21 +3,41 @@
 from __future__ import annotations
 
 import argparse
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Final
 
-from fmugym.tools.evaluation import table
+from fmugym.errors import ConfigError
+from fmugym.tools.agents import FACTS
+from fmugym.tools.evaluation import Score, table
 from fmugym.tools.options import (
     Commands,
     add_command,
+    add_json,
     add_task,
     check_numbers,
     say,
+    say_json,
     tell,
 )
+from fmugym.tools.progress import progress
 from fmugym.tools.targets import maker_of, scenarios_of
-from fmugym.tools.training import Plan, arguments_of, train
+from fmugym.tools.tracking import TRACKERS, tracker_for
+from fmugym.tools.training import Plan, Watch, arguments_of, facts_of, train
+from fmugym.tools.tuning import tune
 
 __all__ = ["add_train"]
+
+_DEFAULTS: Final[dict[str, Any]] = {
+    "algorithm": "PPO",
+    "steps": 100_000,
+    "envs": 8,
+    "seed": 0,
+    "episodes": 5,
+    "normalize": True,
+}
+"""What holds if neither the options nor a training that is resumed say otherwise."""
 
 
 def add_train(commands: Commands) -> None:
@@ -29,30 +49,91 @@ def add_train(commands: Commands) -> None:
         "arguments", nargs="*", metavar="KEY=VALUE", help="arguments of the algorithm"
     )
     command.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="a new one")
-    command.add_argument("--algorithm", default="PPO", help="PPO (default), A2C, SAC, TD3, DQN ...")
-    command.add_argument("--steps", type=int, default=100_000, help="default 100000")
-    command.add_argument("--envs", type=int, default=8, help="that step together; default 8")
-    command.add_argument("--seed", type=int, default=0, help="default 0")
-    command.add_argument("--episodes", type=int, default=5, help="of an evaluation; default 5")
+    command.add_argument("--algorithm", help="PPO (default), A2C, SAC, TD3, DQN ...")
+    command.add_argument("--steps", type=int, help="default 100000")
+    command.add_argument("--envs", type=int, help="that step together; default 8")
+    command.add_argument("--seed", type=int, help="default 0")
+    command.add_argument("--episodes", type=int, help="of an evaluation; default 5")
     command.add_argument(
-        "--no-normalize", action="store_true", help="without running normalization"
+        "--no-normalize",
+        action="store_false",
+        dest="normalize",
+        default=None,
+        help="without running normalization",
     )
+    command.add_argument(
+        "--resume", action="store_true", help="go on with the training in the folder"
+    )
+    command.add_argument(
+        "--tune", type=int, metavar="N", help="first try N sets of arguments with Optuna"
+    )
+    command.add_argument(
+        "--tune-steps", type=int, metavar="N", help="of each of these; default a tenth of --steps"
+    )
+    command.add_argument("--track", choices=sorted(TRACKERS), help="log to this library, too")
+    add_json(command)
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    check_numbers(arguments, "steps", "envs", "episodes")
-    names = scenarios_of(arguments.task)
+    plan, begin_tracker = _plan_of(arguments), None
+    if arguments.track is not None:
+        facts = {"task": arguments.task, "steps": plan.steps, **plan.facts()}
+        begin_tracker = tracker_for(arguments.track, facts, plan.folder)
+    if arguments.tune is not None:
+        plan = _tuned(plan, arguments)
+    with progress(plan.steps, "train") as advance:
+        watch = Watch(tell, advance, begin_tracker=begin_tracker)
+        scores = train(plan, resume=arguments.resume, watch=watch)
+    _show(plan, scores, arguments)
+
+
+def _plan_of(arguments: argparse.Namespace) -> Plan:
+    """The plan that the options make, together with what a training was begun with."""
+    before = facts_of(arguments.output) if arguments.resume else {}
+    given = {name: getattr(arguments, name) for name in _DEFAULTS}
+    for name, default in _DEFAULTS.items():
+        if given[name] is None:
+            given[name] = before.get(name, default)
+    options = argparse.Namespace(**given)
+    check_numbers(options, "steps", "envs", "episodes")
+    own = arguments_of(arguments.arguments) or before.get("arguments", {})
+    make_env, names = maker_of(arguments.task), scenarios_of(arguments.task)
     held_out = {name: maker_of(arguments.task, name) for name in names}
-    plan = Plan(
-        maker_of(arguments.task),
-        held_out or {"held-out seeds": maker_of(arguments.task)},
+    return Plan(
+        make_env,
+        held_out or {"held-out seeds": make_env},
         arguments.output,
-        arguments.algorithm,
-        arguments.steps,
-        arguments.envs,
-        arguments.seed,
-        arguments.episodes,
-        normalize=not arguments.no_normalize,
-        arguments=arguments_of(arguments.arguments),
+        options.algorithm,
+        options.steps,
+        options.envs,
+        options.seed,
+        options.episodes,
+        normalize=options.normalize,
+        arguments=own,
     )
-    say(table(train(plan, tell)))
+
+
+def _tuned(plan: Plan, arguments: argparse.Namespace) -> Plan:
+    if arguments.resume:
+        raise ConfigError("--tune is for a new training, which --resume is not")
+    arguments.tune_steps = arguments.tune_steps or max(1, plan.steps // 10)
+    check_numbers(arguments, "tune", "tune_steps")
+    with progress(arguments.tune, "tune") as advance:
+
+        def noted(line: str) -> None:
+            advance(1)
+            tell(line)
+
+        best = tune(plan, arguments.tune, arguments.tune_steps, noted)
+    tell(f"the best arguments are {json.dumps(best)}")
+    return replace(plan, arguments=best)
+
+
+def _show(plan: Plan, scores: list[Score], arguments: argparse.Namespace) -> None:
+    if not arguments.json:
+        say(table(scores))
+        return
+    best = json.loads((plan.folder / FACTS).read_text(encoding="utf-8"))
+    facts = {"task": arguments.task, "output": arguments.output, "steps": plan.steps}
+    told = {"best": best, "scores": [one.as_dict() for one in scores]}
+    say_json({**facts, **plan.facts(), **told})

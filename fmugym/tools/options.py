@@ -13,9 +13,9 @@ from typing import Any, Final
 from fmugym.checks import check_count, check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.tools.agents import agent_policy
 from fmugym.tools.overview import plain
 from fmugym.tools.simulation import Policy, action_of, policy_of
-from fmugym.tools.training import agent_policy
 
 __all__ = [
     "HELP_OF_TASK",

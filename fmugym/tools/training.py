@@ -1,33 +1,49 @@
-"""Training of agents with Stable-Baselines3, and the agents that come of it."""
+"""Training of agents with Stable-Baselines3."""
 
 from __future__ import annotations
 
 import csv
 import json
-import pickle
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from time import monotonic
 from typing import Any, Final
 
 from gymnasium import spaces
 
-from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.tools.agents import algorithm_of, imported_for_training, policy_with, save
+from fmugym.tools.checkpoints import load_checkpoint, save_checkpoint
 from fmugym.tools.evaluation import Score, evaluate
-from fmugym.tools.simulation import Policy
+from fmugym.tools.progress import Advance, no_progress
+from fmugym.tools.tracking import Tracker
 
-__all__ = ["Plan", "agent_policy", "arguments_of", "train"]
+__all__ = [
+    "TRAINING",
+    "TRIALS",
+    "Plan",
+    "Watch",
+    "arguments_of",
+    "facts_of",
+    "require_new",
+    "train",
+]
 
-_LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
-_MODEL, _NORMALIZATION, _FACTS = "model.zip", "normalization.pkl", "agent.json"
+TRAINING: Final = "training.json"
+TRIALS: Final = "trials"
 _EVALUATIONS: Final = 10
 _HELD_OUT_SEED: Final = 1_000_000
 """Episodes of evaluations have seeds from here on, which no training uses."""
+
+_SECONDS_BETWEEN_CHECKPOINTS: Final = 30.0
+_CSV: Final = "evaluations.csv"
 
 
 @dataclass(frozen=True)
@@ -37,7 +53,7 @@ class Plan:
     Attributes:
         make_env: A function that makes the environment.
         held_out: By name, functions that make the environments of evaluations.
-        folder: Where the agent is written; it must not exist.
+        folder: Where the agent is written; it must not exist, unless a training is resumed.
         algorithm: The name of a class of Stable-Baselines3 or sb3-contrib.
         steps: Steps of all environments together.
         num_envs: Environments that step together.
@@ -60,6 +76,17 @@ class Plan:
     normalize: bool = True
     arguments: Mapping[str, Any] | None = None
 
+    def facts(self) -> dict[str, Any]:
+        """What a training that is resumed must have in common with its beginning."""
+        return {
+            "algorithm": self.algorithm,
+            "envs": self.num_envs,
+            "seed": self.seed,
+            "episodes": self.episodes,
+            "normalize": self.normalize,
+            "arguments": dict(self.arguments or {}),
+        }
+
 
 def arguments_of(texts: Iterable[str]) -> dict[str, Any]:
     """Read arguments of an algorithm, ``key=value`` with values as in TOML.
@@ -81,180 +108,269 @@ def arguments_of(texts: Iterable[str]) -> dict[str, Any]:
     return arguments
 
 
-def train(plan: Plan, tell: Callable[[str], None] = lambda line: None) -> list[Score]:
+@dataclass(frozen=True)
+class Watch:
+    """Who is told of a training.
+
+    Attributes:
+        tell: Gets a line of text for each evaluation.
+        advance: Is told of steps.
+        evaluated: Gets the steps and the mean reward of each evaluation. An exception of it ends
+            the training.
+        begin_tracker: Makes what gets all numbers, when the folder is there; None for nobody.
+    """
+
+    tell: Callable[[str], None] = lambda line: None
+    advance: Advance = no_progress
+    evaluated: Callable[[int, float], None] = lambda steps, mean: None
+    begin_tracker: Callable[[], Tracker] | None = None
+
+
+def train(
+    plan: Plan,
+    tell: Callable[[str], None] = lambda line: None,
+    *,
+    resume: bool = False,
+    watch: Watch | None = None,
+) -> list[Score]:
     """Train an agent, and evaluate it on the way. The best one is kept.
 
-    An interruption by Ctrl-C ends the training; the best agent until then is in the folder.
+    An interruption by Ctrl-C ends the training; the best agent until then is in the folder, and a
+    checkpoint from which the training can be resumed.
 
     Args:
         plan: What to train.
         tell: Gets a line of text for each evaluation.
+        resume: Whether to go on with the training in the folder. If the FMU's state can be saved or
+            its steps repeated, all takes the same course as without the interruption, to the last
+            bit.
+        watch: Who is told of the training, in the place of ``tell``.
 
     Returns:
         The scores of the last evaluation.
 
     Raises:
-        ConfigError: If Stable-Baselines3 is missing, or an argument does not fit.
-        FileExistsError: If the folder exists.
+        ConfigError: If Stable-Baselines3 is missing, an argument does not fit, or there is no such
+            training to resume.
+        FileExistsError: If the folder exists, unless a training is resumed.
     """
-    make_sb3_env = _import("fmugym.sb3").make_sb3_env
-    algorithm = _algorithm(plan.algorithm)
-    if plan.folder.exists():
-        raise FileExistsError(f"{plan.folder} exists; name a new folder")
+    make_sb3_env = imported_for_training("fmugym.sb3").make_sb3_env
+    algorithm_of(plan.algorithm)
+    if resume:
+        _require_same(plan)
+    else:
+        require_new(plan.folder)
     venv = make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed)
     try:
-        is_box = isinstance(venv.observation_space, spaces.Box)
-        if plan.normalize and is_box:
-            wrappers = import_module("stable_baselines3.common.vec_env")
-            venv = wrappers.VecNormalize(venv)
-        model = _model(plan, algorithm, venv)
-        _log_to(plan.folder, model)
-        keeper = _Keeper(plan, model, venv, tell)
-        try:
-            model.learn(plan.steps, callback=keeper.callback())
-        finally:
-            model.logger.close()
-            keeper.evaluate()
-        return keeper.scores
+        if plan.normalize and isinstance(venv.observation_space, spaces.Box):
+            venv = import_module("stable_baselines3.common.vec_env").VecNormalize(venv)
+        with closing(_Training(plan, venv, watch or Watch(tell), resume)) as training:
+            training.run()
+        return training.scores
     finally:
         venv.close()
 
 
-def _model(plan: Plan, algorithm: Any, venv: Any) -> Any:
+def require_new(folder: Path) -> None:
+    """Refuse a folder that has more in it than a search for arguments.
+
+    Raises:
+        FileExistsError: If it has.
+    """
+    if folder.exists() and not {path.name for path in folder.iterdir()} <= {
+        TRIALS,
+        f"{TRIALS}.csv",
+    }:
+        raise FileExistsError(f"{folder} exists; name a new folder")
+
+
+def facts_of(folder: Path) -> dict[str, Any]:
+    """What a training was begun with.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    try:
+        facts: dict[str, Any] = json.loads((folder / TRAINING).read_text(encoding="utf-8"))
+        return {"steps": facts["steps"], **facts}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
+
+
+def _require_same(plan: Plan) -> None:
+    before = facts_of(plan.folder)
+    for name, value in plan.facts().items():
+        if before.get(name) != value:
+            raise ConfigError(
+                f"the training in {shown(str(plan.folder))} has {name} = "
+                f"{shown(before.get(name))}, which cannot change to {shown(value)}"
+            )
+
+
+def _new_model(plan: Plan, venv: Any) -> Any:
     own = dict(plan.arguments or {})
     policy = own.pop("policy", None)
     if policy is None:
         is_dict = isinstance(venv.observation_space, spaces.Dict)
-        policy = "MultiInputPolicy" if is_dict else "MlpPolicy"
+        recurrent = "Lstm" if plan.algorithm.startswith("Recurrent") else ""
+        policy = f"{'MultiInput' if is_dict else 'Mlp'}{recurrent}Policy"
     try:
+        algorithm = algorithm_of(plan.algorithm)
         return algorithm(policy, venv, **{"seed": plan.seed, "device": "cpu", **own})
     except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(f"{plan.algorithm} cannot be made: {reason(error)}") from error
 
 
-def _log_to(folder: Path, model: Any) -> None:
-    folder.mkdir(parents=True)
-    logger = import_module("stable_baselines3.common.logger")
-    formats = ["csv", *(["tensorboard"] if find_spec("tensorboard") else [])]
-    model.set_logger(logger.configure(str(folder), formats))
-
-
-def _algorithm(name: str) -> Any:
-    """Find the class of an algorithm by its name."""
-    base: Any = _import("stable_baselines3.common.base_class").BaseAlgorithm
-    known = {
-        key: value
-        for library in filter(find_spec, _LIBRARIES)
-        for key, value in vars(import_module(library)).items()
-        if isinstance(value, type) and issubclass(value, base)
-    }
-    return known[check_option("algorithm", name, known)]
-
-
-def _import(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ConfigError(
-            f"training needs Stable-Baselines3, but {name} cannot be imported; install the extra: "
-            "pip install 'fmugym-toolbox[sb3]'"
-        ) from error
-
-
-class _Keeper:
-    """Evaluates the agent now and then, and keeps the best one.
+class _Training:
+    """A training: evaluates the agent now and then, keeps the best one, and can be resumed.
 
     Attributes:
         scores: The scores of the last evaluation.
     """
 
-    def __init__(self, plan: Plan, model: Any, venv: Any, tell: Callable[[str], None]) -> None:
-        self._plan, self._model, self._venv, self._tell = plan, model, venv, tell
-        self._best = -float("inf")
-        self._due = max(1, plan.steps // _EVALUATIONS)
-        self._next, self._last = self._due, -1
+    def __init__(self, plan: Plan, venv: Any, watch: Watch, resume: bool) -> None:
+        self._plan, self._venv, self._watch = plan, venv, watch
         self.scores: list[Score] = []
+        self._due = max(1, plan.steps // _EVALUATIONS)
+        self._progress = {"best": -float("inf"), "next": self._due, "last": -1}
+        self._is_new = not resume
+        if resume:
+            self._load()
+        else:
+            self._model = _new_model(plan, venv)
+            plan.folder.mkdir(parents=True, exist_ok=True)
+        facts = {"schema": 1, "steps": plan.steps, **plan.facts()}
+        (plan.folder / TRAINING).write_text(json.dumps(facts), encoding="utf-8")
+        self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
+        self._begin = self._told = self._steps
+        self._saved_at = monotonic()
 
-    def callback(self) -> Any:
-        """The callback of Stable-Baselines3, which it calls in each step."""
+    def _load(self) -> None:
+        plan = self._plan
+        self._model, more, is_exact = load_checkpoint(plan.folder, plan.algorithm, self._venv)
+        self._due, self._progress = more["due"], more["progress"]
+        _drop_rows(plan.folder / _CSV, self._steps)
+        how = "" if is_exact else "; the FMUs cannot, so that their episodes begin anew"
+        self._watch.tell(f"goes on after {self._steps} steps{how}")
 
-        def after_step(local_names: Any, global_names: Any) -> bool:
-            if self._model.num_timesteps >= self._next:
-                self._next += self._due
+    @property
+    def _steps(self) -> int:
+        return int(self._model.num_timesteps)
+
+    def run(self) -> None:
+        """Train until the end, and evaluate once more."""
+        self._log_to()
+        remaining = self._plan.steps - self._steps
+        try:
+            if remaining > 0:
+                self._model.learn(
+                    remaining, callback=self._callback(), reset_num_timesteps=self._is_new
+                )
                 self.evaluate()
-            return True
+                self._save_checkpoint()
+            else:
+                self.evaluate()
+        except KeyboardInterrupt:
+            self.evaluate()
+            raise
 
-        return after_step
+    def close(self) -> None:
+        """Close all logs."""
+        if self._tracker is not None:
+            self._tracker.close()
+        if hasattr(self._model, "_logger"):
+            self._model.logger.close()
+
+    def _log_to(self) -> None:
+        logger = import_module("stable_baselines3.common.logger")
+        suffix = f"_from_{self._begin}" if self._begin else ""
+        kinds = ["csv", *(["tensorboard"] if find_spec("tensorboard") else [])]
+        folder = str(self._plan.folder)
+        formats = [logger.make_output_format(kind, folder, suffix) for kind in kinds]
+        if self._tracker is not None:
+            formats.append(_writer_to(self._tracker, logger.KVWriter))
+        self._model.set_logger(logger.Logger(folder=folder, output_formats=formats))
+
+    def _callback(self) -> Any:
+        base = import_module("stable_baselines3.common.callbacks").BaseCallback
+        methods = {
+            "_on_step": lambda callback: self._after_step(),
+            "_on_rollout_start": lambda callback: self._between_updates(),
+        }
+        return type("Callback", (base,), methods)()
+
+    def _after_step(self) -> bool:
+        self._watch.advance(self._steps - self._told)
+        self._told = self._steps
+        if self._steps >= self._progress["next"]:
+            self._progress["next"] += self._due
+            self.evaluate()
+            self._saved_at = -float("inf")  # before the next update
+        return True
+
+    def _between_updates(self) -> None:
+        if monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS:
+            self._save_checkpoint()
+            self._saved_at = monotonic()
+
+    def _save_checkpoint(self) -> None:
+        more = {"due": self._due, "progress": dict(self._progress)}
+        save_checkpoint(self._plan.folder, self._model, self._venv, more)
 
     def evaluate(self) -> None:
         """Evaluate the agent, unless that was done at this step."""
-        steps = int(self._model.num_timesteps)
-        if steps == self._last:
+        plan, steps = self._plan, self._steps
+        if steps == self._progress["last"] and self.scores:
             return
-        self._last = steps
-        policy = _policy(self._model, self._normalization())
-        seeds = range(_HELD_OUT_SEED, _HELD_OUT_SEED + self._plan.episodes)
+        is_new = steps != self._progress["last"]
+        self._progress["last"] = steps
+        make_policy = partial(policy_with, self._model, self._normalization())
+        seeds = range(_HELD_OUT_SEED, _HELD_OUT_SEED + plan.episodes)
         self.scores = []
-        for name, make_env in self._plan.held_out.items():
-            one = {name: lambda env: policy}
-            self.scores += evaluate(make_env, one, seeds, self._plan.most_steps)
+        for name, make_env in plan.held_out.items():
+            self.scores += evaluate(make_env, {name: make_policy}, seeds, plan.most_steps)
         mean = sum(score.mean for score in self.scores) / len(self.scores)
-        self._tell(f"{steps} steps: reward {mean:.6g} in evaluation")
-        self._note(steps, mean)
-        if mean > self._best:
-            self._best = mean
-            self._save(steps)
+        self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")
+        if is_new:
+            self._note(steps, mean)
+            self._keep_if_best(steps, mean)
+            self._watch.evaluated(steps, mean)
 
     def _normalization(self) -> Any:
         return self._venv if hasattr(self._venv, "normalize_obs") else None
 
     def _note(self, steps: int, mean: float) -> None:
-        path = self._plan.folder / "evaluations.csv"
+        names = [score.name for score in self.scores]
+        path = self._plan.folder / _CSV
         is_new = not path.exists()
         with path.open("a", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             if is_new:
-                writer.writerow(["steps", "reward", *(score.name for score in self.scores)])
+                writer.writerow(["steps", "reward", *names])
             writer.writerow([steps, mean, *(score.mean for score in self.scores)])
+        if self._tracker is not None:
+            each = {f"evaluation/{score.name}": score.mean for score in self.scores}
+            self._tracker.log({"evaluation/reward": mean, **each}, steps)
 
-    def _save(self, steps: int) -> None:
-        folder, normalization = self._plan.folder, self._normalization()
-        self._model.save(folder / _MODEL)
-        if normalization is not None:
-            normalization.save(str(folder / _NORMALIZATION))
-        facts = {"algorithm": self._plan.algorithm, "steps": steps, "reward": self._best}
-        (folder / _FACTS).write_text(json.dumps(facts), encoding="utf-8")
-
-
-def _policy(model: Any, normalization: Any) -> Policy:
-    def choose(observation: Any) -> Any:
-        if normalization is not None:
-            observation = normalization.normalize_obs(observation)
-        action, _ = model.predict(observation, deterministic=True)
-        return action if action.ndim else int(action)
-
-    return Policy(choose)
+    def _keep_if_best(self, steps: int, mean: float) -> None:
+        if mean > self._progress["best"]:
+            self._progress["best"] = mean
+            facts = {"algorithm": self._plan.algorithm, "steps": steps, "reward": mean}
+            save(self._plan.folder, self._model, self._normalization(), facts)
 
 
-def agent_policy(folder: Path) -> Callable[[FMUEnv], Policy]:
-    """Load the agent that ``train`` has written to a folder.
+def _writer_to(tracker: Tracker, base: Any) -> Any:
+    """What writes the log of Stable-Baselines3 to a tracker; it must be one of its own classes."""
+    methods = {
+        "write": lambda self, values, excluded, step=0: tracker.log(values, step),
+        "close": lambda self: tracker.close(),
+    }
+    return type("Writer", (base,), methods)()
 
-    Only load agents from sources that you trust: the files hold pickles, which can run code.
 
-    Raises:
-        ConfigError: If there is no agent, or Stable-Baselines3 is missing.
-    """
-    try:
-        facts = json.loads((folder / _FACTS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
-    model = _algorithm(facts["algorithm"]).load(folder / _MODEL, device="cpu")
-    normalization = None
-    if (folder / _NORMALIZATION).exists():
-        wrappers = import_module("stable_baselines3.common.vec_env")
-        with (folder / _NORMALIZATION).open("rb") as file:
-            normalization = pickle.load(file)
-        if not isinstance(normalization, wrappers.VecNormalize):
-            raise ConfigError(f"{_NORMALIZATION} in {shown(str(folder))} is of something else")
-        normalization.training = False
-    return lambda env: _policy(model, normalization)
+def _drop_rows(path: Path, steps: int) -> None:
+    """Drop the evaluations after a checkpoint: the training makes them again."""
+    if path.exists():
+        header, *rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        kept = [row for row in rows if int(row.partition(",")[0]) <= steps]
+        path.write_text("".join([header, *kept]), encoding="utf-8")

@@ -18,6 +18,7 @@ from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.tools.overview import plain
+from fmugym.trial.trial import known_verdict
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["Finding", "Report", "validate"]
@@ -25,6 +26,13 @@ __all__ = ["Finding", "Report", "validate"]
 _MOST_STEPS: Final = 200
 _SECONDS: Final = 5.0
 """Real time after which an episode of a check is cut short."""
+
+_STEPS_BEFORE_RESTORE: Final = 10
+
+_ENVS: Final = ((100e-6, 64), (1e-3, 16))
+"""How many environments share the effort of a call: by the seconds that a step takes at most."""
+
+_FEWEST_ENVS: Final = 8
 
 _WIDE: Final = 100.0
 """An observation that is larger by this factor than another one hides it from most networks."""
@@ -53,15 +61,18 @@ class Report:
 
     Attributes:
         findings: The results in the order of the checks.
-        costs: Seconds of real time by name: ``step`` and ``reset`` of one environment.
+        costs: Seconds of real time by name: ``step``, ``reset`` and ``restore`` of one environment.
+            None for a restore that the FMU does not allow.
         hooks: How a vector environment calls the hooks: ``compiled``, ``array`` or ``per_env``.
         reset_method: How episodes begin.
+        recommended: Settings that suit the task, by name.
     """
 
     findings: tuple[Finding, ...]
-    costs: Mapping[str, float]
+    costs: Mapping[str, float | None]
     hooks: str
     reset_method: str
+    recommended: Mapping[str, Any]
 
     @property
     def verdict(self) -> str:
@@ -78,6 +89,7 @@ class Report:
             "costs": dict(self.costs),
             "hooks": self.hooks,
             "reset_method": self.reset_method,
+            "recommended": dict(self.recommended),
         }
 
     def as_text(self) -> str:
@@ -87,13 +99,18 @@ class Report:
             lines.append(f"{one.verdict:8} {one.check}: {plain(one.text)}")
             if one.cure:
                 lines.append(f"{'':8} cure: {plain(one.cure)}")
-        step, reset = (_duration(self.costs[name]) for name in ("step", "reset"))
-        lines.append(f"a step takes {step}, a reset {reset}; episodes begin by {self.reset_method}")
+        step, reset, restore = (_duration(self.costs[n]) for n in ("step", "reset", "restore"))
+        lines.append(f"a step takes {step}, a reset {reset}, to restore a state {restore}")
+        lines.append(f"episodes begin by {self.reset_method}")
         lines.append(f"hooks in a vector environment: {self.hooks}")
+        settings = (f"{name} = {value}" for name, value in self.recommended.items())
+        lines.append(f"recommended: {', '.join(settings)}")
         return "\n".join(lines)
 
 
-def _duration(seconds: float) -> str:
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return "is not possible"
     for unit, size in (("s", 1.0), ("ms", 1e-3)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
@@ -132,14 +149,52 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         env.action_space.seed(0)
         first = _play(env, env.action_space.sample)
         findings = tuple(_findings(env, first))
-        costs = {"step": first.step_time, "reset": _play(env, None).reset_time}
-        return Report(findings, costs, _hooks(make_env), env.reset_method)
+        costs = {
+            "step": first.step_time,
+            "reset": _play(env, None).reset_time,
+            "restore": _restore_time(env),
+        }
+        hooks = _hooks(make_env)
+        recommended = _recommended(env, first.step_time, hooks, findings)
+        return Report(findings, costs, hooks, env.reset_method, recommended)
     finally:
         env.close()
 
 
+def _restore_time(env: FMUEnv) -> float | None:
+    """The seconds that it takes to go back to a state in the middle of an episode."""
+    episode = _play(env, _always(_middle(env.action_space)), most_steps=_STEPS_BEFORE_RESTORE)
+    if episode.fault is not None:
+        return None
+    try:
+        snapshot = env.save_state()
+        begin = time.perf_counter()
+        env.restore_state(snapshot)
+    except FMUGymError:
+        return None
+    return time.perf_counter() - begin
+
+
+def _recommended(
+    env: FMUEnv, step_time: float, hooks: str, findings: tuple[Finding, ...]
+) -> dict[str, Any]:
+    """Settings that suit what was measured."""
+    settings: dict[str, Any] = {}
+    if hooks != "none":
+        settings["envs"] = next((n for most, n in _ENVS if step_time < most), _FEWEST_ENVS)
+    if any("very different sizes" in finding.text for finding in findings):
+        settings["normalize"] = True
+    verdict = known_verdict(env.fmu)
+    if verdict is not None and verdict.isolate:
+        settings["isolation"] = "process"
+    return settings | {"reset_method": env.reset_method}
+
+
 def _play(
-    env: FMUEnv, choose: Callable[[], Any] | None, options: Mapping[str, Any] | None = None
+    env: FMUEnv,
+    choose: Callable[[], Any] | None,
+    options: Mapping[str, Any] | None = None,
+    most_steps: int = _MOST_STEPS,
 ) -> _Episode:
     """Play an episode, or only its beginning."""
     begin = time.perf_counter()
@@ -148,7 +203,7 @@ def _play(
     observations: list[Any] = [_flat(observation)]
     rewards: list[float] = []
     fault = None
-    while choose is not None and len(rewards) < _MOST_STEPS:
+    while choose is not None and len(rewards) < most_steps:
         observation, reward, terminated, truncated, info = env.step(choose())
         observations.append(_flat(observation))
         rewards.append(reward)
@@ -171,6 +226,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_repetition(env, first)
     yield from _of_actions(env)
     yield from _of_parameters(env)
+    yield from _of_inputs(env)
     yield _of_reward(first)
     yield from _of_observations(env, first)
     yield _of_length(env)
@@ -258,26 +314,58 @@ def _differ(first: _Episode, second: _Episode) -> bool:
 
 
 def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
-    """Compare episodes with two values of each parameter that is drawn."""
-    drawn = {n: v for n, v in env.config.model_parameters.items() if is_distribution(v)}
-    useless = [name for name, value in drawn.items() if not _has_effect(env, name, value)]
+    """Compare episodes with two values of each parameter of the task."""
+    given = env.config.model_parameters
+    useless = [name for name, value in given.items() if not _has_effect(env, name, value)]
     if useless:
         yield Finding(
             "warning",
             "parameters",
-            f"drawn without an effect: {', '.join(useless)}",
+            f"without an effect: {', '.join(useless)}",
             "look for another parameter that the model uses, or leave them out",
         )
-    elif drawn:
-        yield Finding("ok", "parameters", "each drawn parameter has an effect")
+    elif given:
+        yield Finding("ok", "parameters", "each parameter of the task has an effect")
 
 
-def _has_effect(env: FMUEnv, name: str, distribution: Any) -> bool:
-    rng = np.random.default_rng(0)
-    values = [draw(distribution, rng) for _ in range(2)]
-    options = [{"model_parameters": {name: value}} for value in values]
-    episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
-    return values[0] == values[1] or _differ(*episodes)
+def _has_effect(env: FMUEnv, name: str, value: Any) -> bool:
+    """Whether two values give different episodes; also true if only one value is possible."""
+    values = _two_values(env, name, value)
+    if values[0] == values[1]:
+        return True
+    options = [{"model_parameters": {name: one}} for one in values]
+    try:
+        episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
+    except FMUGymError:  # the FMU does not take a value that was made up here
+        return True
+    return _differ(*episodes)
+
+
+def _two_values(env: FMUEnv, name: str, value: Any) -> list[Any]:
+    """Two draws, or a constant and another number near it."""
+    if is_distribution(value):
+        rng = np.random.default_rng(0)
+        return [draw(value, rng) for _ in range(2)]
+    if env.fmu.variable(name).kind != "real":
+        return [value, value]
+    return [value, 1.1 * value if value else 0.1]
+
+
+def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
+    """Tell the inputs of the FMU that nobody writes."""
+    written = {*env.config.model_input_names, *env.config.model_parameters}
+    idle = [
+        variable.name
+        for variable in env.fmu.description.variables.values()
+        if variable.causality == "input" and variable.numeric and variable.name not in written
+    ]
+    if idle:
+        yield Finding(
+            "warning",
+            "inputs",
+            f"stay at their start values: {', '.join(idle)}",
+            "write them by actions, [inputs] or data, or fix them under [parameters]",
+        )
 
 
 def _middle(space: Any) -> Any:

@@ -85,7 +85,7 @@ int fmi2CompletedIntegratorStep(Model *me, int no_set_state, int *event, int *te
     const int status = core_complete(me);
 
     *event = me->wants_event;
-    *terminate = 0;
+    *terminate = me->stops;
     return status;
 }
 

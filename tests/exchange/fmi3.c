@@ -83,7 +83,7 @@ int fmi3CompletedIntegratorStep(Model *me, bool no_set_state, bool *event, bool 
     const int status = core_complete(me);
 
     *event = me->wants_event;
-    *terminate = false;
+    *terminate = me->stops;
     return status;
 }
 

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
@@ -55,10 +56,15 @@ class PerEnvEngine(Engine):
             env._use(column)
             env._prepare_hooks()  # its constructor may have set some as attributes
         self._together = not any(env._own.step for env in envs)
+        self._checks_all = self._together and is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
         self._space = envs[0].observation_space
         self._observations: list[Any] = [None] * len(envs)
+        shared = pool.observations
+        is_default = shared.dtype == self._space.dtype and shared.shape[1:] == self._space.shape
+        self._observes = is_default and all(env._pool_observes for env in envs)
+        self._shared: tuple[npt.NDArray[np.float32], list[Any]] = shared.copy(), [None] * len(envs)
 
     def close(self) -> None:
         """See ``Engine.close``."""
@@ -136,13 +142,13 @@ class PerEnvEngine(Engine):
     def _results(self, items: Sequence[Any], idle: Sequence[bool]) -> StepResult:
         infos: dict[int, dict[str, Any]] = {}
         rewards, terminated, truncated = [], [], []
-        statuses = self._pool.statuses.tolist()
+        steps = self._told() if self._together else items
         for index, (env, action) in enumerate(zip(self._envs, items, strict=True)):
             if idle[index]:
                 observation, info = self._reset(index, None, {})
                 reward, ended, cut_off = 0.0, False, False
             else:
-                result = self._stepped(index, env, action, statuses[index])
+                result = self._stepped(index, env, action, steps[index])
                 observation, reward, ended, cut_off, info = result
             self._observations[index] = observation
             rewards.append(reward)
@@ -155,6 +161,19 @@ class PerEnvEngine(Engine):
         told = gathered(infos, len(items))
         return StepResult(self._stacked(), np.array(rewards, np.float64), *ends, told)
 
+    def _told(self) -> list[tuple[Any, ...]]:
+        """What the pool tells each environment after a step: status, outputs and observation.
+
+        A single call for all takes less time than one for each, and less memory is touched.
+        """
+        pool = self._pool
+        count = len(self._envs)
+        shared = pool.observations.copy()
+        rows: list[Any] = list(shared) if self._observes else [None] * count
+        self._shared = shared, rows
+        outputs = map(tuple, pool.outputs.T.tolist())
+        return list(zip(pool.statuses.tolist(), outputs, rows, strict=True))
+
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
@@ -166,13 +185,13 @@ class PerEnvEngine(Engine):
             raise _located(error, index) from error
 
     def _stepped(
-        self, index: int, env: FMUEnv, action: Any, status: int
+        self, index: int, env: FMUEnv, action: Any, told: tuple[Any, ...]
     ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         try:
             if not self._together:
                 return env.step(action)
             env.step_count += 1
-            result = env._conclude(self._columns[index], status)
+            result = env._conclude(self._columns[index], *told)
         except FMUGymError as error:
             raise _located(error, index) from error
         env._in_hooks = False
@@ -190,7 +209,8 @@ class PerEnvEngine(Engine):
                 if not idle[index]:
                     taken.append((env, env.previous_action, env.previous_state, env.inputs))
                     env._in_hooks = True
-                    env._take_action(actions[index])
+                    take = env._take_usable if self._checks_all else env._take_action
+                    take(actions[index])
         except BaseException as error:
             for env, previous_action, previous_state, inputs in taken[:-1]:  # the last has done it
                 env.action, env.inputs = env.previous_action, inputs
@@ -203,7 +223,7 @@ class PerEnvEngine(Engine):
     def _actions(self, actions: Any) -> Sequence[Any]:
         """Copy the action of each environment, because hooks keep it."""
         space = self._envs[0].action_space
-        if self._together and is_array_space(space):
+        if self._checks_all:
             return list(checked_actions(space, len(self._envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
@@ -239,7 +259,21 @@ class PerEnvEngine(Engine):
             self._observations[index] = self._envs[index]._observation_and_info()[0]
         return self._stacked()
 
+    def _with_others(self) -> npt.NDArray[np.float32] | None:
+        """The pool's observations, with those of resets and faults; None if hooks make them."""
+        shared, rows = self._shared
+        for index, observation in enumerate(self._observations):
+            if observation is not rows[index]:
+                fits = type(observation) is np.ndarray and observation.dtype == shared.dtype
+                if not self._observes or not fits or observation.shape != shared.shape[1:]:
+                    return None
+                shared[index] = observation
+        return shared if self._observes else None
+
     def _stacked(self) -> Any:
+        shared = self._with_others()
+        if shared is not None:
+            return shared.copy()
         empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)
         try:
             if isinstance(self._space, spaces.Box) and self._space.dtype.kind == "f":

@@ -137,6 +137,10 @@ class Graph:
         """Call what stands for a function of numpy that does not ask its arguments."""
         return own(self, function, *args, **keywords)
 
+    def find(self, node: Node) -> int | None:
+        """The number of an equal node; None if there is none."""
+        return self._numbers.get(node)
+
     def _number(self, node: Node) -> int:
         number = self._numbers.setdefault(node, len(self.nodes))
         if number == len(self.nodes):

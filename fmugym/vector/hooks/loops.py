@@ -7,6 +7,7 @@ bits. It hands these loops out to compilers. So a program calls them, and its re
 from __future__ import annotations
 
 import functools
+import math
 import platform
 from typing import Any
 
@@ -19,7 +20,7 @@ from fmugym.vector.hooks.program import UntraceableError
 if has_native_pool():
     from fmugym import _native
 
-__all__ = ["loop_of", "squares_nearly_exactly"]
+__all__ = ["has_known_sines", "loop_of", "squares_nearly_exactly"]
 
 _loops: dict[tuple[Any, tuple[Any, ...]], Any] = {}
 """The capsules by function and types. They stay alive with the process."""
@@ -56,12 +57,30 @@ def squares_nearly_exactly() -> bool:
     plus a part that is below 0.001 units for squares between 2^-32 and 2^32, since version 2.28
     (``sysdeps/ieee754/dbl-64/e_pow.c``). A sample shows whether numpy calls it.
     """
-    library, version = platform.libc_ver()
-    numbers = [int(part) for part in version.split(".") if part.isdigit()]
-    if library != "glibc" or numbers < [2, 28]:
+    if not _has_known_library():
         return False
     values = np.random.default_rng(0).uniform(-8.0, 8.0, 20_000)
     return bool(_is_within(np.float_power(values, 2.0), values, 0.515))
+
+
+@functools.cache
+def has_known_sines() -> bool:
+    """Whether numpy's sines and cosines have an error of less than 0.55 units in the last place.
+
+    Those of glibc have, since version 2.28 (``sysdeps/ieee754/dbl-64/s_sin.c``). A sample shows
+    whether numpy calls them, as Python does. See ``native/sines.c``.
+    """
+    if not _has_known_library():
+        return False
+    values = np.random.default_rng(0).uniform(-30.0, 30.0, 5_000)
+    own = [[math.sin(value), math.cos(value)] for value in values.tolist()]
+    return bool(np.array_equal(np.stack([np.sin(values), np.cos(values)], axis=1), own))
+
+
+def _has_known_library() -> bool:
+    library, version = platform.libc_ver()
+    numbers = [int(part) for part in version.split(".") if part.isdigit()]
+    return library == "glibc" and numbers >= [2, 28]
 
 
 def _is_within(

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.vector.hooks.graph import Graph, Node
-from fmugym.vector.hooks.loops import loop_of, squares_nearly_exactly
+from fmugym.vector.hooks.loops import has_known_sines, loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import (
     CONSTANT,
     MOST_REGISTERS,
@@ -38,6 +38,9 @@ _OF_FLAGS: Final[dict[Any, str]] = {
     np.invert: "not",
 }
 """Functions of Booleans that the pool computes itself."""
+
+_OF_ANGLES: Final[dict[Any, str]] = {np.sin: "call_sine", np.cos: "call_cosine"}
+"""Functions of which the pool computes most values itself."""
 
 _NAMES: Final[dict[Any, str]] = {np.fabs: "absolute"}
 """Other names of functions that the pool computes itself."""
@@ -120,9 +123,19 @@ class _Compiler:
         if node.kind == "missing":
             raise UntraceableError(str(node.what))
         operation, extra = self._operation(node)
+        if operation == "call_cosine":
+            self._add_sibling(node, np.sin)
         self._steps.append(_Step(operation, extra, number, node.operands))
+        if operation == "call_sine":
+            self._add_sibling(node, np.cos)
         if len(self._steps) > _MOST_INSTRUCTIONS:
             raise UntraceableError(f"it has more than {_MOST_INSTRUCTIONS} operations")
+
+    def _add_sibling(self, node: Node, ufunc: np.ufunc) -> None:
+        """Put the sine and the cosine of an angle side by side: the pool computes both at once."""
+        number = self._graph.find(node._replace(what=ufunc))
+        if number is not None and number not in self._known:
+            self.evaluate(number)
 
     def store(self, store: Store) -> None:
         """Add the instruction that stores a value."""
@@ -189,8 +202,11 @@ class _Compiler:
 
     def _quick_name(self, node: Node, ufunc: np.ufunc) -> str:
         """The operation that calls a loop: one that needs no call for most values, if there is."""
-        if ufunc is np.remainder and set(self._letters(node)) == {"d"}:
-            return "call_remainder"
+        if set(self._letters(node)) == {"d"}:
+            if ufunc is np.remainder:
+                return "call_remainder"
+            if ufunc in _OF_ANGLES and has_known_sines():
+                return _OF_ANGLES[ufunc]
         return "call_square" if self._is_square(node, ufunc) else "call"
 
     def _is_square(self, node: Node, ufunc: np.ufunc) -> bool:

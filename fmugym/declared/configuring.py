@@ -1,0 +1,127 @@
+"""The parts of a config that follow from a task directly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Final
+
+from fmugym.archive.description import ModelDescription
+from fmugym.config import EnvConfig
+from fmugym.declared.declarations import Declarations
+from fmugym.declared.entries import Entry
+from fmugym.declared.naming import CLOCK, Naming
+from fmugym.declared.quantities import duration
+from fmugym.declared.seasons import read_clock, read_scenarios
+from fmugym.declared.variables import Record, is_plain
+from fmugym.pool.spec import whole_number_of_steps
+
+__all__ = ["bounds_of", "clock_of", "own_config", "samplings_of", "time_step_of", "times_of"]
+
+_OF_SECTIONS: Final = frozenset(
+    {"model_input_names", "model_output_names", "model_parameters", "monitor_names"}
+    | {"samplings"}
+    | {"episode_variables", "bounds", "time_step", "substeps", "max_episode_steps", "warm_up"}
+    | {"start_time", "positive_reward", "negative_reward"}
+)
+"""Keys of a config that other sections of a task determine."""
+
+_OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
+
+
+def time_step_of(root: Entry, description: ModelDescription) -> float:
+    """The length of a step in seconds: that of the task, or the default of the FMU.
+
+    Raises:
+        ConfigError: If neither gives a positive one.
+    """
+    entry = root.child("time_step")
+    if entry.value is not None:
+        step = entry.check(duration)
+        if step > 0:
+            return step
+        raise entry.error("time_step must be positive, got 0")
+    if description.step_size is None:
+        raise root.error("the key 'time_step' is missing, and the FMU has no default step size")
+    return description.step_size
+
+
+def own_config(root: Entry) -> dict[str, Any]:
+    """The keys that a task gives the config itself; each value is checked.
+
+    Raises:
+        ConfigError: If there is no such key, or a value does not fit it.
+    """
+    section = root.child("config")
+    own = {} if section.value is None else section.table(_OF_CONFIG)
+    for key, entry in own.items():
+        with entry.placing():
+            EnvConfig((), ("any",), **{key: entry.value})  # which checks the value
+    return {key: entry.value for key, entry in own.items()}
+
+
+def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
+    """The lengths and times of a config.
+
+    Raises:
+        ConfigError: If one is no time, or no multiple of the time step.
+    """
+    root, times = declared.root, dict[str, Any](time_step=time_step)
+    start, substeps, length = map(root.child, ("start_time", "substeps", "episode_length"))
+    if isinstance(start.value, Mapping | list):
+        raise start.error("start_time is one time; 'clock' takes lists, seasons and what is drawn")
+    if declared.warm_up.period:
+        times["warm_up"] = declared.warm_up.period
+    if start.value is not None:
+        times["start_time"] = start.check(duration)
+    if substeps.value is not None:
+        times["substeps"] = substeps.value
+    if length.value is not None:
+        times["max_episode_steps"] = _episode_steps(length, time_step)
+    return times
+
+
+def _episode_steps(entry: Entry, step: float) -> int:
+    length = entry.check(duration)
+    count = whole_number_of_steps(length, step)
+    if not count:
+        raise entry.error(
+            f"episode_length must be a multiple of the time step of {step:g} s, got {length:g} s"
+        )
+    return count
+
+
+def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[str, Any]:
+    """The episode variable that tells when an episode begins, if the task has a clock of its own.
+
+    Args:
+        declared: The task.
+        time_step: Length of a step in seconds.
+        warm_steps: The steps of a warm-up with moving inputs, which come before.
+
+    Raises:
+        ConfigError: If there is no time for an episode.
+    """
+    clock = declared.root.child("clock")
+    scenarios = read_scenarios(declared.root.child("scenarios"))
+    if clock.value is None:
+        return {}
+    length = times_of(declared, time_step).get("max_episode_steps", 0) * time_step
+    return {CLOCK: read_clock(clock, scenarios, length, warm_steps * time_step)}
+
+
+def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
+    """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
+    records = [declared.records[name] for name in (*naming.outputs, *naming.monitors)]
+    return {r.fmu_name: r.sample for r in records if r.sample != "last"}
+
+
+def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
+    """The limits that the base class needs in order to make spaces."""
+    records = [declared.records[name] for name in (*declared.written, *naming.outputs)]
+    return {r.fmu_name: (r.low, r.high) for r in records if _has_own_limits(r)}
+
+
+def _has_own_limits(record: Record) -> bool:
+    given = record.entry.value or {}
+    return is_plain(record) and ("min" in given or "max" in given)

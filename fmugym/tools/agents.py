@@ -1,0 +1,155 @@
+"""Agents of Stable-Baselines3 in folders: saved by a training, loaded to act."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import pickle
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.checks import check_option
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, reason, shown
+from fmugym.tools.simulation import Policy
+
+__all__ = ["FACTS", "agent_policy", "algorithm_of", "imported_for_training", "policy_with", "save"]
+
+_LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
+_MODEL, _NORMALIZATION = "model.zip", "normalization.pkl"
+FACTS: Final = "agent.json"
+
+
+def imported_for_training(name: str) -> Any:
+    """Import a module of Stable-Baselines3, or one that needs it.
+
+    Raises:
+        ConfigError: If it is missing.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ConfigError(
+            f"this needs Stable-Baselines3, but {name} cannot be imported; install the extra: "
+            "pip install 'fmugym-toolbox[sb3]'"
+        ) from error
+
+
+def algorithm_of(name: str) -> Any:
+    """Find the class of an algorithm by its name.
+
+    Raises:
+        ConfigError: If there is none, or Stable-Baselines3 is missing.
+    """
+    base: Any = imported_for_training("stable_baselines3.common.base_class").BaseAlgorithm
+    known = {
+        key: value
+        for library in filter(find_spec, _LIBRARIES)
+        for key, value in vars(import_module(library)).items()
+        if isinstance(value, type) and issubclass(value, base)
+    }
+    return known[check_option("algorithm", name, known)]
+
+
+def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any]) -> None:
+    """Write an agent to a folder.
+
+    Args:
+        folder: The folder; an agent that is there is replaced.
+        model: The model of Stable-Baselines3.
+        normalization: A ``VecNormalize``, or None.
+        facts: What to tell about the agent, ``algorithm`` at least.
+    """
+    model.save(folder / _MODEL)
+    if normalization is not None:
+        normalization.save(str(folder / _NORMALIZATION))
+    (folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
+
+
+def agent_policy(folder: Path) -> Callable[[FMUEnv], Policy]:
+    """Load the agent that ``train`` has written to a folder.
+
+    Only load agents from sources that you trust: the files hold pickles, which can run code.
+
+    Returns:
+        A function that makes the policy for an environment. It raises ``ConfigError`` if the agent
+        was trained for other observations or actions.
+
+    Raises:
+        ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
+    """
+    try:
+        facts = json.loads((folder / FACTS).read_text(encoding="utf-8"))
+        name = str(facts["algorithm"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
+    algorithm = algorithm_of(name)
+    try:
+        model = algorithm.load(folder / _MODEL, device="cpu")
+        normalization = _normalization_in(folder)
+    except ConfigError:
+        raise
+    except Exception as error:  # a damaged file may raise anything
+        raise ConfigError(
+            f"the agent in {shown(str(folder))} cannot be read: {reason(error)}"
+        ) from error
+    return lambda env: _checked_policy(folder, model, normalization, env)
+
+
+def _normalization_in(folder: Path) -> Any:
+    path = folder / _NORMALIZATION
+    if not path.exists():
+        return None
+    with path.open("rb") as file:
+        normalization = pickle.load(file)
+    wrappers = import_module("stable_baselines3.common.vec_env")
+    if not isinstance(normalization, wrappers.VecNormalize):
+        raise ConfigError(f"{_NORMALIZATION} in {shown(str(folder))} is of something else")
+    normalization.training = False
+    return normalization
+
+
+def _checked_policy(folder: Path, model: Any, normalization: Any, env: FMUEnv) -> Policy:
+    for what in ("observation", "action"):
+        own, other = getattr(model, f"{what}_space"), getattr(env, f"{what}_space")
+        if type(own) is not type(other) or own.shape != other.shape:
+            raise ConfigError(
+                f"the agent in {shown(str(folder))} is for another task: its {what} space is "
+                f"{own}, that of the task is {other}"
+            )
+    return policy_with(model, normalization, env)
+
+
+def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:
+    """Make the policy that a model is: its best action, and masked ones only where it knows masks.
+
+    Args:
+        model: The model.
+        normalization: A ``VecNormalize`` that does not learn now, or None.
+        env: The environment to act in.
+    """
+    masks = "action_masks" in inspect.signature(model.predict).parameters
+    memory: dict[str, Any] = {}
+
+    def begin() -> None:
+        memory.clear()
+
+    def choose(observation: Any) -> Any:
+        if normalization is not None:
+            observation = normalization.normalize_obs(observation)
+        more: Any = {"action_masks": env.action_masks()} if masks else {}  # type: ignore[attr-defined]  # a TaskEnv
+        action, memory["state"] = model.predict(
+            observation,
+            state=memory.get("state"),
+            episode_start=np.array(["state" not in memory]),
+            deterministic=True,
+            **more,
+        )
+        return action if action.ndim else int(action)
+
+    return Policy(choose, begin)

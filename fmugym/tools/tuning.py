@@ -1,0 +1,156 @@
+"""Search for good arguments of an algorithm, with Optuna."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from fmugym.errors import ConfigError, FMUGymError
+from fmugym.series.store import imported
+from fmugym.tools.agents import algorithm_of
+from fmugym.tools.training import TRIALS, Plan, Watch, require_new, train
+
+__all__ = ["tune"]
+
+_FACTORS: Final = (0.25, 0.5, 1, 2, 4)
+_COUNTS: Final = ("n_steps", "batch_size", "n_epochs", "train_freq")
+"""Arguments that are tried at multiples of their default."""
+
+_CHOICES: Final[Mapping[str, tuple[float, ...]]] = {
+    "gamma": (0.9, 0.95, 0.98, 0.99, 0.995, 0.999),
+    "gae_lambda": (0.8, 0.9, 0.95, 0.98, 1.0),
+    "clip_range": (0.1, 0.2, 0.3),
+    "tau": (0.001, 0.005, 0.02, 0.05),
+}
+_WIDTHS: Final = (32, 64, 128, 256)
+"""Widths of the two hidden layers."""
+
+_SMALLEST_ENTROPY: Final = 1e-6
+_LARGEST_ENTROPY: Final = 0.05
+_PARTS: Final = 4
+"""A trial has at least so many updates."""
+
+
+def tune(plan: Plan, trials: int, steps: int, tell: Callable[[str], None]) -> dict[str, Any]:
+    """Try arguments of the algorithm in short trainings.
+
+    The sampler is Optuna's tree-structured Parzen estimator, seeded with the plan's seed. A trial
+    that is below the median of those before it is stopped early. Each trial is in a folder of its
+    own, ``trials/000`` and so on, and in a line of ``trials.csv``.
+
+    Args:
+        plan: What to train. Arguments that it has are not searched for.
+        trials: How many to make.
+        steps: The steps of a trial.
+        tell: Gets a line of text for each trial.
+
+    Returns:
+        The arguments of the best trial, those of the plan included.
+
+    Raises:
+        ConfigError: If Optuna is missing, or no trial has come to its end.
+        FileExistsError: If the folder of the plan exists.
+    """
+    optuna: Any = imported("optuna", "tune")
+    require_new(plan.folder / TRIALS)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(
+        direction="maximize",
+        sampler=optuna.samplers.TPESampler(seed=plan.seed),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=3),
+    )
+    objective = _Objective(plan, steps, optuna.TrialPruned)
+    note = _Notes(plan, tell)
+    study.optimize(objective, n_trials=trials, callbacks=[note], catch=(FMUGymError, ValueError))
+    complete = [trial for trial in study.trials if trial.value is not None]
+    if not complete:
+        raise ConfigError(f"none of {trials} trials has come to its end; see trials.csv")
+    best = max(complete, key=lambda trial: trial.value)
+    return dict(best.user_attrs["arguments"])
+
+
+class _Objective:
+    """A trial: returns the mean reward of its best evaluation."""
+
+    def __init__(self, plan: Plan, steps: int, pruned: type[Exception]) -> None:
+        self._plan, self._steps, self._pruned = plan, steps, pruned
+
+    def __call__(self, trial: Any) -> float:
+        given = dict(self._plan.arguments or {})
+        arguments = {**_suggested(trial, self._plan, self._steps), **given}
+        trial.set_user_attr("arguments", arguments)
+        rewards: list[float] = []
+
+        def evaluated(steps: int, mean: float) -> None:
+            rewards.append(mean)
+            trial.report(mean, len(rewards))
+            if trial.should_prune():
+                raise self._pruned
+
+        folder = self._plan.folder / TRIALS / f"{trial.number:03}"
+        plan = replace(self._plan, folder=folder, steps=self._steps, arguments=arguments)
+        train(plan, watch=Watch(evaluated=evaluated))
+        return max(rewards)
+
+
+def _suggested(trial: Any, plan: Plan, steps: int) -> dict[str, Any]:
+    """Arguments for a trial, of those that the algorithm has and the plan does not give."""
+    given = plan.arguments or {}
+    defaults = {
+        name: parameter.default
+        for name, parameter in inspect.signature(algorithm_of(plan.algorithm)).parameters.items()
+        if name not in given
+    }
+    found: dict[str, Any] = {}
+    rate = defaults.get("learning_rate")
+    if isinstance(rate, float):
+        found["learning_rate"] = trial.suggest_float(
+            "learning_rate", rate / 10, rate * 10, log=True
+        )
+    for name in _COUNTS:
+        if type(defaults.get(name)) is int:
+            most = _most(name, plan, steps)
+            counts = {min(most, max(1, math.ceil(defaults[name] * f))) for f in _FACTORS}
+            found[name] = trial.suggest_categorical(name, sorted(counts))
+    for name, values in _CHOICES.items():
+        if isinstance(defaults.get(name), float):
+            found[name] = trial.suggest_categorical(name, values)
+    if isinstance(defaults.get("ent_coef"), float):
+        limits = _SMALLEST_ENTROPY, _LARGEST_ENTROPY
+        found["ent_coef"] = trial.suggest_float("ent_coef", *limits, log=True)
+    if "policy_kwargs" in defaults:
+        width = trial.suggest_categorical("width", _WIDTHS)
+        found["policy_kwargs"] = {"net_arch": [width, width]}
+    return found
+
+
+def _most(name: str, plan: Plan, steps: int) -> int:
+    """The largest count with which a trial has some updates."""
+    most = steps // _PARTS // (plan.num_envs if name == "n_steps" else 1)
+    return 1 << max(3, most.bit_length() - 1)  # so that batches divide what was collected
+
+
+class _Notes:
+    """Writes a line for each trial."""
+
+    def __init__(self, plan: Plan, tell: Callable[[str], None]) -> None:
+        self._path, self._tell = plan.folder / f"{TRIALS}.csv", tell
+
+    def __call__(self, study: Any, trial: Any) -> None:
+        state = trial.state.name.lower()
+        arguments = json.dumps(trial.user_attrs.get("arguments", {}))
+        row = [trial.number, state, trial.value, arguments]
+        is_new = not self._path.exists()
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            if is_new:
+                writer.writerow(["trial", "state", "reward", "arguments"])
+            writer.writerow(row)
+        reward = "" if trial.value is None else f", reward {trial.value:.6g}"
+        self._tell(f"trial {trial.number}: {state}{reward}")
