@@ -388,10 +388,7 @@ class Pool:
         """Change how episodes begin; states that were not restored before cannot be restored."""
 
     def recycle(self) -> None:
-        """Let each instance be replaced by a new one at its next reset, because it leaks."""
-
-    def renew(self) -> None:
-        """See ``fmugym.pool.base.Pool.renew``."""
+        """Let each instance be replaced by a new one at its next reset."""
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""

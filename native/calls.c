@@ -188,9 +188,9 @@ void pool_begin_by(Pool *pool, bool restores, bool rebuilds) {
     pool->settings.rebuilds = rebuilds;
 }
 
-void pool_replace(Pool *pool, Due due) {
+void pool_recycle(Pool *pool) {
     for (size_t i = 0; i < pool->settings.count; i++) {
-        pool->instances[i].due = (uint8_t)due;
+        pool->instances[i].due = true;
     }
 }
 

@@ -134,6 +134,9 @@ typedef struct Fmi {
 /* Of co-simulation and of model exchange. */
 extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3;
 
+/* NULL if there is no such version. */
+const Fmi *fmi_table(int64_t version, bool exchange);
+
 static inline bool has_outputs(Outcome outcome) {
     return outcome.stage == DOING_STEP &&
            (outcome.status <= STATUS_WARNING || outcome.status == STATUS_TERMINATED);

@@ -203,18 +203,15 @@ static Status replace(Pool *pool, Instance *me) {
 }
 
 Status instance_renew_if_due(Pool *pool, Instance *me) {
-    const Due due = (Due)me->due;
+    const bool due = me->due;
 
-    me->due = NOT_DUE;
+    me->due = false;
     if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
         return STATUS_OK;
     }
-    if (due == DUE_FOR_LEAKS) {
+    if (due) {
         health_of(pool, me)[RECYCLINGS]++;
         return replace(pool, me);
-    }
-    if (due == DUE_AS_USED) {
-        return rebuild(pool, me);
     }
     if (me->phase != PHASE_STEPPING && instance_rebuild_to_hear(pool, me)) {
         return STATUS_OK;

@@ -121,7 +121,7 @@ typedef struct {
     uint32_t generation; /* increases whenever the instance is replaced */
     uint8_t phase;
     bool unsavable; /* the FMU once refused to save its state */
-    uint8_t due;    /* whether the next reset replaces it, a Due */
+    bool due;       /* whether the next reset replaces it */
     uint8_t hearing;
 } Instance;
 
@@ -141,9 +141,6 @@ typedef struct {
     double value;
     uint32_t reference, type;
 } RecordedStart;
-
-/* Why the next reset replaces an instance: others have used it, or it has leaked. */
-typedef enum { NOT_DUE, DUE_AS_USED, DUE_FOR_LEAKS } Due;
 
 /* The episode of an instance so far; see records.h. */
 typedef struct {
@@ -266,8 +263,8 @@ bool pool_failure(Pool *pool, size_t index, Failure *copy);
 /* Adds all steps so far to the health counters. */
 void pool_count_steps(Pool *pool);
 
-/* Marks each instance for replacement by a new one at its next reset, unless it was not used yet. */
-void pool_replace(Pool *pool, Due due);
+/* Marks each instance for replacement by a new one at its next reset. */
+void pool_recycle(Pool *pool);
 
 /* Changes how episodes begin from now on. */
 void pool_begin_by(Pool *pool, bool restores, bool rebuilds);

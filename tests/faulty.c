@@ -22,7 +22,7 @@
 #endif
 
 enum { U, Y, FAULT, STAGE, AT, COUNT };
-enum fault { NONE, CRASH, ABORT, EXIT, HANG, CLOSE, PAUSE };
+enum fault { NONE, CRASH, ABORT, EXIT, HANG, CLOSE, PAUSE, LEAK };
 enum stage { NOWHERE, STEP, RESET, TERMINATE, FREE, INITIALIZE };
 enum { OK, WARNING, DISCARD, ERROR };
 
@@ -57,6 +57,10 @@ static void fail(Faulty *me, int fault) {
         for (int descriptor = 3; descriptor < 100; descriptor++) {
             close(descriptor);
         }
+    }
+    if (fault == LEAK) {
+        char *volatile lost = malloc(1 << 18); /* or else the compiler leaves it out */
+        memset(lost, 1, 1 << 18);
     }
     if (fault == PAUSE) {
         usleep(200000);

@@ -11,7 +11,16 @@ import fmu_tools
 
 import fmugym
 
-FAULTS = {"none": 0, "crash": 1, "abort": 2, "exit": 3, "hang": 4, "close": 5, "pause": 6}
+FAULTS = {
+    "none": 0,
+    "crash": 1,
+    "abort": 2,
+    "exit": 3,
+    "hang": 4,
+    "close": 5,
+    "pause": 6,
+    "leak": 7,
+}
 STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
 
 VARIABLES = {

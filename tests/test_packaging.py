@@ -145,6 +145,18 @@ def test_the_wheel_holds_every_module_and_the_typing_marker(built):
         assert modules | {"fmugym/py.typed"} <= set(wheel.namelist())
 
 
+def test_the_wheel_holds_the_sources_of_the_worker_for_windows(built):
+    wanted = {name for name in sources("native") if name.endswith((".c", ".h"))}
+    wanted = {name for name in wanted if not name.startswith("native/python/")}
+    with zipfile.ZipFile(built[1]) as wheel:
+        packed = {
+            name.replace("fmugym/native_sources", "native"): wheel.read(name)
+            for name in wheel.namelist()
+            if name.startswith("fmugym/native_sources/")
+        }
+    assert packed == {name: (ROOT / name).read_bytes() for name in wanted}
+
+
 def test_the_wheel_holds_nothing_beside_the_package(built):
     with zipfile.ZipFile(built[1]) as wheel:
         tops = {name.split("/")[0] for name in wheel.namelist()}

@@ -211,23 +211,6 @@ def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu, backend):
     env.close()
 
 
-@pytest.mark.parametrize("demand", [{"reset_method": "reset"}, {"probe_timeout": None}], ids=str)
-@pytest.mark.parametrize("way", ["compiled", "array", "python", "process"])
-def test_no_instance_is_reset_before_its_first_episode(make_fmu, way, demand):
-    """Not even the one with which the hooks of a vector environment were checked."""
-    path = make_fmu("reset does nothing")
-    options = {"backend": "python"} if way == "python" else {}
-    options |= {"isolation": "process"} if way == "process" else {"private_libraries": False}
-    options |= {"hooks": way} if way in ("compiled", "array") else {}
-    envs = fmugym.FMUVectorEnv(lambda: QuirkEnv(path, gain=1.5, **demand), 3, **options)
-    observations, _ = envs.reset()
-    assert not observations.any()
-    assert not envs.health["replacements"].any()
-    observations, *_ = envs.step(np.full((3, 1), 0.5, np.float32))
-    assert len(set(map(tuple, observations.tolist()))) == 1
-    envs.close()
-
-
 @pytest.mark.parametrize("way", ["native", "python", "process"])
 def test_reading_what_can_only_be_written(make_fmu, way):
     """The message names it; the FMU then needs a reset, as the standard says."""

@@ -1,5 +1,6 @@
 """Linear models along a trajectory, compared with equations, scipy and each other."""
 
+import exchange_tools
 import gymnasium
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from zoo_tools import ZooEnv, parameters, zoo_fmu
 import fmugym
 from fmugym import ConfigError, SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
+from fmugym.fmi.instance import Instance
 from fmugym.vector.trajectories import discrete
 
 TORQUES = np.random.default_rng(0).uniform(-0.015, 0.015, (HORIZON, 1)).astype(np.float32)
@@ -246,6 +248,59 @@ class TestDirectional:
             expected = expm(0.1 * joined)
             assert a[index] == pytest.approx(expected[:2, :2], rel=1e-9, abs=1e-12)
             assert b[index] == pytest.approx(expected[:2, 2:], rel=1e-9, abs=1e-12)
+
+
+class TestModelExchange:
+    """x' = u - k x, solved by fmugym."""
+
+    @pytest.fixture(name="make_env", params=["2", "3"])
+    def fixture_make_env(self, request, tmp_path):
+        version = int(request.param)
+        flag = "providesDirectionalDerivative" + ("s" if version == 3 else "")
+        flags = f' {flag}="true"'
+        path = tmp_path / "Model.fmu"
+        exchange_tools.exchange_fmu(path, "dahlquist", version, flags=flags)
+
+        class Dahlquist(fmugym.FMUEnv):
+            def __init__(self):
+                config = {
+                    "model_input_names": "u",
+                    "model_output_names": "x",
+                    "model_parameters": {"k": 2.0},
+                    "bounds": {"u": (-1, 1)},
+                    "tolerance": 1e-10,
+                    "time_step": 0.1,
+                }
+                super().__init__(path, config)
+
+            def _is_done(self):
+                return False
+
+        return Dahlquist
+
+    @pytest.mark.parametrize("method", ["directional", "differences"])
+    def test_is_the_solution_of_the_equation(self, make_env, method):
+        found = along(make_env, np.full((4, 1), 0.5), method=method)
+        exact = {"A": np.exp(-0.2), "B": (1 - np.exp(-0.2)) / 2}
+        exact |= {"C": exact["A"], "D": exact["B"]}
+        for name, value in exact.items():
+            assert getattr(found, name).ravel() == pytest.approx([value] * 4, rel=1e-6), name
+        assert (found.states, found.method) == (("x",), method)
+
+
+def test_wrong_derivatives_are_told(monkeypatch, caplog):
+    along(exact)
+    assert not caplog.records
+    kept = Instance.jacobian
+
+    def wrong(self, unknowns, knowns):
+        return 1.5 * kept(self, unknowns, knowns)
+
+    monkeypatch.setattr(Instance, "jacobian", wrong)
+    along(exact)
+    (record,) = caplog.records
+    assert "Pendulum" in record.getMessage()
+    assert "directional" in record.getMessage()
 
 
 def test_present_episodes_go_on():

@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 from fmu_tools import PlainEnv, edited_fmu, probe_config, read_fmu, write_fmu
 from process_tools import FaultyEnv, faulty_fmu, start_values
-from wine_tools import for_windows
+from wine_tools import exchange_fmu, for_windows
 
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.windows import REQUESTS
+from fmugym.pool.process.worker import BlockWorker
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools import cli
 from fmugym.trial import opening
@@ -119,6 +121,14 @@ class TestPaths:
 
 
 class TestProgram:
+    def test_it_answers_what_a_worker_of_python_answers(self):
+        methods = {name for name in vars(BlockWorker) if not name.startswith("_")}
+        assert set(REQUESTS) == methods - {
+            "open",
+            "serve",
+            "differentiate",
+        }  # FMPy does
+
     def test_its_sources_are_found(self):
         names = {path.name for path in program.sources()}
         assert {"main.c", "requests.c", "fmi1.c", "fmi2.c", "fmi3.c", "pool.h"} <= names
@@ -280,6 +290,33 @@ class TestInWine:
         assert isinstance(env._pool, ProcessPool)
         (line,) = (r.getMessage() for r in caplog.records if "was tried with 2" in r.getMessage())
         assert " 0 initialization" not in line
+
+    @pytest.mark.parametrize(
+        ("version", "solver"), [(1, "dormand_prince"), (2, "rosenbrock"), (3, "dormand_prince")]
+    )
+    def test_model_exchange(self, tmp_path, opened, version, solver):
+        """x' = -k x from 1: the closed form."""
+        fmu = FMU(exchange_fmu(tmp_path / "Model.fmu", "dahlquist", version))
+        spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1, tolerance=1e-8, solver=solver)
+        pool = opened(opening.make_pool(fmu, spec, 2, LOG))
+        outputs, _ = pool.reset((fmu.variable("k"),), np.array([[1.0, 2.0]]))
+        for _ in range(10):
+            outputs, statuses = pool.step()
+            assert not statuses.any()
+        np.testing.assert_allclose(outputs[0], np.exp([-1.0, -2.0]), rtol=1e-6)
+
+    def test_a_worker_whose_fmu_leaks_is_replaced(self, faulty, opened):
+        fmu = FMU(faulty)
+        variables = tuple(map(fmu.variable, start_values()))
+        values = np.array([list(start_values("leak", "reset").values())], float).T
+        spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1, leak_limit=2**20)
+        pool = opened(opening.make_pool(fmu, spec, 1, LOG))
+        processes = set()
+        for _ in range(30):
+            pool.reset(variables, values)
+            assert not pool.statuses.any()
+            processes.add(pool.processes()[0])
+        assert 1 < len(processes) < 10
 
     def test_info_says_that_it_runs_in_wine(self, cart_pole, capsys):
         assert cli.main(["info", str(cart_pole)]) == 0

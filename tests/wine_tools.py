@@ -7,10 +7,14 @@ import tempfile
 from pathlib import Path
 
 import building
+import exchange_tools
 import fmu_tools
 
 from fmugym import FMU
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
+
+FOLDERS = {1: "win64", 2: "win64", 3: "x86_64-windows"}
+PREFIXES = {1: "Model_fmi", 2: "fmi2", 3: "fmi3"}
 
 
 def why_not():
@@ -36,17 +40,31 @@ def for_windows(path, folder):
 
 
 def _library(model, version):
-    folder = "x86_64-windows" if version == 3 else "win64"
     data = windows_library(f"{model.lower()}.c", flags=(f"-DFMI_VERSION={version}",))
-    return {f"binaries/{folder}/{model}.dll": data}
+    return {f"binaries/{FOLDERS[version]}/{model}.dll": data}
 
 
 @functools.cache
-def windows_library(source, flags=()):
-    """The bytes of a library for Windows, made of a C file of this folder."""
+def windows_library(*sources, flags=(), stubs=""):
+    """The bytes of a library for Windows; the arguments are those of ``building.library``."""
     command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu"]
-    command += ["-shared", "-O1", "-g0", "-ffp-contract=off", *flags, building.HERE / source]
+    command += ["-shared", "-O1", "-g0", "-ffp-contract=off", '-DSTUBS="stubs.h"', "-I.", *flags]
     with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "stubs.h").write_text(stubs)
         target = Path(folder) / "made.dll"
-        subprocess.run([*command, "-o", target], check=True, cwd=folder)
+        files = [building.HERE / source for source in sources]
+        subprocess.run([*command, *files, "-o", target], check=True, cwd=folder)
         return target.read_bytes()
+
+
+def exchange_fmu(path, model, version):
+    """Write an FMU for model exchange with a library for Windows only."""
+    shim = f"exchange/fmi{version}.c"
+    stubs = fmu_tools.stubs(version, PREFIXES[version], building.HERE / shim)
+    sources = [*(f"exchange/{name}.c" for name in ("core", "usual", model)), shim]
+    data = windows_library(*sources, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
+    files = {
+        "modelDescription.xml": exchange_tools.describe(model, version),
+        f"binaries/{FOLDERS[version]}/Model.dll": data,
+    }
+    return fmu_tools.write_fmu(Path(path), files)

@@ -186,12 +186,6 @@ class Pool(ABC):
     def forget_health(self) -> None:
         """Set all counters to zero."""
 
-    def renew(self) -> None:  # noqa: B027 (most pools need none)
-        """Let each instance that was used be replaced by a new one at its next reset.
-
-        This is no replacement that ``health`` counts. Others than FMUs need none.
-        """
-
     @abstractmethod
     def close(self) -> None:
         """Free all instances. It may be called more than once."""

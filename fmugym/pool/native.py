@@ -221,6 +221,10 @@ class NativePool(SavingPool):
             raise SimulationError(f"{name} cannot get and set its state")
         if self._watch is not None:
             self._watch.has_snapshots = True
+        return self._copy_all()
+
+    def _copy_all(self) -> _native.Snapshot:
+        """See ``SavingPool._copy_all``."""
         snapshot = self._open_pool().save()
         if isinstance(snapshot, int):
             raise SimulationError(self.failure(snapshot))
@@ -338,10 +342,6 @@ class NativePool(SavingPool):
         self._mistrust_states()
         self._spec = replace(self._spec, reset_method=method)
         return True
-
-    def renew(self) -> None:
-        """See ``Pool.renew``."""
-        self._open_pool().renew()
 
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""

@@ -145,6 +145,10 @@ class PythonPool(SavingPool):
         """See ``Pool.save``."""
         if self._watch is not None:
             self._watch.has_snapshots = True
+        return self._copy_all()
+
+    def _copy_all(self) -> list[Snapshot]:
+        """See ``SavingPool._copy_all``."""
         try:
             with fmu_calls:
                 return [slot.save() for slot in self._slots]
@@ -271,11 +275,6 @@ class PythonPool(SavingPool):
         self._keep_records()
         self._mistrust_states()
         return True
-
-    def renew(self) -> None:
-        """See ``Pool.renew``."""
-        for slot in self._slots:
-            slot.is_used = True
 
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""

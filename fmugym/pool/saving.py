@@ -6,6 +6,7 @@ import logging
 import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +84,7 @@ class SavingPool(AttendedPool):
         if self.save_method is not SaveMethod.COPY or not every:
             return None
         try:
-            return Copies(weakref.ref(self), self.save(), np.array(indices))
+            return Copies(weakref.ref(self), self._copy_all(), np.array(indices))
         except SimulationError:  # an episode has ended in another way
             return None
 
@@ -115,6 +116,10 @@ class SavingPool(AttendedPool):
         """The record of an instance; None if it does not reach from the reset until now."""
 
     # Copies
+
+    def _copy_all(self) -> Any:
+        """Copy all states as ``save`` does, but in a way that lets instances be replaced."""
+        return self.save()
 
     def _restore_or_replay(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """Restore the copies that are of the same instances, and replay the other episodes."""

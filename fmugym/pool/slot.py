@@ -72,8 +72,7 @@ class Slot:
 
     Attributes:
         failure: Why the last status was worse than a warning.
-        is_due: Whether the next reset replaces the instance because it leaks.
-        is_used: Whether the next reset replaces the instance because others have used it.
+        is_due: Whether the next reset replaces the instance.
         keeps_record: Whether the inputs of its episodes are kept.
     """
 
@@ -87,7 +86,7 @@ class Slot:
         pacer: Pacer,
     ) -> None:
         self.failure = ""
-        self.is_due = self.is_used = self.keeps_record = False
+        self.is_due = self.keeps_record = False
         self._played: tuple[tuple[str, ...], FloatArray, list[bytes]] | None = None
         self._unexplained = False
         self._counts, self._pacer = counts, pacer
@@ -156,7 +155,6 @@ class Slot:
     def _make_anew_if_due(self) -> None:
         """Replace an instance that has leaked memory, or that no reset can make like new."""
         is_due, self.is_due = self.is_due, False
-        is_used, self.is_used = self.is_used, False
         unexplained, self._unexplained = self._unexplained, False
         if self._instance.phase in (Phase.DEAD, Phase.INSTANTIATED):
             return
@@ -165,11 +163,7 @@ class Slot:
             self._replace()
         elif unexplained and not self._has_snapshots and self._instance.can_say_more:
             self._rebuild(hear_all=True)
-        elif (
-            is_used
-            or self._spec.reset_method not in _REUSING
-            or self._instance.hears_more_than_wanted
-        ):
+        elif self._spec.reset_method not in _REUSING or self._instance.hears_more_than_wanted:
             self._rebuild()
 
     @property

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.archive.bundled import is_bundled
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.fmi.status import Status
@@ -159,8 +158,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._background = Background()
         self._engine = self._make_engine(hooks, max_episode_steps)
         self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
-        if not is_bundled(env.fmu.path):
-            self._pool.renew()  # no reset is relied on before its first episode
         self._pool.forget_health()  # that of the hook check
 
     def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -28,6 +29,14 @@ from fmugym.vector.sensitivities import (
 )
 
 __all__ = ["LinearTrajectory", "linearize_along"]
+
+logger = logging.getLogger(__name__)
+
+_BESIDE: Final = 1e-3
+"""How far actions are moved to check derivatives, as a fraction of the width of their space."""
+
+_DOUBTFUL: Final = 0.1
+"""The error of predictions from which on derivatives are doubtful."""
 
 _METHODS: Final = ("directional", "differences")
 
@@ -84,7 +93,8 @@ def linearize_along(
       the mean of both, with constant inputs (exponential midpoint rule; M. Hochbruck, C. Lubich,
       SIAM J. Numer. Anal. 41(3), 2003). The error of a step is of order 3 in its size; errors of
       the FMU's own solver are not in it. The states are all continuous states that the FMU
-      declares, and need not be settable.
+      declares, and need not be settable. A second trajectory close by checks the matrices; if they
+      are far off, a warning is logged.
     - ``"differences"``: central differences, all states, actions and steps together, on all
       threads. Each state is moved by its start value: episodes that start at the states of the
       trajectory do one step. So the start values of ``states`` must determine all of the FMU's
@@ -209,7 +219,18 @@ def _by_directional_derivatives(
     try:
         env._use(replace(env._opening, backend="python").open(1, rehearse=False))
         env.restore_state(start)
-        return _Follower(env, states).follow(nominal)
+        follower = _Follower(env, states)
+        found = follower.follow(nominal)
+        env.restore_state(start)
+        error = follower.error_beside(nominal, found)
+        if error > _DOUBTFUL:
+            logger.warning(
+                "%s: its directional derivatives predict the effect of small changes with an error "
+                "of %.0f %%. They are wrong, or the steps are too long for them; compare with "
+                "method='differences'",
+                *(_name(env), 100 * error),
+            )
+        return found
     finally:
         env.close()
 
@@ -249,6 +270,30 @@ class _Follower:
         by_x, by_u = outputs[:, :, :n], outputs[:, :, n:]
         d = (by_x @ b + by_u) @ by_actions
         return Matrices(a, b @ by_actions, by_x @ a, d, np.array(x), np.array(y))
+
+    def error_beside(self, nominal: npt.NDArray[Any], found: Matrices) -> float:
+        """Play other actions, and compare the change of each step with what matrices predict.
+
+        Returns:
+            The mean error of a state, as a fraction of its largest change; that of the worst state.
+        """
+        space = float_box(self._env.action_space, "action")
+        up, down, _ = moved_both_ways(space, nominal, _BESIDE)
+        odd = np.arange(len(nominal)).reshape(-1, *[1] * (nominal.ndim - 1)) % 2 == 1
+        actions, x = np.where(odd, up, down), [self._read()]
+        for action in actions:
+            *_, terminated, truncated, _ = self._env.step(action)
+            x.append(self._read())
+            if terminated or truncated:
+                break
+        off = np.array(x) - found.x[: len(x)]
+        steps = len(x) - 1
+        du = np.subtract(actions, nominal, dtype=np.float64).reshape(len(nominal), -1)[:steps]
+        predicted = np.einsum("kij,kj->ki", found.A[:steps], off[:-1])
+        predicted += np.einsum("kij,kj->ki", found.B[:steps], du)
+        scale = np.abs(off[1:]).max(axis=0, initial=0.0)
+        wrong = np.abs(off[1:] - predicted).mean(axis=0)
+        return float(np.max(wrong / np.where(scale > 0.0, scale, np.inf), initial=0.0))
 
     def _read(self) -> FloatArray:
         return self._pool.read(self._x)[:, 0]

@@ -5,14 +5,12 @@
 PyTypeObject *access_type;
 
 const Fmi *fmi_of(int version, bool exchange) {
-    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3},
-                                              {&exchange1, &exchange2, &exchange3}};
+    const Fmi *fmi = fmi_table(version, exchange);
 
-    if (version < 1 || version > 3) {
+    if (fmi == NULL) {
         PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);
-        return NULL;
     }
-    return versions[exchange][version - 1];
+    return fmi;
 }
 
 bool is_access(const PyPool *self, PyObject *object) {

@@ -278,26 +278,18 @@ PyObject *py_count_steps(PyObject *object, PyObject *unused) {
     Py_RETURN_NONE;
 }
 
-static void do_replace(PyPool *self, bool alone, void *context) {
+static void do_recycle(PyPool *self, bool alone, void *context) {
     (void)alone;
-    pool_replace(&self->pool, *(const Due *)context);
-}
-
-static PyObject *replace_all(PyObject *object, Due due) {
-    if (!perform((PyPool *)object, NEVER_SHORT, do_replace, &due)) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    (void)context;
+    pool_recycle(&self->pool);
 }
 
 PyObject *py_recycle(PyObject *object, PyObject *unused) {
     (void)unused;
-    return replace_all(object, DUE_FOR_LEAKS);
-}
-
-PyObject *py_renew(PyObject *object, PyObject *unused) {
-    (void)unused;
-    return replace_all(object, DUE_AS_USED);
+    if (!perform((PyPool *)object, NEVER_SHORT, do_recycle, NULL)) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
 }
 
 /* Both take two integers. */

@@ -94,7 +94,6 @@ PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_recycle(PyObject *object, PyObject *unused);
-PyObject *py_renew(PyObject *object, PyObject *unused);
 PyObject *py_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_begin_by(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_costs(PyObject *object, PyObject *unused);

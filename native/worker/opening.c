@@ -7,11 +7,6 @@
 #include "../records.h"
 #include "worker.h"
 
-static const Fmi *fmi_of(int64_t version, bool exchange) {
-    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3}, {NULL, &exchange2, NULL}};
-    return version < 1 || version > 3 ? NULL : versions[exchange][version - 1];
-}
-
 bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
     size_t count, size;
     const char *types = read_block(reader, &count);
@@ -138,7 +133,7 @@ static void read_library(Reader *reader, Settings *s) {
     const int64_t version = read_integer(reader);
     const bool exchange = read_flag(reader);
 
-    s->fmi = fmi_of(version, exchange);
+    s->fmi = fmi_table(version, exchange);
     if (exchange) {
         read_solving(reader, &s->solving);
     }

@@ -32,6 +32,7 @@ enum {
     REQUEST_FAILURE,
     REQUEST_READ,
     REQUEST_REPLACE_RECORD,
+    REQUEST_RENEW,
     REQUEST_CLOSE,
     REQUESTS
 };
@@ -497,6 +498,14 @@ static void answer_count_steps(Worker *w, Reader *reader) {
     send_done();
 }
 
+static void answer_renew(Worker *w, Reader *reader) {
+    (void)reader;
+    pool_enter(&w->pool);
+    pool_replace(&w->pool, DUE_AS_USED);
+    pool_leave(&w->pool);
+    send_done();
+}
+
 static void answer_failure(Worker *w, Reader *reader) {
     const int64_t index = read_integer(reader);
     Writer writer = {.bytes = NULL};
@@ -532,6 +541,7 @@ bool worker_answer(Worker *w, Reader *reader) {
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_READ] = answer_read,
         [REQUEST_REPLACE_RECORD] = answer_replace_record,
+        [REQUEST_RENEW] = answer_renew,
         [REQUEST_CLOSE] = answer_close,
     };
     const uint8_t request = read_flag(reader);

@@ -15,5 +15,7 @@ void model_rates(Model *me) {
 }
 
 double model_partial(const Model *me, size_t unknown, size_t known) {
-    return -me->v[K];
+    const double by_state = unknown == X ? 1.0 : -me->v[K], by_input = unknown == X ? 0.0 : 1.0;
+
+    return known == X ? by_state : by_input;
 }

@@ -257,11 +257,6 @@ class ProcessPool(SavingPool):
             self._crew.run("a change", able, lambda s: s.tell("begin_by", str(method)))
         return True
 
-    def renew(self) -> None:
-        """See ``Pool.renew``."""
-        with self._lock:
-            self._crew.run("a change", self._crew.able, lambda s: s.tell("renew"))
-
     def save(self) -> _Snapshot:
         """See ``Pool.save``."""
         with self._lock:

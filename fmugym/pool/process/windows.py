@@ -38,9 +38,9 @@ from fmugym.pool.settings import (
 from fmugym.pool.spec import ResetMethod
 from fmugym.wine.loader import windows_path
 
-__all__ = ["ProgramCoding"]
+__all__ = ["REQUESTS", "ProgramCoding"]
 
-_REQUESTS: Final = (
+REQUESTS: Final = (
     "reset",
     "begin_by",
     "save",
@@ -53,11 +53,12 @@ _REQUESTS: Final = (
     "failure",
     "read",
     "replace_record",
+    "renew",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
 
-_NUMBERS: Final = {name: number for number, name in enumerate(_REQUESTS)}
+_NUMBERS: Final = {name: number for number, name in enumerate(REQUESTS)}
 _UNKNOWN: Final = 255
 """The number of a request that the program refuses."""
 

@@ -276,10 +276,6 @@ class BlockWorker:
         """See ``Pool.begin_by``."""
         self._pool.begin_by(ResetMethod(method))
 
-    def renew(self) -> None:
-        """See ``Pool.renew``."""
-        self._pool.renew()
-
     def save(self) -> int:
         """See ``Pool.save``; the snapshot stays here, and its number is returned."""
         number = next(self._numbers)
