@@ -31,8 +31,8 @@ static Half magnitude_of(double value) {
         return isnan(value) ? 0x7e00 : 0x7c00;
     }
     memcpy(&bits, &value, sizeof bits);
-    bits += (UINT64_C(1) << 41) - 1 + (bits >> 42 & 1); /* 42 bits fall away */
-    return (Half)((bits >> 42) - (UINT64_C(1023 - 15) << 10));
+    bits += (UINT64_C(1) << 41) - 1 + ((bits >> 42) & 1); /* 42 bits fall away */
+    return (Half)((bits >> 42) - ((uint64_t)(1023 - 15) << 10));
 }
 
 Half half_of(double value) {

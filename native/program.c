@@ -6,6 +6,7 @@
 
 #include "fmi.h"
 #include "halves.h"
+#include "lanes.h"
 #include "platform.h"
 #include "quick.h"
 
@@ -333,12 +334,6 @@ static void call(const Called *called, size_t count, size_t lanes, const Registe
     called->loop(called->context, data, &length, called->sizes, called->auxiliary);
     clear_rest(&registers->own[i.to], count, lanes, (size_t)called->sizes[called->kept]);
 }
-
-/* Computing the end from the blocks shows the compiler that no value is left over. */
-#define EACH_LANE(statement)                                                                       \
-    for (size_t j = 0; j < blocks * PROGRAM_BLOCK; j++) {                                          \
-        statement;                                                                                 \
-    }
 
 /* Calls the loop for the values that are doubtful. */
 static void call_where(const Called *called, size_t count, const uint8_t *doubtful,

@@ -5,21 +5,8 @@
 #include <stdbool.h>
 #include <string.h>
 
+#include "lanes.h"
 #include "platform.h"
-#include "program.h"
-
-/* Computing the end from the blocks shows the compiler that no value is left over. */
-#define EACH_LANE(statement)                                                                       \
-    for (size_t j = 0; j < blocks * PROGRAM_BLOCK; j++) {                                          \
-        statement;                                                                                 \
-    }
-
-/* The upper half of a number's digits (G. W. Veltkamp, T. J. Dekker 1971). The product of two such
- * halves is exact. */
-static inline double upper_half(double x) {
-    const double shifted = x * 134217729.0;
-    return shifted - (shifted - x);
-}
 
 /* The power of 2, by a loop whose error is less than 0.515 units in the last place if the square is
  * between 2^-32 and 2^32. Dekker's product gives the error of the rounded square. Where it is less

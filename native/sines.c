@@ -10,20 +10,14 @@
 #include <stdbool.h>
 #include <string.h>
 
+#include "lanes.h"
 #include "platform.h"
-#include "program.h"
 #include "quick.h"
 
 /* The first 33 bits of half of pi, the next 33, and the rest. */
 #define HALF_PI_1 0x1.921fb544p+0
 #define HALF_PI_2 0x1.0b4611a6p-34
 #define HALF_PI_3 0x1.3198a2e037073p-69
-
-/* The upper half of a number's digits. */
-static inline double upper(double x) {
-    const double shifted = x * 134217729.0;
-    return shifted - (shifted - x);
-}
 
 /* A number as the sum of two. */
 typedef struct {
@@ -38,7 +32,7 @@ static inline Pair sum_of(double a, double b) {
 
 /* What the rounded product of two numbers lacks. */
 static inline double lost(double a, double b, double product) {
-    const double a1 = upper(a), a2 = a - a1, b1 = upper(b), b2 = b - b1;
+    const double a1 = upper_half(a), a2 = a - a1, b1 = upper_half(b), b2 = b - b1;
     return ((a1 * b1 - product) + a1 * b2 + a2 * b1) + a2 * b2;
 }
 
@@ -148,11 +142,6 @@ static inline void both_of(double x, double *sine, double *cosine, uint8_t *doub
     *doubtful_sine = value_of(wave, 0, sine);
     *doubtful_cosine = value_of(wave, 1, cosine);
 }
-
-#define EACH_LANE(statement)                                                                       \
-    for (size_t j = 0; j < blocks * PROGRAM_BLOCK; j++) {                                          \
-        statement;                                                                                 \
-    }
 
 WIDE void quick_sine(const double *restrict x, size_t blocks, double *restrict to,
                      uint8_t *restrict doubtful) {

@@ -3,13 +3,15 @@
 import csv
 import json
 import sys
+import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import fmugym
 from fmugym.series import TimeSeries
-from fmugym.tools.cli import main
+from fmugym.tools.cli import _parsed, _parser, main
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 PID = "pid of=T setpoint=21 kp=0.3 ti=7200"
@@ -49,6 +51,8 @@ class TestRecord:
         task = Path(CART_POLE).read_text().splitlines()[-1]
         assert task in page
         assert "first seed" in page
+        assert "<h1>cart_pole.toml</h1>" in page
+        assert str(Path(CART_POLE).parent) not in page
 
     def test_a_report_compares_controllers(self, tmp_path, capsys):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
@@ -138,6 +142,21 @@ class TestEvaluate:
         alone = run(capsys, "evaluate", "fmugym/House-v0", *both[2:], *options[:-2], "--json")[1]
         assert json.loads(alone)["scores"][1]["rewards"] == scores[3]["rewards"]
 
+    def test_an_interruption_keeps_the_scores_that_are_there(self, capsys, monkeypatch):
+        steps = iter(range(200))
+
+        def step(self, action):
+            if next(steps, None) is None:
+                raise KeyboardInterrupt
+            return original(self, action)
+
+        original = fmugym.FMUEnv.step
+        monkeypatch.setattr(fmugym.FMUEnv, "step", step)
+        options = "--episodes", "2", "--steps", "60", "--scenario", "frost", "--action", "0"
+        code, out, _ = run(capsys, "evaluate", "fmugym/House-v0", *options, "--json")
+        assert code == 130
+        assert [one["name"] for one in json.loads(out)["scores"]] == ["random"]
+
     def test_all_scenarios(self, capsys):
         options = "--scenario", "all", "--steps", "2", "--episodes", "1"
         code, out, _ = run(capsys, "evaluate", "fmugym/House-v0", *options)
@@ -173,3 +192,67 @@ class TestBench:
         code, out, err = run(capsys, "bench", CART_POLE, *arguments)
         assert (code, out) == (1, "")
         assert arguments[1] in err
+
+
+class TestProgress:
+    @pytest.mark.parametrize("is_terminal", [False, True])
+    def test_bars_are_for_terminals(self, is_terminal, capsys, monkeypatch):
+        bars = []
+
+        class Bar:
+            def __init__(self, **arguments):
+                bars.append((arguments["total"], []))
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *error):
+                return None
+
+            def update(self, steps):
+                bars[-1][1].append(steps)
+
+        monkeypatch.setitem(sys.modules, "tqdm", SimpleNamespace(tqdm=Bar))
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
+        options = "--steps", "3", "--episodes", "2"
+        code, *_ = run(capsys, "simulate", "fmugym/House-v0", *options)
+        assert code == 0
+        assert bars == ([(6, [1] * 6)] if is_terminal else [])
+
+    def test_without_tqdm_there_are_none(self, capsys, monkeypatch):
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+        code, _, err = run(capsys, "simulate", "fmugym/House-v0", "--steps", "3")
+        assert (code, err) == (0, "")
+
+
+class TestJson:
+    @pytest.mark.parametrize("options", [[], ["--class"]])
+    def test_of_new(self, options, tmp_path, capsys):
+        fmu = fmugym.bundled_fmu("Pendulum")
+        path = tmp_path / "out"
+        code, out, err = run(capsys, "new", fmu, *options, "--output", path, "--json")
+        facts = json.loads(out)
+        assert (code, err, facts["output"]) == (0, "", str(path))
+        text = path.read_text()
+        if options:
+            assert facts["program"] == text
+            assert run(capsys, "skeleton", fmu)[1] == run(capsys, "new", fmu, "--class")[1]
+        else:
+            assert facts["task"] == tomllib.loads(text)
+            assert any("reward" in note for note in facts["notes"])
+
+    def test_all_commands_have_it(self):
+        parser = _parser()
+        (commands,) = (action.choices for action in parser._actions if action.choices)
+        for name, command in commands.items():
+            assert any("--json" in action.option_strings for action in command._actions), name
+
+
+def test_arguments_of_an_algorithm_may_stand_anywhere(capsys, monkeypatch):
+    found = _parsed(["train", "a.toml", "x=1", "--output", "b", "y=2", "z"])
+    assert found.arguments == ["x=1", "y=2", "z"]
+    for wrong in (["simulate", "a.toml", "y=2"], ["train", "a", "--output", "b", "--y", "c"]):
+        with pytest.raises(SystemExit) as caught:
+            _parsed(wrong)
+        assert caught.value.code == 2

@@ -232,6 +232,21 @@ class TestCache:
         assert env.health["steps"] == 2 * 2 * STEPS
         env.close()
 
+    @pytest.mark.parametrize("hooks", ["compiled", "array"])
+    def test_one_warm_up_serves_many_environments(self, hooks):
+        task = self.task(clock=["01-15", "07-01 03:00"])
+        envs = FMUVectorEnv(partial(fmugym.load, task), 6, hooks=hooks)
+        observations, infos = envs.reset(seed=0)
+        assert len(set(infos["drawn"]["clock"])) == 2
+        assert envs.health["steps"].sum() == 2 * 2 * STEPS
+        single = fmugym.load(task)
+        for seed in range(6):
+            np.testing.assert_array_equal(single.reset(seed=seed)[0], observations[seed])
+        envs.reset(seed=6)
+        assert envs.health["steps"].sum() == 2 * 2 * STEPS
+        envs.close()
+        single.close()
+
     def test_it_survives_on_disk(self, monkeypatch):
         agent = {"history": {"of": ["T", "u"], "length": "2h"}}
         first = fmugym.load(self.task(agent=agent))
@@ -258,6 +273,22 @@ class TestCache:
         np.testing.assert_array_equal(again.reset(seed=0)[0], expected)
         assert again.health["steps"] == 2 * STEPS
         again.close()
+
+    def test_without_states_every_episode_has_its_warm_up(self, caplog):
+        task = {
+            "fmu": {"bundled": "Pendulum", "fmi_version": "1.0"},
+            "time_step": "50ms",
+            "variables": {"tau": {"min": -1, "max": 1}},
+            "agent": {"actions": ["tau"], "observations": ["q"]},
+            "reward": "q",
+            "warm_up": {"period": "1s", "controller": 0.01, "cache": True},
+        }
+        env = fmugym.load(task)
+        first, again = env.reset(seed=0)[0], env.reset(seed=0)[0]
+        np.testing.assert_array_equal(first, again)
+        assert env.health["steps"] == 40
+        assert caplog.text.count("cannot be serialized") == 1
+        env.close()
 
     def test_another_controller_is_another_state(self):
         task = self.task()

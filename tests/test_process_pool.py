@@ -685,13 +685,23 @@ class TestChoice:
         assert len(pool.processes()) == 3
         assert "each gets a process" in caplog.text
 
-    def test_by_its_own_word(self, make_pool, tmp_path):
+    def test_by_its_own_word(self, make_pool, tmp_path, caplog):
         flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
         alone = faulty_fmu(tmp_path / "1", "{lonely}", flag)
         assert isinstance(make_pool(2, alone, isolation=None, workers=None), ProcessPool)
+        path = faulty_fmu(tmp_path / "2", capabilities=flag)
+        pool = make_pool(2, path, isolation=None, workers=None)
+        assert len(pool.processes()) == 2
+        assert "a process may have one instance of" in caplog.text
+        assert not isinstance(make_pool(1, path, isolation=None, workers=None), ProcessPool)
+
+    def test_unless_the_caller_insists(self, make_pool, tmp_path):
+        flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
+        path = faulty_fmu(tmp_path, capabilities=flag)
+        assert not isinstance(make_pool(2, path, isolation="none", workers=None), ProcessPool)
         if pools.has_native_pool():  # else copies of the library are not to be had
-            path = faulty_fmu(tmp_path / "2", capabilities=flag)
-            assert not isinstance(make_pool(2, path, isolation=None), ProcessPool)
+            options = {"isolation": None, "workers": None, "private_libraries": True}
+            assert not isinstance(make_pool(2, path, **options), ProcessPool)
 
     def test_with_isolation_asked_for(self, make_pool, tmp_path):
         path = faulty_fmu(tmp_path, "{lonely}")

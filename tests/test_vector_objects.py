@@ -262,3 +262,17 @@ class TestContents:
         contents.restore()
         assert len(loop) == 1
         env.close()
+
+
+def test_observations_of_one_environment_after_another_are_new_arrays():
+    """A caller may write to what a step has returned, and reset some environments afterwards."""
+    envs = FMUVectorEnv(Drawing, 3, hooks="per_env", autoreset_mode="disabled")
+    envs.reset(seed=0)
+    observations = envs.step(envs.action_space.sample())[0]
+    before = observations.copy()
+    observations[:] = 99.0
+    again, _ = envs.reset(options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(again[[0, 2]], before[[0, 2]])
+    assert (again[1] != before[1]).all()
+    assert (np.abs(again) < 2.0).all()
+    envs.close()

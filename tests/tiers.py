@@ -49,6 +49,8 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_declared_sensors": 5,
+    "test_declared_warm_up": 5,
     "test_copies": 2,
     "test_examples_planners": 4,
     "test_quirks": 4,
@@ -148,6 +150,10 @@ SLOW_TESTS = (
     "test_snapshots.py::TestForeign",
     "test_snapshots.py::TestSingle::test_goes_on_in_another_process",
     "test_specs.py::test_a_class_of_a_script",
+    "test_trajectories.py::TestDifferences::test_of_fmi",
+    "test_trajectories.py::TestDirectional::test_error",
+    "test_trajectories.py::TestModelExchange",
+    "test_trajectories.py::TestRefusals::test_of_an_",
     "test_trial.py::TestDeath::test_a_hang",
     "test_trial.py::TestDeath::test_before_a_vector",
     "test_trial.py::TestDeath::test_of_a_second",

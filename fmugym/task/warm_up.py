@@ -27,7 +27,7 @@ from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables
 from fmugym.trial.trial import state_files
 
-__all__ = ["Found", "WarmUp", "WarmUps", "rows_of_one"]
+__all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
 
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
@@ -138,6 +138,7 @@ class WarmUps:
         self._prefix: str | None = None
         self._scope = b""
         self._keys: dict[int, bytes] = {}
+        self._has_told = False
 
     # States that are known
 
@@ -159,7 +160,7 @@ class WarmUps:
             indices: The environments.
         """
         self._keys = {}
-        if not self._warm_up.caches or pool.save_method is not SaveMethod.STATE:
+        if not self._warm_up.caches or not self._can_keep(pool):
             return {}
         names = repr([variable.name for variable in variables]).encode()
         found = {}
@@ -173,6 +174,22 @@ class WarmUps:
             else:
                 found[index] = warmed
         return found
+
+    def distinct(self, indices: Iterable[int]) -> list[int]:
+        """Of environments without a known state, those whose warm-ups lead to different ones."""
+        by_key = {self._keys.get(index, index): index for index in reversed(list(indices))}
+        return sorted(by_key.values())
+
+    def _can_keep(self, pool: Pool) -> bool:
+        """Whether the FMU's states can be kept; says so once if they cannot."""
+        can = pool.save_method is SaveMethod.STATE
+        if not can and not self._has_told:
+            self._has_told = True
+            self._env.logger.warning(
+                "%s: no state is kept after the warm-up, because its states cannot be serialized",
+                self._env.fmu.path.name,
+            )
+        return can
 
     def _key(self, parts: Iterable[bytes]) -> bytes:
         if self._prefix is None:
@@ -188,12 +205,12 @@ class WarmUps:
         Raises:
             SimulationError: If an FMU refuses.
         """
-        for index, warmed in found.items():
-            where = np.array([index])
-            status = pool.restore_instances(warmed.state, np.zeros(1, np.int64), where)[index]
-            if status > _WARNING:
+        for warmed, indices in grouped(found):
+            sources = np.zeros(len(indices), np.int64)
+            statuses = pool.restore_instances(warmed.state, sources, indices)
+            for index in indices[statuses[indices] > _WARNING].tolist():
                 raise failed_reset(self._located(pool, index))
-            pool.inputs[:, index] = warmed.inputs
+            pool.inputs[:, indices] = warmed.inputs[:, None]
 
     # Warm-ups
 
@@ -294,6 +311,14 @@ class WarmUps:
             values = [warmed.state.outputs, warmed.inputs, *warmed.variables.values()]
             numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
             files.keep(key.hex()[:32], InitialState(numbers.tobytes(), warmed.state.data))
+
+
+def grouped(found: Found) -> list[tuple[Warmed, IndexArray]]:
+    """The states that were found, each with its environments."""
+    groups: dict[int, tuple[Warmed, list[int]]] = {}
+    for index, warmed in found.items():
+        groups.setdefault(id(warmed), (warmed, []))[1].append(index)
+    return [(warmed, np.array(indices)) for warmed, indices in groups.values()]
 
 
 def rows_of_one(env: Any) -> Readings:

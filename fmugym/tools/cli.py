@@ -114,7 +114,7 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
     parser = _parser()
     arguments, rest = parser.parse_known_args(argv)
-    more = [text for text in rest if "=" in text and not text.startswith("-")]
+    more = [text for text in rest if not text.startswith("-")]
     if rest and (len(more) < len(rest) or not hasattr(arguments, "arguments")):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:

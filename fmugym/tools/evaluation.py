@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -17,7 +17,7 @@ from fmugym.tools.overview import plain
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Policy, Summary, simulate
 
-__all__ = ["Score", "confidence", "evaluate", "plot_scores", "table"]
+__all__ = ["Score", "confidence", "each_score", "evaluate", "plot_scores", "table"]
 
 _Z: Final = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""
@@ -125,16 +125,26 @@ def evaluate(
     Returns:
         A score for each controller, in their order.
     """
-    seeds, scores = list(seeds), []
-    env = make_env()
+    return list(each_score(make_env, policies, seeds, most_steps, scenario, advance))
+
+
+def each_score(
+    make_env: Callable[[], FMUEnv],
+    policies: Mapping[str, Callable[[FMUEnv], Policy]],
+    seeds: Iterable[int],
+    most_steps: int,
+    scenario: str | None = None,
+    advance: Advance = no_progress,
+) -> Iterator[Score]:
+    """Yield each score of ``evaluate`` as soon as it is known."""
+    seeds, env = list(seeds), make_env()
     try:
         for name, make_policy in policies.items():
             policy, begin = make_policy(env), perf_counter()
             episodes = [simulate(env, policy, seed, most_steps, advance) for seed in seeds]
-            scores.append(_score(name, episodes, perf_counter() - begin, scenario))
+            yield _score(name, episodes, perf_counter() - begin, scenario)
     finally:
         env.close()
-    return scores
 
 
 def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | None) -> Score:

@@ -83,7 +83,11 @@ def _train(arguments: argparse.Namespace) -> None:
         plan = _tuned(plan, arguments)
     with progress(plan.steps, "train") as advance:
         watch = Watch(tell, advance, begin_tracker=begin_tracker)
-        scores = train(plan, resume=arguments.resume, watch=watch)
+        try:
+            scores = train(plan, resume=arguments.resume, watch=watch)
+        except KeyboardInterrupt:
+            tell(f"{plan.folder} has the best agent until now; --resume goes on with the training")
+            raise
     _show(plan, scores, arguments)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from fmugym.env import FMUEnv
 from fmugym.series import RecordSeries
-from fmugym.tools.evaluation import evaluate, plot_scores, table
+from fmugym.tools.evaluation import Score, each_score, plot_scores, table
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -25,7 +25,7 @@ from fmugym.tools.options import (
 )
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import progress
-from fmugym.tools.records import Recording, require_format
+from fmugym.tools.records import Recording, require_format, title_of
 from fmugym.tools.simulation import Summary, simulate
 from fmugym.tools.speed import bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
@@ -146,14 +146,23 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         require_format(arguments.plot, 1)
     players = players_of(arguments, random=True)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
-    scores = []
-    for scenario in _scenarios(arguments):
-        make_env = maker_of(arguments.task, scenario)
-        label = "evaluate" if scenario is None else scenario
-        with progress(None, label) as advance:
-            scores += evaluate(make_env, players, seeds, arguments.steps, scenario, advance)
-    if arguments.plot is not None:
-        plot_scores(scores, arguments.plot, str(arguments.task))
+    scores: list[Score] = []
+    try:
+        for scenario in _scenarios(arguments):
+            make_env = maker_of(arguments.task, scenario)
+            label = "evaluate" if scenario is None else scenario
+            with progress(None, label) as advance:
+                played = each_score(make_env, players, seeds, arguments.steps, scenario, advance)
+                scores.extend(played)  # one by one, so that an interruption keeps them
+    except KeyboardInterrupt:
+        _show_scores(scores, arguments)
+        raise
+    _show_scores(scores, arguments)
+
+
+def _show_scores(scores: list[Score], arguments: argparse.Namespace) -> None:
+    if arguments.plot is not None and scores is not None:
+        plot_scores(scores, arguments.plot, title_of(arguments.task))
     if arguments.json:
         say_json({"task": arguments.task, "scores": [one.as_dict() for one in scores]})
     else:

@@ -13,7 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.series import RecordSeries, TimeSeries, plot, write_report
 
-__all__ = ["Recording", "require_format"]
+__all__ = ["Recording", "require_format", "title_of"]
 
 _TABLES: Final = (".csv", ".parquet")
 _PICTURES: Final = (".png", ".svg", ".pdf")
@@ -36,6 +36,12 @@ def require_format(path: Path, runs: int) -> None:
         raise FileExistsError(f"{path} exists; name a new file")
 
 
+def title_of(target: str) -> str:
+    """What a task is called in pictures and reports: a file by its name, without its folder."""
+    path = Path(target)
+    return path.name if path.is_file() else target
+
+
 class Recording:
     """The episodes of one controller after another, and the files about them.
 
@@ -46,7 +52,8 @@ class Recording:
     """
 
     def __init__(self, target: str, scenario: str | None, paths: Sequence[Path]) -> None:
-        self._title = target if scenario is None else f"{target}, scenario {scenario}"
+        name = title_of(target)
+        self._title = name if scenario is None else f"{name}, scenario {scenario}"
         self._paths = paths
         self._recorders: dict[str, RecordSeries] = {}
         self._text = self._description = ""

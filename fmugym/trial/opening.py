@@ -90,11 +90,11 @@ def make_pool(
             results in the trial.
         threads: See ``NativePool``; the Python pool has one thread. By default one if instances
             disturb each other when they run at the same time.
-        private_libraries: See ``NativePool``; by default True if the FMU says that it can be
-            instantiated only once per process, or if two instances disturb each other in the
-            trial. The Python pool has one library.
+        private_libraries: See ``NativePool``; by default True if two instances disturb each other
+            in the trial. The Python pool has one library.
         isolation: ``"process"`` for worker processes, ``"none"`` for this process. By default this
-            process, unless instances disturb each other and private libraries do not help.
+            process, unless the FMU says that it can be instantiated only once per process, or
+            instances disturb each other and private libraries do not help.
         workers: See ``ProcessPool``; by default one for each instance if they disturb each other.
         call_timeout: See ``ProcessPool``; calls in this process have no time limit.
         rehearse: Whether a spare instance plays episodes again now and then, to see whether they
@@ -360,9 +360,11 @@ class _Plan:
             plan = replace(plan, reset_method=verdict.reset_method)
             _tell_of_resets(fmu, verdict, log)
         if plan.private_libraries is None and num_instances > 1 and not plan.has_own_workers:
-            plan = plan._apart(
-                fmu, verdict.neighbours or Neighbours.INDEPENDENT, num_instances, log
-            )
+            if _is_alone(fmu):
+                plan = plan._in_processes(fmu, num_instances, log)
+            else:
+                neighbours = verdict.neighbours or Neighbours.INDEPENDENT
+                plan = plan._apart(fmu, neighbours, num_instances, log)
         if verdict.isolate and plan.isolation is None:
             why = f": {verdict.reasons[-1]}" if verdict.reasons else ""
             log.warning("%s harms its process%s. It runs in worker processes", fmu.path.name, why)
@@ -377,6 +379,22 @@ class _Plan:
             return self
         log.info("%s: initial states are kept for other instances and on disk", fmu.path.name)
         return replace(self, state_files=state_files(fmu))
+
+    def _in_processes(self, fmu: FMU, num_instances: int, log: logging.Logger) -> _Plan:
+        """Give each instance a process, as the FMU demands, unless the caller insists."""
+        if self.isolation == "none":
+            what = "isolation='none' keeps more in it all the same"
+            plan = self
+        else:
+            what = "each gets a process with a copy of the FMU's files"
+            plan = self._with_a_process_each(num_instances)
+        level = logging.INFO if self.isolation == "process" else logging.WARNING
+        log.log(level, "a process may have one instance of %s: %s", fmu.path.name, what)
+        return plan
+
+    def _with_a_process_each(self, num_instances: int) -> _Plan:
+        workers = self.workers or num_instances
+        return replace(self, isolation="process", workers=workers, own_files=True)
 
     def _apart(
         self, fmu: FMU, neighbours: Neighbours, num_instances: int, log: logging.Logger
@@ -393,8 +411,7 @@ class _Plan:
         elif neighbours is Neighbours.PROCESSES and in_process:
             plan, what = self, "isolation='none' keeps them in one process all the same"
         elif neighbours is not Neighbours.ONE_THREAD:
-            workers = self.workers or num_instances
-            plan = replace(self, isolation="process", workers=workers, own_files=True)
+            plan = self._with_a_process_each(num_instances)
             what = "each gets a process with a copy of the FMU's files"
         asked_for = self.isolation == "process"
         level = logging.INFO if asked_for else logging.WARNING
@@ -471,20 +488,21 @@ def _verdict(
     if is_bundled(fmu.path):
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
     several = num_instances > 1 and plan.private_libraries is None and not plan.has_own_workers
-    once = fmu.description.capabilities.can_be_instantiated_only_once_per_process
+    several = several and not _is_alone(fmu)
     isolated = plan.isolation == "process"
     if not candidate.exempt:
         remains = _remains(candidate)
-        verdict = examine(
-            candidate, spec, starts, several=several, alone=once, must_survive=not isolated
-        )
+        verdict = examine(candidate, spec, starts, several=several, must_survive=not isolated)
         return _judge_remains(remains, verdict, candidate, spec, starts)
-    if several and (once or isolated or _disturb_here(candidate, spec)):
-        verdict = examine(
-            candidate, spec, several=True, alone=not isolated or once, must_survive=False
-        )
+    if several and (isolated or _disturb_here(candidate, spec)):
+        verdict = examine(candidate, spec, several=True, alone=not isolated, must_survive=False)
         return Verdict(neighbours=verdict.neighbours or Neighbours.PROCESSES)
     return Verdict()
+
+
+def _is_alone(fmu: FMU) -> bool:
+    """Whether the FMU says that a process may have only one instance."""
+    return fmu.description.capabilities.can_be_instantiated_only_once_per_process
 
 
 def _remains(candidate: Candidate) -> Remains:

@@ -35,6 +35,9 @@ logger = logging.getLogger(__name__)
 _BESIDE: Final = 1e-3
 """How far actions are moved to check derivatives, as a fraction of the width of their space."""
 
+_ROUNDING: Final = 1e-9
+"""Changes of states that are smaller fractions of these show rounding errors."""
+
 _DOUBTFUL: Final = 0.1
 """The error of predictions from which on derivatives are doubtful."""
 
@@ -278,22 +281,16 @@ class _Follower:
             The mean error of a state, as a fraction of its largest change; that of the worst state.
         """
         space = float_box(self._env.action_space, "action")
-        up, down, _ = moved_both_ways(space, nominal, _BESIDE)
-        odd = np.arange(len(nominal)).reshape(-1, *[1] * (nominal.ndim - 1)) % 2 == 1
-        actions, x = np.where(odd, up, down), [self._read()]
+        actions, down, _ = moved_both_ways(space, nominal, _BESIDE)
+        actions[1::2] = down[1::2]
+        x = [self._read()]
         for action in actions:
             *_, terminated, truncated, _ = self._env.step(action)
             x.append(self._read())
             if terminated or truncated:
                 break
-        off = np.array(x) - found.x[: len(x)]
-        steps = len(x) - 1
-        du = np.subtract(actions, nominal, dtype=np.float64).reshape(len(nominal), -1)[:steps]
-        predicted = np.einsum("kij,kj->ki", found.A[:steps], off[:-1])
-        predicted += np.einsum("kij,kj->ki", found.B[:steps], du)
-        scale = np.abs(off[1:]).max(axis=0, initial=0.0)
-        wrong = np.abs(off[1:] - predicted).mean(axis=0)
-        return float(np.max(wrong / np.where(scale > 0.0, scale, np.inf), initial=0.0))
+        moves = np.subtract(actions, nominal, dtype=np.float64).reshape(len(nominal), -1)
+        return _error_of(found, np.array(x), moves)
 
     def _read(self) -> FloatArray:
         return self._pool.read(self._x)[:, 0]
@@ -306,6 +303,23 @@ class _Follower:
         if "fault" in info or (any(ends) and index + 1 < horizon):
             why = info.get("fault", "the episode ends there")
             raise SimulationError(f"step {index + 1} of {horizon} has no successor: {why}")
+
+
+def _error_of(found: Matrices, x: FloatArray, moves: FloatArray) -> float:
+    """The error of predicted changes of each step, as ``_Follower.error_beside`` returns it.
+
+    Args:
+        found: The matrices and the nominal states.
+        x: The states beside them, shape (steps + 1, n_x).
+        moves: How far the actions were moved, shape (horizon, n_u).
+    """
+    steps, off = len(x) - 1, x - found.x[: len(x)]
+    predicted = np.einsum("kij,kj->ki", found.A[:steps], off[:-1])
+    predicted += np.einsum("kij,kj->ki", found.B[:steps], moves[:steps])
+    wrong = np.abs(off[1:] - predicted).mean(axis=0)
+    largest = np.abs(off[1:]).max(axis=0)
+    has_moved = largest > _ROUNDING * np.abs(x).max(axis=0)
+    return float(np.max(wrong[has_moved] / largest[has_moved], initial=0.0))
 
 
 def _require_no_feedback(env: FMUEnv, action: npt.NDArray[Any]) -> None:

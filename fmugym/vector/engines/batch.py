@@ -24,7 +24,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
-from fmugym.task.warm_up import WarmUps
+from fmugym.task.warm_up import WarmUps, grouped
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
@@ -243,24 +243,33 @@ class BatchEngine(Engine):
     def _begin_with_warm_up(
         self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
     ) -> None:
-        """Begin episodes with a warm-up, or in the state that an earlier one has led to."""
+        """Begin episodes with a warm-up, or in the states that earlier ones have led to."""
         env, pool = self.env, self._pool
         rows = {name: self._row(name) for name in env.variables}
-        found = warm_ups.find(pool, plan.model_variables, values, rows, indices.tolist())
-        others = np.array([index for index in indices.tolist() if index not in found], np.intp)
-        if len(others):
-            mask = np.zeros(self._n, np.bool_)
-            mask[others] = True
-            self._reset_pool(mask, others, plan, values)
         self._forget(indices, plan)
-        if len(others):
-            written = warm_ups.run(pool, parts(Readings.of(env), others), others)
-            self._place(written, written.values(), others)
-        warm_ups.restore(pool, found)
-        for index, warmed in found.items():
-            columns = [np.asarray(value)[..., None] for value in warmed.variables.values()]
-            self._place(warmed.variables, columns, np.array([index]))
+        left = indices.tolist()
+        while left:
+            found = warm_ups.find(pool, plan.model_variables, values, rows, left)
+            first = warm_ups.distinct(index for index in left if index not in found)
+            self._warm_up(warm_ups, np.array(first, np.intp), plan, values)
+            warm_ups.restore(pool, found)
+            for warmed, where in grouped(found):
+                columns = [np.asarray(value)[..., None] for value in warmed.variables.values()]
+                self._place(warmed.variables, columns, where)
+            left = [index for index in left if index not in found and index not in first]
         env.previous_state[:, indices] = env.state[:, indices]
+
+    def _warm_up(
+        self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
+    ) -> None:
+        """Reset FMUs and do their warm-ups."""
+        if not len(indices):
+            return
+        mask = np.zeros(self._n, np.bool_)
+        mask[indices] = True
+        self._reset_pool(mask, indices, plan, values)
+        written = warm_ups.run(self._pool, parts(Readings.of(self.env), indices), indices)
+        self._place(written, written.values(), indices)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""

@@ -1,0 +1,21 @@
+/* Loops over the values of a register. */
+
+#ifndef FMUGYM_LANES_H
+#define FMUGYM_LANES_H
+
+#include "program.h"
+
+/* Computing the end from the blocks shows the compiler that no value is left over. */
+#define EACH_LANE(statement)                                                                       \
+    for (size_t j = 0; j < blocks * PROGRAM_BLOCK; j++) {                                          \
+        statement;                                                                                 \
+    }
+
+/* The upper half of a number's digits (G. W. Veltkamp, T. J. Dekker 1971). The product of two such
+ * halves is exact. */
+static inline double upper_half(double x) {
+    const double shifted = x * 134217729.0;
+    return shifted - (shifted - x);
+}
+
+#endif
