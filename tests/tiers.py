@@ -14,6 +14,7 @@ SLOW_MODULES = {
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
+    "test_examples_train_house",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
