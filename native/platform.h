@@ -26,8 +26,9 @@
 enum { CACHE_LINE = 64 };
 
 /* For loops that run faster with wider vector instructions, where the processor has them. The
- * results are the same because no operations are fused. */
-#if defined __x86_64__ && defined __linux__ && defined __GLIBC__
+ * results are the same because no operations are fused. The choice is made while the library is
+ * loaded, when the thread sanitizer cannot work yet. */
+#if defined __x86_64__ && defined __linux__ && defined __GLIBC__ && !defined __SANITIZE_THREAD__
 #define WIDE __attribute__((target_clones("avx2", "default")))
 #else
 #define WIDE

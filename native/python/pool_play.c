@@ -750,12 +750,15 @@ PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) 
 
 /* Starting episodes outside of a step */
 
+/* Sets ended to 1 if any episode is at its end now, 0 otherwise. */
 static void do_start(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
+    const Play *play = t->turn.play;
 
     t->call.alone = alone;
     t->ends.outside = false;
     t->troubled = pool_start(&self->pool, &t->call, &t->ends.outside);
+    t->ends.ended = memchr(play->ended, 1, play->count) != NULL;
 }
 
 static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *const *args,
@@ -770,11 +773,8 @@ static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *co
 }
 
 /* How many instances had trouble, and whether any episode is at its end now. */
-static PyObject *start_result(const Playing *playing, const PyTurn *t) {
-    const Play *play = &playing->play;
-    PyObject *any = memchr(play->ended, 1, play->count) == NULL ? Py_False : Py_True;
-
-    return Py_BuildValue("(nO)", (Py_ssize_t)t->troubled, any);
+static PyObject *start_result(const PyTurn *t) {
+    return Py_BuildValue("(nO)", (Py_ssize_t)t->troubled, t->ends.ended ? Py_True : Py_False);
 }
 
 static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
@@ -789,7 +789,7 @@ static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *ar
         done = perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self);
     }
     release_turn(playing, &t);
-    return done ? start_result(playing, &t) : NULL;
+    return done ? start_result(&t) : NULL;
 }
 
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
