@@ -391,6 +391,26 @@ class TestPictures:
         limits = {line.get_ydata()[0] for line in action.get_lines()[1:]}
         assert limits == {-0.1, 0.1}
 
+    def test_two_set_points_are_the_edges_of_a_band(self):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        task = {
+            "fmu": {"bundled": "Pendulum"},
+            "time_step": 0.05,
+            "agent": {"actions": "tau", "observations": ["q"]},
+            "setpoints": {"least": -1, "most": {"value": 2}},
+            "reward": "-max(least - q, 0) - max(q - most, 0)",
+        }
+        env = RecordSeries(fmugym.load(task))
+        env.reset(seed=0)
+        for _ in range(5):
+            env.step(env.action_space.sample())
+        axis = plot(env.series).axes[0]
+        (band,) = axis.collections
+        heights = band.get_paths()[0].vertices[:, 1]
+        assert (heights.min(), heights.max()) == (-1, 2)
+        assert [line.get_label() for line in axis.get_lines()[:3]] == ["q", "least", "most"]
+        env.close()
+
     def test_files(self, series, tmp_path):
         (first, *_) = series.episodes().values()
         plot(first, tmp_path / "a.png", title="$a_b")

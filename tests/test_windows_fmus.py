@@ -129,6 +129,16 @@ class TestProgram:
             "differentiate",
         }  # FMPy does
 
+    def test_its_sources_fit_the_native_pool(self, tmp_path):
+        """Without Wine, too: what they use of the native pool is there."""
+        for path in program.sources():
+            if path.parent.name == "worker" and path.suffix == ".c":
+                command = [sys.executable, "-m", "ziglang", "cc", "-c", *program._OPTIONS, path]
+                done = subprocess.run(
+                    [*command, "-o", "made.o"], cwd=tmp_path, capture_output=True, text=True
+                )
+                assert done.returncode == 0, done.stderr
+
     def test_its_sources_are_found(self):
         names = {path.name for path in program.sources()}
         assert {"main.c", "requests.c", "fmi1.c", "fmi2.c", "fmi3.c", "pool.h"} <= names

@@ -161,6 +161,8 @@ SLOW_TESTS = (
     "test_trial.py::TestSurvival::test_is_remembered",
     "test_trial.py::TestSurvival::test_without_a_place",
     "test_vector_codec.py::test_gathered_as",
+    "test_windows_fmus.py::TestProgram::test_a_compiler",
+    "test_windows_fmus.py::TestProgram::test_its_sources_fit",
 )
 """Others, by the beginning of their node ids."""
 

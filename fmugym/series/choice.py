@@ -37,22 +37,25 @@ class Choice(NamedTuple):
     variables: tuple[Variable, ...]
     observed: tuple[int, ...]
 
-    def values(self, present: FloatArray, pool: Pool, observations: FloatArray) -> FloatArray:
-        """Put the values of N environments together.
+    def values(
+        self, present: FloatArray, pool: Pool, observations: FloatArray, indices: Any
+    ) -> FloatArray:
+        """Put the values of M environments together.
 
         Args:
-            present: All of the task's quantities, shape (k, N).
+            present: All of the task's quantities, shape (k, M).
             pool: Reads variables of the FMU.
-            observations: Shape (N, m).
+            observations: Those of all environments, shape (N, m).
+            indices: The M environments.
 
         Returns:
             One row for each environment, one column for each quantity.
         """
         rows = [present[list(self.places)]]
         if self.variables:
-            rows.append(pool.read(self.variables))
+            rows.append(pool.read(self.variables)[:, indices])
         if self.observed:
-            rows.append(observations.T[list(self.observed)])
+            rows.append(observations[indices].T[list(self.observed)])
         return np.concatenate(rows).T
 
 

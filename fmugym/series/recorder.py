@@ -123,7 +123,7 @@ class _One:
     def __init__(self, env: FMUEnv) -> None:
         self.prototype, self.count = env, 1
 
-    def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
         env = self.prototype
         env._tells = True  # nothing is written, so that compiled steps may go on
         try:
@@ -223,8 +223,8 @@ class _Many:
         self._envs, self.prototype, self.count = envs, envs._prototype, envs.num_envs
         self.actions: Any = np.zeros(envs.action_space.shape, envs.action_space.dtype)
 
-    def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
-        return self._envs._engine.evaluate(function, self.actions)
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
+        return self._envs._engine.evaluate(function, self.actions, indices)
 
     @property
     def pool(self) -> Pool:

@@ -25,8 +25,8 @@ class Episodes(Protocol):
     prototype: FMUEnv
     count: int
 
-    def evaluate(self, function: Callable[[Any], Sequence[Any]]) -> FloatArray:
-        """Evaluate a function of the environment; shape (k, N)."""
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
+        """Evaluate a function of M of the environments; shape (k, M)."""
 
     @property
     def pool(self) -> Pool:
@@ -185,7 +185,9 @@ class Rows:
         self._steps += ~idle
         ended = (outcome.terminated | outcome.truncated) & ~idle
         values = self._values(outcome.observations)
-        values[outcome.lost, : len(self._choice.places) + len(self._choice.variables)] = np.nan
+        values[
+            outcome.lost[self._indices], : len(self._choice.places) + len(self._choice.variables)
+        ] = np.nan
         due = ~idle & (ended | (self._steps % self._every == 0))
         flags = outcome.terminated, outcome.truncated
         block = self._block(due, values, flags, outcome.infos)
@@ -193,9 +195,11 @@ class Rows:
         return block
 
     def _values(self, observations: Any) -> FloatArray:
-        episodes = self._episodes
-        present = episodes.evaluate(self._choice.read)
-        return self._choice.values(present, episodes.pool, flat(observations, episodes.count))
+        """The values of the environments to write down, one row for each."""
+        episodes, indices = self._episodes, self._indices
+        present = episodes.evaluate(self._choice.read, indices)
+        seen = flat(observations, episodes.count)
+        return self._choice.values(present, episodes.pool, seen, indices)
 
     def _block(
         self,
@@ -204,7 +208,8 @@ class Rows:
         flags: tuple[MaskArray, MaskArray],
         infos: Infos,
     ) -> Block:
-        which = self._indices[mask[self._indices]]
+        is_due = mask[self._indices]
+        which = self._indices[is_due]
         spec = self._episodes.prototype._spec
         passed: Any = (spec.warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
@@ -212,7 +217,7 @@ class Rows:
             *(self._number[which], self._steps[which]),
             *(
                 spec.communication_point(passed),
-                *values[which].T,
+                *values[is_due].T,
                 *self._sums[which].T,
             ),
             *(infos.numbers("kpis", name)[which] for name in self._kpis),

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
@@ -43,6 +44,27 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
         done=np.zeros(count, np.bool_),
         after_end=np.zeros(count, np.bool_),
         parameters=MappingProxyType({}),
+        variables=variables,
+    )
+
+
+def some(batch: Readings, indices: npt.NDArray[np.intp]) -> Readings:
+    """Return copies of what the hooks of some environments of a batch read, in the same form."""
+    values = batch.values[:, indices]
+    variables = EpisodeVariables(batch.variables)
+    variables.update({name: np.asarray(row)[..., indices] for name, row in batch.variables.items()})
+    return Readings(
+        values=values,
+        out=NamedValues("output", list(batch.out), lambda: values),
+        state=values[: len(batch.state)],
+        previous_state=batch.previous_state[:, indices],
+        inputs=batch.inputs[:, indices],
+        action=batch.action[..., indices],
+        previous_action=batch.previous_action[..., indices],
+        step_count=batch.step_count[indices],
+        done=batch.done[indices],
+        after_end=batch.after_end[indices],
+        parameters={name: row[indices] for name, row in batch.parameters.items()},
         variables=variables,
     )
 

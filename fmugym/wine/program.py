@@ -144,9 +144,15 @@ def _compile(target: Path) -> None:
             stderr=subprocess.STDOUT,
             timeout=_LONGEST_BUILD,
         )
-    except (OSError, subprocess.SubprocessError) as error:
-        said = getattr(error, "output", None) or b""
-        text = said.decode(errors="replace").strip()[-2000:]
-        raise FMULoadError(
-            printable(f"the worker program for Windows libraries cannot be built: {error} {text}")
-        ) from None
+    except subprocess.CalledProcessError as error:
+        raise _build_failed(error.output.decode(errors="replace").strip()[-2000:]) from None
+    except subprocess.TimeoutExpired:
+        raise _build_failed(f"the compiler took longer than {_LONGEST_BUILD:g} s") from None
+    except OSError as error:
+        raise _build_failed(str(error)) from None
+
+
+def _build_failed(why: str) -> FMULoadError:
+    return FMULoadError(
+        printable(f"the worker program for Windows libraries cannot be built: {why}")
+    )

@@ -149,14 +149,20 @@ const char *read_text(Reader *reader) {
 
 /* Writing */
 
+void *memory_for(void *old, size_t size) {
+    void *memory = realloc(old, size + 1);
+
+    if (memory == NULL) {
+        fprintf(stderr, "the worker has no memory left\n");
+        ExitProcess(1);
+    }
+    return memory;
+}
+
 void write_bytes(Writer *writer, const void *bytes, size_t count) {
     if (writer->size + count > writer->room) {
         writer->room = 2 * (writer->size + count);
-        writer->bytes = realloc(writer->bytes, writer->room);
-        if (writer->bytes == NULL) {
-            fprintf(stderr, "the worker has no memory left\n");
-            ExitProcess(1);
-        }
+        writer->bytes = memory_for(writer->bytes, writer->room);
     }
     if (count > 0) {
         memcpy(writer->bytes + writer->size, bytes, count);

@@ -49,7 +49,10 @@ const char *read_text(Reader *reader);
 /* A length and so many bytes. */
 const char *read_block(Reader *reader, size_t *size);
 
-/* Bytes that grow; the caller frees them. If memory runs out, the process ends. */
+/* As realloc; if memory runs out, the process ends, which its parent takes as a death. */
+void *memory_for(void *old, size_t size);
+
+/* Bytes that grow; the caller frees them. */
 typedef struct {
     char *bytes;
     size_t size, room;

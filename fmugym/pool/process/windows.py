@@ -53,7 +53,6 @@ REQUESTS: Final = (
     "failure",
     "read",
     "replace_record",
-    "renew",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""

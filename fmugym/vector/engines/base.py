@@ -103,16 +103,19 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+    def evaluate(
+        self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
+    ) -> FloatArray:
         """Evaluate a function of the environment, which reads as hooks do and changes nothing.
 
         Args:
-            function: Returns numbers for a single environment, and arrays of shape (N,) for a
-                prototype that stands for all of them.
-            actions: The latest actions, environments first.
+            function: Returns numbers for a single environment, and arrays of shape (M,) for a
+                prototype that stands for M of them.
+            actions: The latest actions of all environments, these first.
+            indices: The M environments to evaluate it for.
 
         Returns:
-            The values of all environments, shape (k, N).
+            The values, shape (k, M).
         """
 
     @abstractmethod

@@ -34,7 +34,7 @@ from fmugym.vector.hooks import results
 from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
 from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams
-from fmugym.vector.views import batched, column, parts, take
+from fmugym.vector.views import batched, column, parts, some, take
 
 __all__ = ["BatchEngine"]
 
@@ -165,13 +165,15 @@ class BatchEngine(Engine):
         self.env.variables.update(variables)
         return returned
 
-    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+    def evaluate(
+        self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
+    ) -> FloatArray:
         """See ``Engine.evaluate``."""
         env = self.env
         latest = replace(Readings.of(env), action=np.moveaxis(np.asarray(actions), 0, -1))
-        with reading(env, latest):
+        with reading(env, some(latest, indices)):
             rows = function(env)
-        return np.array([np.broadcast_to(row, self._n) for row in rows], np.float64)
+        return np.array([np.broadcast_to(row, len(indices)) for row in rows], np.float64)
 
     def _with(self, variable: str, values: Mapping[int, Any]) -> FloatArray:
         """The row of an episode variable with other values for some environments."""

@@ -95,9 +95,11 @@ class PerEnvEngine(Engine):
         values = [attribute(self._envs[index], name) for index in indices]
         return [v(*arguments, **keywords) if callable(v) else v for v in values]
 
-    def evaluate(self, function: Callable[[Any], Sequence[Any]], actions: Any) -> FloatArray:
+    def evaluate(
+        self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
+    ) -> FloatArray:
         """See ``Engine.evaluate``; the environments know their actions."""
-        return np.array([function(env) for env in self._envs], np.float64).T
+        return np.array([function(self._envs[index]) for index in indices], np.float64).T
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """See ``Engine.set_attribute``; the values may be of any type."""

@@ -1,0 +1,25 @@
+/* Answers to requests, and messages that come before them. */
+
+#ifndef FMUGYM_ANSWERS_H
+#define FMUGYM_ANSWERS_H
+
+#include "worker.h"
+
+void send_done(void);
+/* Frees what the writer has. */
+void send_result(Writer *writer);
+void send_error(const char *text);
+/* Sends why the last status of an instance was bad, as an error. */
+void send_failure(Worker *worker, size_t index);
+/* Whether there is a failure is the first byte. */
+void write_failure(Worker *worker, Writer *writer, size_t index);
+
+/* The answers to requests for snapshots, serialized states and records; see saving.c. */
+void answer_save(Worker *worker, Reader *reader);
+void answer_restore(Worker *worker, Reader *reader);
+void answer_bundle(Worker *worker, Reader *reader);
+void answer_unbundle(Worker *worker, Reader *reader);
+void answer_record_of(Worker *worker, Reader *reader);
+void answer_replace_record(Worker *worker, Reader *reader);
+
+#endif
