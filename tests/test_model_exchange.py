@@ -18,6 +18,8 @@ from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import SOLVERS
+from fmugym.tools.proposal import Proposal
+from fmugym.tools.skeleton import Skeleton
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -622,3 +624,28 @@ class TestEnvironments:
         env.reset()
         assert not env.step(E)[3]
         env.close()
+
+
+class TestTools:
+    @all_versions
+    def test_a_skeleton_derives_from_the_class_for_the_interface(self, fmu_path, version):
+        text = Skeleton(FMU(fmu_path("circuit", version))).text()
+        assert f"(fmugym.FMI{version}MEEnv)" in text
+
+    def test_a_task_file_names_interface_and_solver(self, fmu_path, tmp_path):
+        both = fmu_path("circuit", interfaces=TestEnvironments.BOTH)
+        text = Proposal(FMU(both)).text()
+        text += '\n[config]\ninterface = "model_exchange"\nsolver = "rk4"\nmax_step = 0.001\n'
+        (tmp_path / "task.toml").write_text(text)
+        env = fmugym.load(tmp_path / "task.toml")
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        assert env.fmu.description.interface == "model_exchange"
+        assert (env._spec.solver, env._spec.max_step) == ("rk4", 0.001)
+        env.close()
+
+    def test_fixed_steps_are_by_default_those_of_the_fmu(self, fmu_path):
+        for solver, max_step in (("euler", 0.01), ("dormand_prince", None)):
+            env = BallEnv(fmu_path("ball"), solver=solver)
+            assert env._spec.max_step == max_step
+            env.close()

@@ -14,6 +14,7 @@ SLOW_MODULES = {
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
+    "test_examples_train_house",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
@@ -65,6 +66,8 @@ these occurs with others in turn.
 """
 
 SLOW_TESTS = (
+    "test_baselines_tuning.py::test_it_finds",
+    "test_baselines_tuning.py::test_the_same",
     "test_cli.py::TestSkeleton::test_runs_for",
     "test_cli_playing.py::TestBench::test_a_table",
     "test_cli_playing.py::TestRecord::test_a_report",

@@ -14,6 +14,7 @@ from fmugym.baselines.base import Controller
 from fmugym.baselines.feedback import LQR, PID, Hysteresis
 from fmugym.baselines.feedforward import Constant, Random, Schedule
 from fmugym.baselines.parsing import controller_of
+from fmugym.baselines.tuning import Tuning, tune
 
 __all__ = [
     "LQR",
@@ -23,5 +24,7 @@ __all__ = [
     "Hysteresis",
     "Random",
     "Schedule",
+    "Tuning",
     "controller_of",
+    "tune",
 ]

@@ -13,11 +13,14 @@ from gymnasium import spaces
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Controller", "FloatArray"]
+__all__ = ["Controller", "FloatArray", "Numbers", "Signal", "check_numbers"]
 
 FloatArray = npt.NDArray[np.float64]
 
-Signal = str | float
+Numbers = float | FloatArray
+"""A number, or an array of shape (N,) with one for each environment."""
+
+Signal = str | Numbers
 """An element of the observation by name, or a constant."""
 
 
@@ -114,9 +117,15 @@ class Controller(ABC):
 
     def _check_signal(self, what: str, signal: Signal) -> None:
         if not isinstance(signal, str):
-            check_number(what, signal)
+            self._check_size(what, check_numbers(what, signal))
         elif signal not in self.names:
             raise ConfigError(unknown_name(f"observation in {what}", signal, self.names))
+
+    def _check_size(self, what: str, numbers: Numbers | None) -> None:
+        """Check that an array has one number for each environment."""
+        size = np.size(numbers) if np.ndim(numbers) else self.count  # type: ignore[arg-type] # None is a scalar, too
+        if size != self.count:
+            raise ConfigError(f"{what} has {size} numbers, but there are {self.count} environments")
 
     def _limits(self) -> tuple[float, float]:
         """The lowest and the highest action of a space with one element."""
@@ -143,6 +152,22 @@ class Controller(ABC):
     def _shape(self) -> str:
         width = len(self.names)
         return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
+
+
+def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:
+    """Return a number as a float, or those of a one-dimensional array as floats.
+
+    Args:
+        what: Its name, for the error.
+        value: Any object.
+        limits: As for ``check_number``.
+
+    Raises:
+        ConfigError: If one of them is no number, or out of its range.
+    """
+    if isinstance(value, np.ndarray) and value.ndim == 1:
+        return np.array([check_number(f"each {what}", one, **limits) for one in value.tolist()])
+    return check_number(what, value, **limits)
 
 
 def _attribute(env: Any, name: str) -> Any:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.base import Controller, FloatArray, Signal
-from fmugym.checks import check_number
+from fmugym.baselines.base import Controller, FloatArray, Numbers, Signal, check_numbers
 from fmugym.errors import ConfigError
 from fmugym.lazy import scipy_module
 from fmugym.linearization import LinearModel
@@ -20,6 +19,8 @@ __all__ = ["LQR", "PID", "Hysteresis"]
 class Hysteresis(Controller):
     """Switches between two actions, as a thermostat does.
 
+    Each number may be an array of shape (N,), with one for each environment.
+
     Args:
         of: The name of what is measured.
         setpoint: What it shall be: a name or a constant.
@@ -29,16 +30,18 @@ class Hysteresis(Controller):
     """
 
     def __init__(
-        self, of: str, setpoint: Signal, band: float, below: float = 1.0, above: float = 0.0
+        self, of: str, setpoint: Signal, band: Numbers, below: Numbers = 1.0, above: Numbers = 0.0
     ) -> None:
         self.of, self.setpoint = of, setpoint
-        self.band = check_number("band", band, minimum=0.0)
-        self.below, self.above = check_number("below", below), check_number("above", above)
+        self.band = check_numbers("band", band, minimum=0.0)
+        self.below, self.above = check_numbers("below", below), check_numbers("above", above)
 
     def _prepare(self) -> None:
         self._limits()
         self._check_signal("of", self.of)
         self._check_signal("setpoint", self.setpoint)
+        for name in ("band", "below", "above"):
+            self._check_size(name, getattr(self, name))
         self._action = np.full(self.count, self.above)
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
@@ -62,6 +65,8 @@ class PID(Controller):
     so that it does not wind up. The derivative is that of the measured value, so that a step of the
     set point does not kick. (K. J. Åström and T. Hägglund, Advanced PID Control, 2006, chapter 3.)
 
+    Each number may be an array of shape (N,), with one for each environment.
+
     Args:
         of: The name of what is measured.
         setpoint: What it shall be: a name or a constant.
@@ -76,21 +81,23 @@ class PID(Controller):
         self,
         of: str,
         setpoint: Signal,
-        kp: float,
-        ti: float | None = None,
-        td: float = 0.0,
-        offset: float = 0.0,
+        kp: Numbers,
+        ti: Numbers | None = None,
+        td: Numbers = 0.0,
+        offset: Numbers = 0.0,
     ) -> None:
         self.of, self.setpoint = of, setpoint
-        self.kp = check_number("kp", kp)
-        self.ti = None if ti is None else check_number("ti", ti, minimum=0.0, positive=True)
-        self.td = check_number("td", td, minimum=0.0)
-        self.offset = check_number("offset", offset)
+        self.kp = check_numbers("kp", kp)
+        self.ti = None if ti is None else check_numbers("ti", ti, minimum=0.0, positive=True)
+        self.td = check_numbers("td", td, minimum=0.0)
+        self.offset = check_numbers("offset", offset)
 
     def _prepare(self) -> None:
         self._low, self._high = self._limits()
         self._check_signal("of", self.of)
         self._check_signal("setpoint", self.setpoint)
+        for name in ("kp", "ti", "td", "offset"):
+            self._check_size(name, getattr(self, name))
         self._integral = np.zeros(self.count)
         self._last = np.full(self.count, np.nan)
 

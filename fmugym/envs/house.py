@@ -19,10 +19,10 @@ class HouseEnv(TaskEnv):
 
     The plant is the bundled FMU of a house with an air-source heat pump and underfloor heating
     (``resources/House/README.md``). The action is the part load of the heat pump, from 0 to 1;
-    below 0.2 it is off. An agent observes temperatures, set point, weather and price, and forecasts
-    of twelve hours. The reward of a step of 15 min is minus the cost of the electricity in EUR, and
-    minus 0.50 EUR for each hour and kelvin below the set point or above 24 degC. An episode is a
-    week of the heating season of a synthetic year.
+    below 0.2 it is off. An agent observes temperatures, set point, weather, price, the hour of the
+    day, and forecasts of twelve hours. The reward of a step of 15 min is minus the cost of the
+    electricity in EUR, and minus 0.50 EUR for each hour and kelvin below the set point or above
+    24 degC. An episode is a week of the heating season of a synthetic year.
 
     Args:
         scenario: "autumn", "frost" or "spring": two weeks that training leaves out. By default an
