@@ -3,7 +3,10 @@
 #ifndef FMUGYM_LANES_H
 #define FMUGYM_LANES_H
 
-#include "program.h"
+enum {
+    PROGRAM_WIDTH = 64, /* most instances evaluated at the same time */
+    PROGRAM_BLOCK = 16  /* operations compute a multiple of this many values */
+};
 
 /* Computing the end from the blocks shows the compiler that no value is left over. */
 #define EACH_LANE(statement)                                                                       \

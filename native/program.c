@@ -6,7 +6,6 @@
 
 #include "fmi.h"
 #include "halves.h"
-#include "lanes.h"
 #include "platform.h"
 #include "quick.h"
 

@@ -8,9 +8,9 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "lanes.h"
+
 enum {
-    PROGRAM_WIDTH = 64,      /* most instances evaluated at the same time */
-    PROGRAM_BLOCK = 16,      /* operations compute a multiple of this many values */
     PROGRAM_REGISTERS = 256, /* maximum number of registers */
     PROGRAM_RESULTS = 3,     /* maximum number of results */
     CALL_VALUES = 4          /* maximum number of inputs and outputs of a loop of numpy */

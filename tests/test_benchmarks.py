@@ -144,7 +144,7 @@ def test_a_task_by_hand_is_the_same_task(tasks, index):
         each.close()
 
 
-DOCUMENTS = {"readme": "README.md", "vector": "docs/vector.md", "hooks": "docs/hooks.md"}
+DOCUMENTS = {"readme": "docs/speed.md", "vector": "docs/vector.md", "hooks": "docs/hooks.md"}
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

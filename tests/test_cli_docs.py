@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "command-line.md").read_text()
 BLOCKS = re.findall(r"^```bash\n(.*?)^```", PAGE, re.M | re.S)
 BLOCKS += re.findall(
-    r"^```bash\n(.*?)^```", (ROOT / "docs" / "baselines.md").read_text(), re.M | re.S
+    r"^```bash\n(fmugym .*?)^```", (ROOT / "docs" / "baselines.md").read_text(), re.M | re.S
 )
 NEEDS = {
     "fmugym train": "stable_baselines3",

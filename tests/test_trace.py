@@ -163,7 +163,7 @@ def selected(self):
         (remembered, "changes self.worst"),
         (number, "a flag is no Boolean"),
         (array, "operands could not be broadcast|shape mismatch"),
-        (wide, "uses numpy.sort"),
+        (wide, "sorts more than 32 elements"),
         (mixed, "mixes the values of several environments"),
         (indexed, "needs numpy.take"),
         (selected, "that a condition selects: use numpy.where"),

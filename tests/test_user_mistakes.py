@@ -227,7 +227,7 @@ def library_is_text(probe, folder):
         (other_token, "refused to be instantiated.*; the FMU said"),
         (no_zip, r"some\.fmu is not an FMU \(a zip archive\)"),
         (no_fmu, r"some\.fmu is not an FMU: it has no modelDescription\.xml"),
-        (exchange_only, "has no co-simulation interface; export the model for co-simulation"),
+        (exchange_only, "Probe.fmu cannot be loaded: it does not export fmi2"),
         (library_is_text, r"Probe\.(so|dll|dylib) is not a shared library, expected one of "),
         (lambda _, folder: folder / "absent.fmu", r"there is no FMU at .*absent\.fmu"),
         (lambda *_: "absent.fmu", r"there is no FMU at .*absent\.fmu"),

@@ -283,8 +283,7 @@ class Declarations:
         for name, series in self.series.items():
             target = series.entry.child("input")
             if target.value is not None:
-                unit = series.entry.child("unit")
-                record = self.records.input_of(target, None if unit.value is None else unit.text())
+                record = self.records.input_of(target, series.unit)
                 _require_plain_input(record)
                 yield record.alias, (record, Expression.parse(name))
         for entry in section_of(self.root, "inputs"):

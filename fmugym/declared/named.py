@@ -65,7 +65,7 @@ def _shown(unit: str | None) -> str:
 def _of_name(declared: Declarations, name: str, kind: str, target: str = "") -> Quantity:
     """The quantity of a name that is no variable; a set point has the unit of its variable."""
     series = declared.series.get(name)
-    unit = "" if series is None else _shown(series.entry.child("unit").value)
+    unit = "" if series is None else _shown(series.unit)
     if target and not unit:
         unit = _shown(declared.records[target].unit)
     holds = name in declared.steps or (series is not None and series.is_stepped)

@@ -55,6 +55,7 @@ class Series:
         values: The values at these times, and between them on straight lines.
         is_stepped: Whether the values jump, and hold until the next one.
         low, high: Limits for the observation space.
+        unit: The unit of the values; None if none is declared.
     """
 
     entry: Entry
@@ -65,6 +66,7 @@ class Series:
     is_stepped: bool
     low: float
     high: float
+    unit: str | None
 
     @classmethod
     def of(
@@ -73,7 +75,7 @@ class Series:
         """Make a series of rows.
 
         Args:
-            entry: Where it is declared; ``min`` and ``max`` are read from it.
+            entry: Where it is declared; ``min``, ``max`` and ``unit`` are read from it.
             times: The times of the rows in seconds.
             values: Their values.
             period: Seconds after which the rows repeat.
@@ -94,7 +96,8 @@ class Series:
         low, high = entry.child("min"), entry.child("max")
         least = float(values.min()) if low.value is None else number(low)
         most = float(values.max()) if high.value is None else number(high)
-        return cls(entry, start, period, times, values, is_stepped, least, most)
+        unit = None if entry.child("unit").value is None else entry.child("unit").text()
+        return cls(entry, start, period, times, values, is_stepped, least, most, unit)
 
 
 def _require_rising(entry: Entry, times: FloatArray, values: FloatArray, period: float) -> None:
