@@ -77,7 +77,7 @@ def test_work_for_one_thread_is_no_job(counted):
 def test_a_short_job_wakes_few_of_many_helpers(counted):
     """Work of some 20 us is for two or three threads, whatever the number of threads is."""
     short = counted["short"]
-    assert 0 < short["wakes"] <= 8 * short["jobs"]
+    assert 0 < short["wakes"] <= 8 * short["rounds"]
 
 
 @needs_native
