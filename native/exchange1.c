@@ -109,9 +109,7 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
-    .reset = reset,
-    .terminate = terminate,
-    .free_instance = free_instance,
+    SHARED_FUNCTIONS,
 };
 
 static const Model model = {

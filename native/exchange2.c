@@ -62,15 +62,8 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
-    .reset = reset,
-    .terminate = terminate,
-    .free_instance = free_instance,
-    .get_state = get_state,
-    .set_state = set_state,
-    .free_state = free_state,
-    .state_size = state_size,
-    .serialize = serialize,
-    .deserialize = deserialize,
+    SHARED_FUNCTIONS,
+    SHARED_STATES,
 };
 
 static const Model model = {

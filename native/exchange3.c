@@ -55,15 +55,8 @@ static const Fmi fmu = {
     .get = get3,
     .set = set3,
     .set_string = set_string3,
-    .reset = reset,
-    .terminate = terminate,
-    .free_instance = free_instance,
-    .get_state = get_state,
-    .set_state = set_state,
-    .free_state = free_state,
-    .state_size = state_size,
-    .serialize = serialize,
-    .deserialize = deserialize,
+    SHARED_FUNCTIONS,
+    SHARED_STATES,
 };
 
 static const Model model = {

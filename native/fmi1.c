@@ -91,7 +91,5 @@ const Fmi fmi1 = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
-    .reset = reset,
-    .terminate = terminate,
-    .free_instance = free_instance,
+    SHARED_FUNCTIONS,
 };

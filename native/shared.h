@@ -116,4 +116,10 @@ static inline Status older_set_string(const Library *library, void *component,
                                  : sane(f->set_string(component, &reference, 1, &text));
 }
 
+/* The entries of these functions in a table, and of those for FMU states. */
+#define SHARED_FUNCTIONS .reset = reset, .terminate = terminate, .free_instance = free_instance
+#define SHARED_STATES                                                                              \
+    .get_state = get_state, .set_state = set_state, .free_state = free_state,                      \
+    .state_size = state_size, .serialize = serialize, .deserialize = deserialize
+
 #endif

@@ -260,7 +260,7 @@ class TestParquet(TestFiles):
 
     def load(self, folder, times=(0, 3600, 7200), values=(10.0, 20.0, 15.0), **column):
         parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
-        pyarrow = pytest.importorskip("pyarrow")
+        pyarrow = pytest.importorskip("pyarrow", reason="needs the extra parquet")
         table = pyarrow.table({"time": list(times), "T_C": list(values), "note": ["a", "b", "c"]})
         parquet.write_table(table, folder / "weather.parquet")
         data = {"T": {"file": str(folder / "weather.parquet"), "column": "T_C"} | column}

@@ -17,7 +17,7 @@ class Precise(fmugym.FMUEnv):
     """The point mass by explicit Euler, one internal step for each step, seen as float64."""
 
     version = "2.0"
-    parameters = {  # noqa: RUF012
+    parameters = {  # noqa: RUF012  (nothing changes it)
         "m": M,
         "l": L,
         "b": B,

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -281,7 +282,7 @@ class TestInWine:
             np.testing.assert_allclose(*rows, rtol=1e-6, atol=1e-9)
 
     def test_a_vector_environment(self, cart_pole, opened):
-        make = lambda: ForcedCartPole(cart_pole)  # noqa: E731
+        make = partial(ForcedCartPole, cart_pole)
         env = opened(fmugym.FMUVectorEnv(make, 4, workers=2))
         single = opened(make())
         first, _ = env.reset(seed=5)

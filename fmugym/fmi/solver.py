@@ -197,7 +197,7 @@ class Solver:
         self._jacobian: list[State] | None = None
 
     def _remember(self, **changes: object) -> None:
-        self.memory = replace(self.memory, **changes)  # type: ignore[arg-type]
+        self.memory = replace(self.memory, **changes)  # type: ignore[arg-type]  # names of its fields
 
     def _fail(self, text: str) -> CallError:
         self._complain(text)
