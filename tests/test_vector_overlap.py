@@ -188,7 +188,9 @@ def test_a_timeout_leaves_the_step_under_way(waiting):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Windows cannot be sent like this")
-def test_an_interrupt_leaves_the_step_under_way(waiting):
+def test_an_interrupt_leaves_the_step_under_way(waiting, request):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it behind &
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     waiting.step_async(np.zeros((2, 1), np.float32))
     timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
