@@ -9,6 +9,7 @@ SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
     "test_cli_docs",
+    "test_cli_tuning",
     "test_copies",
     "test_examples",
     "test_examples_half_batches",

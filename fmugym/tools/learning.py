@@ -122,7 +122,7 @@ def _tuned(plan: Plan, arguments: argparse.Namespace) -> Plan:
         raise ConfigError("--tune is for a new training, which --resume is not")
     arguments.tune_steps = arguments.tune_steps or max(1, plan.steps // 10)
     check_numbers(arguments, "tune", "tune_steps")
-    with progress(arguments.tune, "tune") as advance:
+    with progress(arguments.tune, "tune", "trials") as advance:
 
         def noted(line: str) -> None:
             advance(1)
