@@ -148,6 +148,7 @@ SLOW_TESTS = (
     "test_slow_models.py::TestProgress::test_of_a_trial_is_logged",
     "test_slow_models.py::TestTime::test_is_given_in_worker",
     "test_slow_models.py::TestTime::test_of_a_reset_in_a_worker",
+    "test_series.py::test_a_recorder_",
     "test_slow_models.py::TestTime::test_of_a_trial",
     "test_snapshots.py::TestForeign",
     "test_snapshots.py::TestSingle::test_goes_on_in_another_process",
