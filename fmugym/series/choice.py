@@ -63,7 +63,8 @@ class Choice(NamedTuple):
         Returns:
             One row for each environment, one column for each element.
         """
-        return observations[indices][:, list(self.observed)]
+        chosen: FloatArray = observations[indices][:, list(self.observed)]
+        return chosen
 
 
 def matches(pattern: str, name: str) -> bool:

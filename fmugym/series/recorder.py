@@ -215,7 +215,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         flags = np.array([terminated]), np.array([truncated])
         infos, seen = Infos([info], 1), _batch(observation)
         if not self._recorder.has_begun:
-            self._recorder.go_on(self.unwrapped.step_count - 1)
+            self._recorder.go_on(self._recorder.episodes.prototype.step_count - 1)
         self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)
         return observation, reward, terminated, truncated, info
 
