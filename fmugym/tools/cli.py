@@ -7,7 +7,9 @@
     fmugym validate TASK|model.fmu
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
     fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
-        [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb] [KEY=VALUE ...]
+        [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb]
+        [--record GLOB ...] [--record-env N ...] [--record-every SECONDS] [--record-format csv]
+        [KEY=VALUE ...]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
