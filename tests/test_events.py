@@ -1,8 +1,10 @@
 """Event mode in co-simulation, clocks, early return: FMI 3.0."""
 
 import logging
+from contextlib import closing
 
 import clocks_tools
+import exchange_tools
 import numpy as np
 import pytest
 
@@ -147,6 +149,30 @@ class TestTimedClocks:
             assert found[1 + COUNTS.index(f"count of {name}")] == len(times)
 
 
+class TestEarlyReturn:
+    """Without event mode: FMI 3.0 by a flag, FMI 2.0 by Discard and the last successful time."""
+
+    @all_kinds
+    @pytest.mark.parametrize("version", [2, 3])
+    @pytest.mark.parametrize("size", [0.1, 0.37])
+    def test_the_rest_of_the_step_follows(self, tmp_path, kind, version, size):
+        if kind == "native" and not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        ends = {}
+        for options in ((), ("-DEARLY=0.03",)):
+            path = exchange_tools.exchange_fmu(
+                tmp_path / "model.fmu", "dahlquist", version, ("CoSimulation",), "", options
+            )
+            fmu = FMU(path, probe_timeout=None)
+            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=size)
+            with closing(opening.make_pool(fmu, spec, 2, LOG, **OPTIONS[kind])) as pool:
+                pool.variable = fmu.variable
+                start(pool)
+                ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
+        plain, early = ends.values()
+        np.testing.assert_allclose(early, plain, rtol=2e-3)  # its Euler steps end elsewhere
+
+
 class TestTriggeredClocks:
     @all_kinds
     @both_interfaces
@@ -160,9 +186,7 @@ class TestTriggeredClocks:
 
     @all_kinds
     @both_interfaces
-    def test_an_output_clock_tells_whether_it_ticked_in_the_step(
-        self, make_pool, kind, interface
-    ):
+    def test_an_output_clock_tells_whether_it_ticked_in_the_step(self, make_pool, kind, interface):
         pool = start(make_pool(kind, interface, outputs=("bell", "count of bell", "countdown")))
         found = np.array([step(pool)[:, 0] for _ in range(7)])
         np.testing.assert_array_equal(found[:, 0], [0, 0, 1, 0, 0, 1, 0])
@@ -174,7 +198,9 @@ class TestClockedInputs:
     @all_kinds
     @both_interfaces
     def test_a_value_takes_effect_with_the_next_tick(self, make_pool, kind, interface):
-        pool = make_pool(kind, interface, inputs=("command", "plain"), outputs=("sample",), step=0.04)
+        pool = make_pool(
+            kind, interface, inputs=("command", "plain"), outputs=("sample",), step=0.04
+        )
         start(pool)
         values = np.arange(12) + 1.0
         found = [step(pool, value, 0.5 * value)[0, 0] for value in values]
