@@ -298,7 +298,7 @@ class TestRefusals:
 
     def test_clocks_need_event_mode(self, fmu_path):
         config = {"model_input_names": ["strike"], "model_output_names": ["x"]}
-        with pytest.raises(ConfigError, match="'strike'.*event mode"):
+        with pytest.raises(ConfigError, match=r"'strike'.*event mode"):
             Env(fmu_path(event_mode=False), config)
 
     def test_clocks_have_no_start_values(self, fmu_path):
@@ -307,5 +307,5 @@ class TestRefusals:
             "model_output_names": ["x"],
             "model_parameters": {"strike": 1},
         }
-        with pytest.raises(ConfigError, match="'strike'.*clock"):
+        with pytest.raises(ConfigError, match=r"'strike'.*clock"):
             Env(fmu_path(), config)
