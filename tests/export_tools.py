@@ -2,11 +2,14 @@
 
 import ctypes
 import itertools
+import shutil
 import subprocess
+import sys
 from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 from gymnasium import spaces
@@ -46,6 +49,8 @@ def network_for(env, hidden=(16, 16), scaled=True, squashed=False, seed=0, activ
 
 def compiled(agent, folder, language="C99"):
     """Write and compile an agent; the object takes samples."""
+    if sys.platform == "win32" or shutil.which(COMPILERS[language][0]) is None:
+        pytest.skip(f"needs a compiler of {language}: {COMPILERS[language][0]}")
     write_c(agent, folder)
     library = folder / f"{agent.name}-{language}.so"
     command = [*COMPILERS[language], *FLAGS, "-shared", "-fPIC", "-o", str(library)]
