@@ -12,6 +12,7 @@
         [KEY=VALUE ...]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
+    fmugym export AGENT --task TASK --output agent.c [--algorithm PPO] [--all-inputs]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
@@ -71,6 +72,7 @@ from importlib.metadata import version
 from typing import Final
 
 from fmugym.errors import FMUGymError
+from fmugym.tools.exporting import add_export
 from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_skeleton, add_stand_in, add_validate
 from fmugym.tools.learning import add_train
@@ -83,7 +85,7 @@ __all__ = ["main"]
 _INTERRUPTED: Final = 130
 
 _COMMANDS: Final = (
-    *(add_info, add_new, add_validate, add_simulate, add_train, add_tune),
+    *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
     *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in),
 )
 
