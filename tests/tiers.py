@@ -8,6 +8,7 @@ in the default run: of a test with many combinations of parameters, it takes eve
 SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
+    "test_cli_advice",
     "test_cli_docs",
     "test_cli_tuning",
     "test_copies",
@@ -174,6 +175,8 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )
