@@ -79,9 +79,7 @@ def _of_fmi1(root: Any) -> Iterator[tuple[str, list[str] | None]]:
 
 
 def _names_of_references(root: Any, description: ModelDescription) -> dict[str, str]:
-    """The names by what ``ModelStructure`` calls variables by: numbers of their order in FMI 2.0,
-    value references in FMI 3.0.
-    """
+    """The names of variables by their numbers in FMI 2.0, by value references in FMI 3.0."""
     elements = root.iterfind("ModelVariables/*")
     if description.fmi_major_version == 2:
         return {str(place): e.get("name", "") for place, e in enumerate(elements, 1)}

@@ -11,7 +11,7 @@ from typing import Any, Final
 from fmugym.archive.description import Unit
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link"]
+__all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,14 @@ def conversion_of_link(
             if dimension is not None and dimension == other:
                 return Conversion(factor / to_base, (offset - base_offset) / to_base)
     return IDENTITY if source == target else _conversion_by_pint(source, target)
+
+
+def definition_of(name: str, units: Mapping[str, Unit]) -> Unit | None:
+    """Find what a name of a unit, or of a display unit, means in base units; None if it is open."""
+    for dimension, (factor, offset) in _defined(name, units):
+        if dimension is not None:
+            return Unit(dimension, factor, offset)
+    return None
 
 
 _LARGE: Final = 2.0**20

@@ -1,0 +1,103 @@
+"""Systems as users make, read and write them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Self
+
+from fmugym.archive.safe_zip import ArchiveLimits
+from fmugym.checks import check_path
+from fmugym.systems.components import Component
+from fmugym.systems.ssp.reading import arguments_of
+from fmugym.systems.ssp.writing import write_ssp
+from fmugym.systems.wired import WiredSystem
+
+__all__ = ["FMUSystem"]
+
+
+class FMUSystem(WiredSystem):
+    """Several FMUs that run as one. It can stand wherever the path of an FMU can.
+
+    The variables of the system are those of its components, named ``component.variable``. Inputs
+    that nothing drives are inputs of the system. A connection that begins or ends at a name without
+    a component gives the system an input, parameter or output of this name.
+
+    See ``WiredSystem`` for the arguments and attributes.
+    """
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> Self:
+        """Read an SSP archive. Nothing of its FMUs is executed.
+
+        Nested systems become one level: a component ``plant`` of the system ``car`` is named
+        ``car.plant``. Geometry, annotations of other tools and values for parameters that do not
+        exist are ignored and listed in ``findings``.
+
+        Args:
+            path: The ``.ssp`` file.
+            limits: What is too large to be opened.
+
+        Raises:
+            ConfigError: If the system has a mistake.
+            FMULoadError: If the archive or an FMU cannot be read, or it has something that changes
+                results and is not supported, such as signal dictionaries.
+        """
+        return cls(**arguments_of(path, limits))
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the system with its FMUs as an SSP archive.
+
+        What SSP has no words for (the master, steps of components) stands in annotations that
+        fmugym reads again.
+
+        Args:
+            path: The ``.ssp`` file, which is replaced if it exists.
+
+        Returns:
+            The path.
+
+        Raises:
+            ConfigError: If the path is none.
+            FMULoadError: If the file cannot be written.
+        """
+        file = check_path("the path of a system", path)
+        write_ssp(self, file)
+        return file
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """A system pickles as the file that it came from, or as its arguments."""
+        if self.file is not None:
+            return type(self).read, (self.file,)
+        return _again, (type(self), self.arguments())
+
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that make this system once more, FMUs as their paths."""
+        components = {
+            name: Component(
+                one.fmu.path,
+                one.given.start_values,
+                one.fmu.interface,
+                one.given.steps,
+                one.given.feedthrough,
+            )
+            for name, one in self.components.items()
+        }
+        return {
+            "components": components,
+            "connections": self.connections,
+            "name": self.name,
+            "units": self.units,
+            "master": self.master,
+            "loops": self.loops,
+            "loop_tolerance": self.loop.tolerance,
+            "loop_iterations": self.loop.max_iterations,
+            **self.times,
+            "description": self.description,
+            "own_names": self.own_names,
+            "unit_definitions": self.unit_definitions,
+        }
+
+
+def _again(cls: type[FMUSystem], arguments: dict[str, Any]) -> FMUSystem:
+    return cls(**arguments)
