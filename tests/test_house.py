@@ -16,6 +16,7 @@ STOREYS = [
     {"fmi"},
     {"pool"},
     {"trial"},
+    {"systems"},
     {"config"},
     {"task"},
     {"env"},

@@ -28,6 +28,8 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_systems_description",
+    "test_systems_ssp",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""

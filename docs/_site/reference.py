@@ -24,6 +24,7 @@ PAGES: Final = {
     "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
     "Recordings": ("Recorder", "Recording", "replay"),
     "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
+    "Systems": ("FMUSystem", "Component", "Connection"),
     "Rigs": ("Backend", "Paced"),
     "Errors": (),  # and all other exceptions
 }

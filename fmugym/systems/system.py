@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import check_path
+from fmugym.errors import FMUGymError
 from fmugym.systems.components import Component
 from fmugym.systems.ssp.reading import arguments_of
 from fmugym.systems.ssp.writing import write_ssp
@@ -43,7 +44,11 @@ class FMUSystem(WiredSystem):
             FMULoadError: If the archive or an FMU cannot be read, or it has something that changes
                 results and is not supported, such as signal dictionaries.
         """
-        return cls(**arguments_of(path, limits))
+        arguments = arguments_of(path, limits)
+        try:
+            return cls(**arguments)
+        except FMUGymError as error:
+            raise type(error)(f"{arguments['file'].name}: {error}") from None
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the system with its FMUs as an SSP archive.
