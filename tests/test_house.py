@@ -11,7 +11,7 @@ PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
     {"errors", "caching", "lazy", "signals", "_native"},
-    {"checks", "wine"},
+    {"checks", "extras", "wine"},
     {"archive", "distributions", "rendering"},
     {"fmi"},
     {"pool"},

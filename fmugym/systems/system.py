@@ -10,6 +10,7 @@ from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import check_path
 from fmugym.errors import FMUGymError
 from fmugym.systems.components import Component
+from fmugym.systems.drawing import draw
 from fmugym.systems.ssp.reading import arguments_of
 from fmugym.systems.ssp.writing import write_ssp
 from fmugym.systems.wired import WiredSystem
@@ -69,6 +70,21 @@ class FMUSystem(WiredSystem):
         file = check_path("the path of a system", path)
         write_ssp(self, file)
         return file
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the system: components, connections with their gains, inputs, outputs, loops.
+
+        Args:
+            path: A file to write, such as ``system.png`` or ``system.svg``; None for no file.
+
+        Returns:
+            The figure of Matplotlib.
+
+        Raises:
+            ConfigError: If Matplotlib is missing (extra ``plot``), the format of the file is
+                unknown, or the file cannot be written.
+        """
+        return draw(self, path)
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         """A system pickles as the file that it came from, or as its arguments."""
