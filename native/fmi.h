@@ -57,11 +57,17 @@ typedef struct {
     bool has_tolerance;
 } Experiment;
 
-/* A callback that sets the start values and returns a status. */
+/* A callback that sets the start values and returns a status; and one that exchanges values with
+ * other FMUs in Initialization Mode, or NULL. FMI 1.0 has no such mode, and does not call it. */
 typedef struct {
     Status (*set)(void *context);
     void *context;
+    Status (*exchange)(void *context);
 } StartValues;
+
+static inline Status exchange_in(StartValues start_values) {
+    return start_values.exchange == NULL ? STATUS_OK : start_values.exchange(start_values.context);
+}
 
 typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
 
@@ -129,12 +135,19 @@ typedef struct Fmi {
                         size_t size);
     Status (*deserialize)(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
+
+    /* Of systems only, otherwise NULL: which FMU failed last, or NULL; and freeing what may still be
+     * freed after a fatal error. */
+    const char *(*blamed)(const void *component);
+    void (*drop)(const Library *library, void *component);
 } Fmi;
 
 /* Of co-simulation and of model exchange. */
 extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3;
+/* Of systems. */
+extern const Fmi composite;
 
-/* NULL if there is no such version. */
+/* NULL if there is no such version. Version 0 are systems. */
 const Fmi *fmi_table(int64_t version, bool exchange);
 
 static inline bool has_outputs(Outcome outcome) {

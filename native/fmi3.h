@@ -109,6 +109,9 @@ static inline Status initialize(const Library *library, void *instance,
                                               e->start_time, e->has_stop_time, e->stop_time));
     }
     if (status <= STATUS_WARNING) {
+        status = exchange_in(start_values);
+    }
+    if (status <= STATUS_WARNING) {
         *doing = "initialization";
         status = sane(f->exit_initialization(instance));
     }

@@ -93,6 +93,7 @@ class FMI3Instance(Instance):
         def run(span: Span, set_start_values: Callable[[], None]) -> None:
             set_start_values()
             check("entering initialization", enter(component, *span.tolerances, *span.times))
+            self.exchange_values()
             check("initialization", leave(component))
 
         return run

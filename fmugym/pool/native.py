@@ -52,12 +52,15 @@ from fmugym.pool.settings import (
     library_settings,
     record_from,
     solving_settings,
+    table_of,
     types_and_references,
     variable_settings,
     variables_of,
 )
 from fmugym.pool.spec import ResetMethod
+from fmugym.pool.systems import system_settings
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
+from fmugym.systems.description import SystemDescription
 
 __all__ = ["NativePool"]
 
@@ -143,10 +146,10 @@ class NativePool(SavingPool):
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
-        paths = [fmu.prepare_library()]
+        paths = fmu.prepare_libraries()
         folder = fmu.extract()
         if private_libraries:
-            paths = _copy_library(folder, Path(fmu.library), self.num_instances)
+            paths = _copy_libraries(fmu, folder, self.num_instances)
         place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
         try:
             return _native.Pool(
@@ -158,6 +161,7 @@ class NativePool(SavingPool):
                         "logging": log.isEnabledFor(logging.INFO),
                         "mark": None if self._mark is None else self._mark.page,
                         "solving": solving_settings(description, spec),
+                        "system": system_settings(description, spec, folder),
                     },
                 ),
                 experiment=cast("_native.Experiment", experiment_settings(spec)),
@@ -176,7 +180,7 @@ class NativePool(SavingPool):
                 },
                 count=self.num_instances,
                 threads=self.threads,
-                callback=_Receiver(log, description.model_identifier, self._first_index),
+                callback=_Receiver(log, description, self._first_index),
                 listener=self._listener,
             )
         except OSError as error:
@@ -188,7 +192,7 @@ class NativePool(SavingPool):
         if access is None:
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
-            version = self._fmu.description.fmi_major_version
+            version = table_of(self._fmu.description)
             is_exchange = self._fmu.description.model_exchange is not None
             parts = types_and_references(variables, version)
             access = _native.Access(version, *parts, is_exchange)
@@ -584,11 +588,15 @@ class NativePool(SavingPool):
 class _Receiver:
     """Passes on the FMU's messages; it must not refer to the pool."""
 
-    def __init__(self, log: logging.Logger, model: str, first_index: int) -> None:
-        self._log, self._model, self._first_index = log, model, first_index
+    def __init__(self, log: logging.Logger, description: ModelDescription, first: int) -> None:
+        self._log, self._model, self._first_index = log, description.model_identifier, first
+        is_system = isinstance(description, SystemDescription)
+        components = description.plan.components if is_system else ()
+        self._parts = [f".{component.name}" for component in components] or [""]
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
-        name = f"{self._model}_{self._first_index + index}"
+        instance, part = divmod(index, len(self._parts))
+        name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
         level, text = as_record(name, status, category, message)
         self._log.log(level, "%s", text)
 
@@ -628,6 +636,17 @@ class _Listener:
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:
     return None if mask is None else np.asarray(mask, np.bool_)
+
+
+def _copy_libraries(fmu: LoadableFMU, folder: Path, count: int) -> list[Path]:
+    """Copy the libraries of all parts for each instance; see ``_copy_library``."""
+    parts = fmu.parts or (fmu,)
+    folders = [part.extract() for part in fmu.parts] or [folder]
+    copies = [
+        _copy_library(place, Path(part.library), count)
+        for part, place in zip(parts, folders, strict=True)
+    ]
+    return [path for paths in zip(*copies, strict=True) for path in paths]
 
 
 def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:

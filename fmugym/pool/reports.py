@@ -38,6 +38,7 @@ class Failure(NamedTuple):
     string: int
     said: str
     values: bytes | None
+    part: str | None = None
 
 
 def describe_failure(failure: Failure, spec: PoolSpec, name: str) -> str:
@@ -57,7 +58,8 @@ def _sentence(failure: Failure, spec: PoolSpec, name: str) -> str:
         doing = f"setting {_string_name(spec, failure.string)!r}"
     if failure.status < 0:  # the call was refused, and the text is a whole sentence
         return doing
-    return f"{name}: {doing} returned {Status(failure.status).name.capitalize()}"
+    where = "" if failure.part is None else f" in {failure.part}"
+    return f"{name}: {doing} returned {Status(failure.status).name.capitalize()}{where}"
 
 
 def _string_name(spec: PoolSpec, reference: int) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, PoolSpec, ResetMethod
+from fmugym.systems.description import SystemDescription
 from fmugym.wine.loader import windows_path, windows_uri
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "library_settings",
     "record_from",
     "solving_settings",
+    "table_of",
     "types_and_references",
     "variable_settings",
     "variables_of",
@@ -92,7 +94,7 @@ def _place_of_resources(folder: Path, version: int) -> Path:
 def library_settings(description: ModelDescription, place: PlaceOfFMU) -> dict[str, Any]:
     """What to load, and what is known of it."""
     return {
-        "version": description.fmi_major_version,
+        "version": table_of(description),
         "model": description.model_identifier.encode(),
         "token": description.instantiation_token.encode(),
         "resources": place.resources,
@@ -152,14 +154,27 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
     )
 
 
+def table_of(description: ModelDescription) -> int:
+    """The table of functions in C: the major FMI version, or 0 for systems."""
+    is_system = isinstance(description, SystemDescription)
+    return 0 if is_system else description.fmi_major_version
+
+
 def types_and_references(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes]:
-    """The C types of variables, a byte each, and their value references, four bytes each."""
+    """The C types of variables, a byte each, and their value references, four bytes each.
+
+    Args:
+        variables: The variables.
+        version: See ``table_of``; the values of systems are all of type Float64.
+    """
     types = bytes(_type_number(variable, version) for variable in variables)
     references = np.array([v.value_reference for v in variables], np.uint32)
     return types, references.tobytes()
 
 
 def _type_number(variable: Variable, version: int) -> int:
+    if version == 0:
+        return _TYPES.index("Float64")
     if variable.kind == "enumeration":
         return _TYPES.index("Int64" if version == 3 else "Int32")
     return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
@@ -169,7 +184,7 @@ def variables_of(
     description: ModelDescription, types: Sequence[int], references: Sequence[int]
 ) -> tuple[Variable, ...]:
     """Find variables by C type and value reference; aliases are as good."""
-    version = description.fmi_major_version
+    version = table_of(description)
     known = {
         (_type_number(v, version), v.value_reference): v
         for v in description.variables.values()

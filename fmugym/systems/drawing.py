@@ -8,7 +8,7 @@ from typing import Any, Final
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, printable, reason
 from fmugym.extras import imported
-from fmugym.systems.layout import Box, Layout, Wire, layout_of
+from fmugym.systems.placing import Box, Layout, Wire, layout_of
 from fmugym.systems.wired import WiredSystem
 
 __all__ = ["draw"]
