@@ -20,8 +20,8 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
-from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.library import Library
+from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.solver import Solving
 from fmugym.fmi.status import Phase, Status, sane
@@ -224,9 +224,7 @@ class SystemInstance(Instance):
             return self._tell(failure)
         return Status.OK
 
-    def _get_all(
-        self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]
-    ) -> None:
+    def _get_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for index, behind in enumerate(ends):
             end = behind[0]
             buffer[index] = _scaled(end.gain, end.offset, self._get(end))
@@ -240,9 +238,7 @@ class SystemInstance(Instance):
             return float(part.inputs.values[given - part.layout.first_input])
         return part.get(end.variable)
 
-    def _set_all(
-        self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]
-    ) -> None:
+    def _set_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for behind, value in zip(ends, buffer.tolist(), strict=True):
             for end in behind:
                 self._set(end, _scaled(end.gain, end.offset, value))
@@ -659,9 +655,7 @@ def _instantiate(library: Library, label: str, hear_all: bool) -> Instance:
         raise FMULoadError(f"{label}: {error}") from None
 
 
-def _close(
-    instances: list[SystemInstance], libraries: list[Library], fmu: LoadableFMU
-) -> None:
+def _close(instances: list[SystemInstance], libraries: list[Library], fmu: LoadableFMU) -> None:
     while instances:
         instances.pop().free()
     for library in libraries:

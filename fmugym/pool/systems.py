@@ -55,7 +55,11 @@ def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
     texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
     is_exchange = description.model_exchange is not None
     return (
-        (part.component.name.encode(), label.encode(), f"{label}, whose outputs are not finite".encode()),
+        (
+            part.component.name.encode(),
+            label.encode(),
+            f"{label}, whose outputs are not finite".encode(),
+        ),
         (version, is_exchange, part.has_mode),
         (known["model"], known["token"], known["resources"]),
         known["categories"],
