@@ -32,6 +32,7 @@ MODULES: Final = {
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
+    "PettingZoo": "fmugym.pettingzoo",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",
     "Pictures": "fmugym.rendering",
