@@ -9,15 +9,19 @@ static bool goes_on(Status status) {
     return status <= STATUS_WARNING;
 }
 
-static void carry(Composite *me, const Route *route) {
-    me->inputs[route->target] = scaled(route->scale, me->outputs[route->source]);
+static Status carry(Composite *me, size_t begin, size_t end) {
+    Status status = STATUS_OK;
+
+    for (size_t i = begin; i < end && goes_on(status); i++) {
+        const Route *route = &me->system->routes[i];
+        status = route_carry(me, route, me->outputs[route->source], &me->inputs[route->target]);
+    }
+    return status;
 }
 
-static void carry_to(Composite *me, size_t index) {
+static Status carry_to(Composite *me, size_t index) {
     const Part *part = &me->system->parts[index];
-    for (size_t i = part->first_route; i < part->end_route; i++) {
-        carry(me, &me->system->routes[i]);
-    }
+    return carry(me, part->first_route, part->end_route);
 }
 
 typedef struct {
@@ -104,25 +108,28 @@ static Status evaluate(void *context, const double *x, double *y) {
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
         status = step_part(me, group->parts[i], r->span);
     }
-    for (size_t i = 0; i < group->number_of_routes; i++) {
+    for (size_t i = 0; i < group->number_of_routes && goes_on(status); i++) {
         const Route *route = &me->system->routes[group->routes[i]];
-        y[i] = scaled(route->scale, me->outputs[route->source]);
+        status = route_carry(me, route, me->outputs[route->source], &y[i]);
     }
     return status;
 }
 
 static Status solve(Composite *me, const PartGroup *group, Span span) {
     Repetition repetition = {me, group, span, false};
+    Status status = STATUS_OK;
 
     repetition.span.no_return = false;
-    for (size_t i = 0; i < group->count; i++) {
-        carry_to(me, group->parts[i]);
+    for (size_t i = 0; i < group->count && goes_on(status); i++) {
+        status = carry_to(me, group->parts[i]);
     }
     for (size_t i = 0; i < group->number_of_routes; i++) {
         me->loop[i] = me->inputs[me->system->routes[group->routes[i]].target];
     }
     const bool was_terminated = me->terminated;
-    Status status = save_all(&repetition);
+    if (goes_on(status)) {
+        status = save_all(&repetition);
+    }
     if (goes_on(status)) {
         status = loop_solve(&group->loop, group->number_of_routes, me->loop, evaluate, &repetition);
     }
@@ -142,10 +149,10 @@ static Status step_group(Composite *me, const PartGroup *group, Span span) {
         return solve(me, group, span);
     }
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
-        if (!jacobi) {
-            carry_to(me, group->parts[i]);
+        status = jacobi ? STATUS_OK : carry_to(me, group->parts[i]);
+        if (goes_on(status)) {
+            status = step_part(me, group->parts[i], span);
         }
-        status = step_part(me, group->parts[i], span);
     }
     return status;
 }
@@ -161,8 +168,8 @@ Status system_do_step(const Library *library, void *component, double time, doub
     me->terminated = false;
     Status status = me->is_fresh ? STATUS_OK : system_refresh(me);
     me->is_fresh = false;
-    for (size_t i = 0; i < s->number_of_routes && s->jacobi; i++) {
-        carry(me, &s->routes[i]);
+    if (goes_on(status) && s->jacobi) {
+        status = carry(me, 0, s->number_of_routes);
     }
     for (size_t i = 0; i < s->number_of_groups && goes_on(status); i++) {
         status = step_group(me, &s->groups[i], span);

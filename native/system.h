@@ -178,7 +178,9 @@ Status part_get(Composite *me, size_t index, Type type, uint32_t reference, doub
 Status part_set(Composite *me, size_t index, Type type, uint32_t reference, double value);
 /* Fills the output slots of a part. */
 Status part_read(Composite *me, size_t index);
-/* Fills those of all parts. */
+/* Computes what a route carries. Values that are not finite must not reach other FMUs. */
+Status route_carry(Composite *me, const Route *route, double value, double *carried);
+/* Fills the output slots of all parts. */
 Status system_refresh(Composite *me);
 
 #endif

@@ -90,8 +90,7 @@ static Status read_source(const Beginning *b, const Route *route, double *value)
         status = part_get(b->me, route->source_part, (Type)part->output_types[place],
                           part->output_references[place], value);
     }
-    *value = status > STATUS_WARNING ? 0.0 : scaled(route->scale, *value);
-    return status;
+    return status > STATUS_WARNING ? status : route_carry(b->me, route, *value, value);
 }
 
 /* An FMU of FMI 1.0 that waits gets the value when it begins. */

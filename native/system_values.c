@@ -52,28 +52,22 @@ Status part_set_inputs(Composite *me, size_t index) {
                                  me->typed, me->floats));
 }
 
-static bool are_finite(const double *values, size_t count) {
-    bool finite = true;
-    for (size_t i = 0; i < count; i++) {
-        finite &= isfinite(values[i]) != 0;
-    }
-    return finite;
-}
-
-/* Values that are not finite must not reach other FMUs. */
 Status part_read(Composite *me, size_t index) {
     const Part *part = &me->system->parts[index];
-    double *values = me->outputs + part->first_output;
-    const Status status =
-        part_judge(me, index, access_get(&part->outputs, &me->libraries[index],
-                                         me->parts.components[index], values, me->typed,
-                                         me->floats));
 
-    if (status <= STATUS_WARNING && !are_finite(values, part->outputs.count)) {
-        me->blamed = part->not_finite;
-        return STATUS_DISCARD;
+    return part_judge(me, index,
+                      access_get(&part->outputs, &me->libraries[index],
+                                 me->parts.components[index], me->outputs + part->first_output,
+                                 me->typed, me->floats));
+}
+
+Status route_carry(Composite *me, const Route *route, double value, double *carried) {
+    if (!isfinite(value)) {
+        me->blamed = me->system->parts[route->source_part].not_finite;
+        return STATUS_NOT_FINITE;
     }
-    return status;
+    *carried = scaled(route->scale, value);
+    return STATUS_OK;
 }
 
 Status system_refresh(Composite *me) {

@@ -6,6 +6,7 @@ This does what ``native/system.c`` and its siblings do, operation by operation.
 from __future__ import annotations
 
 import logging
+import math
 import struct
 import weakref
 from collections.abc import Callable, Iterable, Sequence
@@ -24,7 +25,7 @@ from fmugym.fmi.library import Library
 from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.solver import Solving
-from fmugym.fmi.status import Phase, Status, sane
+from fmugym.fmi.status import Phase, Status, failed_call, sane
 from fmugym.systems.description import PartVariable, SystemDescription
 from fmugym.systems.layout import Layout, PartLayout, Route
 from fmugym.systems.plan import Evaluation, Group
@@ -44,6 +45,13 @@ class _FailedError(Exception):
 
 def _scaled(gain: float, offset: float, value: float) -> float:
     return value if gain == 1.0 and offset == 0.0 else gain * value + offset
+
+
+def _carried(source: _Part, route: Route, value: float) -> float:
+    """What a route carries. Values that are not finite must not reach other FMUs."""
+    if not math.isfinite(value):
+        raise _FailedError(Status.NOT_FINITE, f"{source.label}, whose outputs are not finite")
+    return _scaled(route.gain, route.offset, value)
 
 
 class _Part:
@@ -89,10 +97,8 @@ class _Part:
         self.judge(access.set())
 
     def read(self) -> None:
-        """Fill the slots of the outputs. Values that are not finite must not reach other FMUs."""
+        """Fill the slots of the outputs."""
         self.judge(self.outputs.get())
-        if not np.isfinite(self.outputs.values).all():
-            raise _FailedError(Status.DISCARD, f"{self.label}, whose outputs are not finite")
 
     def advance(self, time: float, step: float) -> bool:
         """Do the communication steps; returns whether the FMU has asked to stop."""
@@ -184,10 +190,8 @@ class SystemInstance(Instance):
 
     def describe_failure(self, doing: str, status: int) -> str:
         """Say which call failed and in which component, with its last messages."""
-        where = f" in {self._who}" if self._who else ""
         said = "".join(part.instance._log.said() for part in self._parts)
-        label = Status(status).name.capitalize()
-        return f"{self._log.instance_name}: {doing} returned {label}{where}{said}"
+        return f"{self._log.instance_name}: {failed_call(doing, status, self._who)}{said}"
 
     def _tell(self, failure: _FailedError) -> int:
         self._who = failure.who
@@ -276,7 +280,11 @@ class SystemInstance(Instance):
             self._initialize_parts(Span(start_time, stop_time, tolerance), set_start_values)
         except _FailedError as failure:
             self._fail_initialization()
-            self.check("initialization", self._tell(failure))
+            if failure.status == Status.FATAL:
+                self.phase = Phase.DEAD
+            self._tell(failure)
+            text = self.describe_failure("initialization", failure.status)
+            raise SimulationError(text) from None
         except BaseException:
             self._fail_initialization()
             raise
@@ -374,7 +382,7 @@ class SystemInstance(Instance):
         begin_if_old(route.source_part)
         part = self._parts[route.source_part]
         value = part.get(part.layout.outputs[route.source - part.layout.first_output])
-        return _scaled(route.gain, route.offset, value)
+        return _carried(part, route, value)
 
     def _write_target(self, route: Route, value: float) -> None:
         part = self._parts[route.target_part]
@@ -398,6 +406,13 @@ class SystemInstance(Instance):
             return self.judge_step(self._tell(failure))
         return self.judge_step(Status.TERMINATED) if self._terminated else Status.OK
 
+    def judge_step(self, status: int) -> int:
+        """See ``Instance.judge_step``; values for other components may be no numbers."""
+        if status != Status.NOT_FINITE:
+            return super().judge_step(status)
+        self.forbid_steps()
+        return status
+
     def _step_all(self, time: float, step_size: float) -> None:
         if not self._fresh:
             self._refresh()
@@ -412,7 +427,7 @@ class SystemInstance(Instance):
     def _carried(self, route: Route) -> float:
         part = self._parts[route.source_part]
         value = float(part.outputs.values[route.source - part.layout.first_output])
-        return _scaled(route.gain, route.offset, value)
+        return _carried(part, route, value)
 
     def _take(self, route: Route, value: float) -> None:
         part = self._parts[route.target_part]
