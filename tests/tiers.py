@@ -28,7 +28,9 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_pettingzoo",
     "test_systems_description",
+    "test_systems_faces",
     "test_systems_ssp",
     "test_without_native",
 }

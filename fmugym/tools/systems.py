@@ -151,7 +151,7 @@ def _change(gain: float, offset: float) -> str:
     parts = [f"* {gain:.6g}"] if gain != 1 else []
     if offset:
         parts.append(f"{'+' if offset > 0 else '-'} {abs(offset):.6g}")
-    return f"  ({' '.join(parts)})" if parts else ""
+    return f" ({' '.join(parts)})" if parts else ""
 
 
 def _connector(connector: Mapping[str, Any]) -> str:
