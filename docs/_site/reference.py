@@ -32,6 +32,7 @@ MODULES: Final = {
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
     "RLlib": "fmugym.rllib",
+    "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",
     "Pictures": "fmugym.rendering",
