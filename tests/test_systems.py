@@ -2,6 +2,7 @@
 
 import logging
 import pickle
+from dataclasses import replace
 
 import exchange_tools
 import fmu_tools
@@ -54,7 +55,10 @@ def closing_pools():
     def make(plan, inputs=(), outputs=(), native=True, count=1, time_step=0.1, **options):
         fmu = SystemFMU(plan)
         spec = PoolSpec(
-            tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), time_step, **options
+            tuple(map(fmu.variable, inputs)),
+            tuple(map(fmu.variable, outputs)),
+            time_step,
+            **options,
         )
         pool = local_pool(fmu, spec, count, LOG, native=native)
         pool.variable = fmu.variable
@@ -99,12 +103,12 @@ class TestAgainstClosedForms:
         build, exact, outputs = ORDERS[name]
         plan = build([fmus[2], fmus[3]], steps, master=master)
         errors = []
-        for count in (64, 128, 256):
+        for count in (24, 48, 96):
             rows = play(make(plan, (), outputs, native, time_step=2.0 / count), count)
             expected = exact(np.arange(count + 1) * 2.0 / count).T
             errors.append(np.abs(rows - expected).max())
-        assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.12)
-        assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.06)
+        assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
+        assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
 
     @by_each_master
     def test_the_start_is_exact(self, make, fmus, master):
@@ -235,9 +239,7 @@ class TestLoops:
     @in_each_engine
     def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus, native):
         for method, status in (("newton", Status.OK), ("fixed_point", Status.DISCARD)):
-            pool = make(
-                loop_of_gains(fmus, Loop(method), (2.0, 3.0)), ["a.u2"], ["a.y1"], native
-            )
+            pool = make(loop_of_gains(fmus, Loop(method), (2.0, 3.0)), ["a.u2"], ["a.y1"], native)
             pool.reset(*NO_START)
             outputs, statuses = pool.step(np.array([[1.0]]))
             assert statuses.tolist() == [status]
@@ -260,8 +262,6 @@ class TestLoops:
     @in_each_engine
     def test_repeat_the_dynamics_from_the_beginning_of_the_step(self, make, fmus, native):
         """The coupled masses as a loop: what both compute agrees with what both got."""
-        from dataclasses import replace
-
         plan = masses([fmus[2], fmus[3]])
         loop = Loop("newton", 1e-12)
         plan = replace(plan, groups=(Group(("first", "second"), loop),))
@@ -278,7 +278,9 @@ class TestValues:
     @in_each_engine
     def test_connectors_stand_for_variables_in_other_units(self, make, fmus, native):
         """One input for two components; an output and a parameter in other units."""
-        parts = [linear(n, fmus[v], b=[[1, 0], [0, 0]], c=np.eye(2)) for n, v in (("a", 2), ("b", 3))]
+        parts = [
+            linear(n, fmus[v], b=[[1, 0], [0, 0]], c=np.eye(2)) for n, v in (("a", 2), ("b", 3))
+        ]
         connectors = (
             Connector("push", (End("a", "u1", 2.0), End("b", "u1", 1.0, 0.5)), "input"),
             Connector("level", (End("b", "y1", 100.0, -1.0),), "output", "cm"),
@@ -307,7 +309,11 @@ class TestValues:
         parts = tuple(Component(n, p) for n, p in zip("ab", probes, strict=True))
         links = (Link("a", "steps", "b", "n"), Link("b", "on_out", "a", "free"))
         plan = SystemPlan(
-            "types", parts, links, (Group(("a",)), Group(("b",))), (Evaluation((0,)), Evaluation((1,)))
+            "types",
+            parts,
+            links,
+            (Group(("a",)), Group(("b",))),
+            (Evaluation((0,)), Evaluation((1,))),
         )
         names = ["b.n_out", "a.free_out", "a.mode_out", "b.mode_out"]
         pool = make(plan, ["b.on", "a.mode", "b.mode"], names, native)
@@ -374,9 +380,7 @@ class TestFaults:
     def test_discarded_steps_are_repeated_as_smaller_ones_of_all(self, make, fmus, native):
         """One component accepts only steps of at most 0.03 s, so the system does four of 0.025."""
         plan = masses([fmus[2], fmus[2]])
-        limited = make(
-            plan, (), ["first.y1", "second.y2"], native, time_step=0.1, fault_retries=3
-        )
+        limited = make(plan, (), ["first.y1", "second.y2"], native, time_step=0.1, fault_retries=3)
         fine = make(plan, (), ["first.y1", "second.y2"], native, time_step=0.025)
         outputs, _ = limited.reset((limited.variable("second.limit"),), np.array([[0.03]]))
         fine.reset(*NO_START)
@@ -436,8 +440,8 @@ class TestStates:
             one.step()
         one.save_by(lambda: SaveMethod.STATE)
         other.save_by(lambda: SaveMethod.STATE)
-        bundle = pickle.loads(pickle.dumps(one.save_states(np.arange(2))))
-        other.restore_states(bundle, np.arange(2), np.arange(2))
+        bundle = pickle.loads(pickle.dumps(one.save_instances(np.arange(2))))
+        other.restore_instances(bundle, np.arange(2), np.arange(2))
         for _ in range(5):
             assert one.step()[0].tobytes() == other.step()[0].tobytes()
 

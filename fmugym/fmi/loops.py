@@ -57,9 +57,7 @@ def _improved(x: Vector, y: Vector, evaluate: Callable[[Vector], Vector]) -> Vec
     return [a + d if math.isfinite(d) else b for a, d, b in triples]
 
 
-def _differentiated(
-    x: Vector, y: Vector, evaluate: Callable[[Vector], Vector]
-) -> list[Vector]:
+def _differentiated(x: Vector, y: Vector, evaluate: Callable[[Vector], Vector]) -> list[Vector]:
     """The matrix of x - y(x), differentiated by x."""
     n = len(x)
     matrix = [[0.0] * n for _ in range(n)]

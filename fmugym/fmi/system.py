@@ -21,8 +21,8 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
-from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.library import Library
+from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.solver import Solving
 from fmugym.fmi.status import Phase, Status, failed_call, sane
@@ -228,9 +228,7 @@ class SystemInstance(Instance):
             return self._tell(failure)
         return Status.OK
 
-    def _get_all(
-        self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]
-    ) -> None:
+    def _get_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for index, behind in enumerate(ends):
             end = behind[0]
             buffer[index] = _scaled(end.gain, end.offset, self._get(end))
@@ -244,9 +242,7 @@ class SystemInstance(Instance):
             return float(part.inputs.values[given - part.layout.first_input])
         return part.get(end.variable)
 
-    def _set_all(
-        self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]
-    ) -> None:
+    def _set_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for behind, value in zip(ends, buffer.tolist(), strict=True):
             for end in behind:
                 self._set(end, _scaled(end.gain, end.offset, value))
@@ -596,6 +592,8 @@ class SystemInstance(Instance):
 class _SystemState(SavedState):
     """The owner of the states of all components."""
 
+    release: Any
+
     def __init__(self, memory: _Memory) -> None:
         self.memory = memory
         self.release = weakref.finalize(self, _release, memory.states)
@@ -622,6 +620,7 @@ class SystemLibrary(Library):
     def __init__(
         self, fmu: LoadableFMU, layout: Layout, target: logging.Logger, solving: Solving | None
     ) -> None:
+        self.close: Any
         self._system, self._layout, self._target = fmu, layout, target
         self._libraries: list[Library] = []
         self.can_save_state = fmu.description.capabilities.can_get_and_set_fmu_state
@@ -674,9 +673,7 @@ def _instantiate(library: Library, label: str, hear_all: bool) -> Instance:
         raise FMULoadError(f"{label}: {error}") from None
 
 
-def _close(
-    instances: list[SystemInstance], libraries: list[Library], fmu: LoadableFMU
-) -> None:
+def _close(instances: list[SystemInstance], libraries: list[Library], fmu: LoadableFMU) -> None:
     while instances:
         instances.pop().free()
     for library in libraries:

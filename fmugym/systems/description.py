@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import count
+from typing import Final
 
 from fmugym.archive.description import Capabilities, ModelDescription, Unit, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.plan import Connector, End, SystemPlan
 
 __all__ = ["PartVariable", "SystemDescription", "describe_system"]
+
+
+_NO_PLAN: Final = SystemPlan("", ())
+"""Dataclasses want a default here, for there are others before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,7 @@ class SystemDescription(ModelDescription):
         ends: What stands behind each variable; one, except for connectors with several ends.
     """
 
-    plan: SystemPlan = SystemPlan("", ())
+    plan: SystemPlan = _NO_PLAN
     parts: tuple[ModelDescription, ...] = ()
     ends: tuple[tuple[PartVariable, ...], ...] = ()
 
@@ -104,8 +109,7 @@ def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabi
     """What all components can; a restriction of one restricts the system."""
     flags = [part.capabilities for part in parts]
     able = {
-        field.name: all(getattr(one, field.name) for one in flags)
-        for field in fields(Capabilities)
+        field.name: all(getattr(one, field.name) for one in flags) for field in fields(Capabilities)
     }
     restrictions = ("can_be_instantiated_only_once_per_process", "needs_execution_tool")
     able |= {name: any(getattr(one, name) for one in flags) for name in restrictions}
@@ -144,7 +148,7 @@ def _variables(
 
 def _scalars(part: ModelDescription) -> Iterator[Variable]:
     """Arrays, binary values and clocks cannot be variables of a system."""
-    return (v for v in part.variables.values() if v.numeric or v.kind == "string" and not v.shape)
+    return (v for v in part.variables.values() if v.numeric or (v.kind == "string" and not v.shape))
 
 
 def _renamed(own: Variable, name: str, reference: int, is_linked: bool) -> Variable:

@@ -49,9 +49,7 @@ class PartLayout:
     @cached_property
     def starts(self) -> tuple[tuple[Variable, float | str], ...]:
         """What the plan sets before the initialization."""
-        return tuple(
-            (self._settable(name), value) for name, value in self.component.starts
-        )
+        return tuple((self._settable(name), value) for name, value in self.component.starts)
 
     def _settable(self, name: str) -> Variable:
         variable = self.description.variable(name)
