@@ -212,9 +212,7 @@ def main(argv=None):
     system = make_system(options.folder)
     system.write(options.folder / "home.ssp")
     system.plot(options.folder / "home.svg")
-    envs = fmugym.FMUVectorEnv(
-        lambda: HomeEnv(system), options.envs, autoreset_mode="Disabled"
-    )
+    envs = fmugym.FMUVectorEnv(lambda: HomeEnv(system), options.envs, autoreset_mode="Disabled")
     reference = float(np.mean(thermostat(envs, TEST_SEED)))
     curve = []
     for number, (mean, total) in enumerate(train(envs, options.generations, options.seed), 1):

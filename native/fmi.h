@@ -35,6 +35,7 @@ typedef enum {
     TYPE_UINT32,
     TYPE_UINT64,
     TYPE_BOOLEAN,
+    TYPE_CLOCK, /* whether it ticks; FMI 3.0 */
     NUMBER_OF_TYPES
 } Type;
 
@@ -57,12 +58,13 @@ typedef struct {
     bool has_tolerance;
 } Experiment;
 
-/* A callback that sets the start values and returns a status; and one that exchanges values with
- * other FMUs in Initialization Mode, or NULL. FMI 1.0 has no such mode, and does not call it. */
+/* Callbacks for initialization; each returns a status. */
 typedef struct {
-    Status (*set)(void *context);
+    Status (*set)(void *context); /* sets the start values */
     void *context;
-    Status (*exchange)(void *context);
+    Status (*prepare)(void *prepared); /* in initialization mode of FMI 3.0, or NULL */
+    void *prepared;
+    Status (*exchange)(void *context); /* with other FMUs in initialization mode, or NULL */
 } StartValues;
 
 static inline Status exchange_in(StartValues start_values) {
@@ -142,13 +144,15 @@ typedef struct Fmi {
     void (*drop)(const Library *library, void *component);
 } Fmi;
 
-/* Of co-simulation and of model exchange. */
-extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3;
+/* How an FMU is run. fmugym/pool/settings.py has the same numbers. */
+typedef enum { CO_SIMULATION_ALONE, MODEL_EXCHANGE_SOLVED, CO_SIMULATION_WITH_EVENTS } Manner;
+
+extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
 /* Of systems. */
 extern const Fmi composite;
 
-/* NULL if there is no such version. Version 0 are systems. */
-const Fmi *fmi_table(int64_t version, bool exchange);
+/* NULL if the version has no such manner. Version 0 are systems. */
+const Fmi *fmi_table(int64_t version, int64_t manner);
 
 static inline bool has_outputs(Outcome outcome) {
     return outcome.stage == DOING_STEP &&

@@ -82,7 +82,7 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     atomic_add(&initializations, 1);
     begin_call(CALL_INITIALIZE);
     status = s->fmi->initialize(me->library, me->component, &s->experiment,
-                                (StartValues){set_start_values, &context}, &doing);
+                                (StartValues){.set = set_start_values, .context = &context}, &doing);
     end_call();
     instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);

@@ -173,9 +173,9 @@ Status system_deserialize(const Library *library, void *component, const char *b
 Status part_judge(Composite *me, size_t index, Status status);
 /* Sets the inputs of a part to its slots. */
 Status part_set_inputs(Composite *me, size_t index);
-/* One variable of a part. */
-Status part_get(Composite *me, size_t index, Type type, uint32_t reference, double *value);
-Status part_set(Composite *me, size_t index, Type type, uint32_t reference, double value);
+/* One variable of a part. The place of its reference must stay the same: solvers compare it. */
+Status part_get(Composite *me, size_t index, Type type, const uint32_t *reference, double *value);
+Status part_set(Composite *me, size_t index, Type type, const uint32_t *reference, double value);
 /* Fills the output slots of a part. */
 Status part_read(Composite *me, size_t index);
 /* Computes what a route carries. Values that are not finite must not reach other FMUs. */

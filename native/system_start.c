@@ -23,7 +23,7 @@ static Status set_pending(Composite *me, size_t index, const Pending *pending) {
     const Part *part = &me->system->parts[index];
 
     if (pending->text == NULL) {
-        return part_set(me, index, end->type, end->reference, pending->value);
+        return part_set(me, index, end->type, &end->reference, pending->value);
     }
     return part_judge(me, index, part->fmi->set_string(&me->libraries[index],
                                                        me->parts.components[index],
@@ -65,7 +65,8 @@ static Status begin_next(void *context) {
 static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
     Composite *me = b->me;
     Place place = {b, index};
-    const StartValues values = {set_starts, &place, goes_on ? begin_next : NULL};
+    const StartValues values = {
+        .set = set_starts, .context = &place, .exchange = goes_on ? begin_next : NULL};
 
     me->parts.started[index] = true;
     return part_judge(me, index, me->system->parts[index].fmi->initialize(
@@ -88,7 +89,7 @@ static Status read_source(const Beginning *b, const Route *route, double *value)
 
     if (status <= STATUS_WARNING) {
         status = part_get(b->me, route->source_part, (Type)part->output_types[place],
-                          part->output_references[place], value);
+                          &part->output_references[place], value);
     }
     return status > STATUS_WARNING ? status : route_carry(b->me, route, *value, value);
 }
@@ -102,7 +103,7 @@ static Status write_target(const Beginning *b, const Route *route, double value)
     me->inputs[route->target] = value;
     return me->parts.started[route->target_part]
                ? part_set(me, route->target_part, (Type)part->input_types[place],
-                          part->input_references[place], value)
+                          &part->input_references[place], value)
                : STATUS_OK;
 }
 

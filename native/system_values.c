@@ -14,29 +14,30 @@ Status part_judge(Composite *me, size_t index, Status status) {
     return status;
 }
 
-static Access access_of_one(const Part *part, Type type, uint32_t *reference, uint32_t *position) {
+static Access access_of_one(const Part *part, Type type, const uint32_t *reference,
+                            uint32_t *position) {
     Access access = {.fmi = part->fmi,
                      .count = 1,
                      .number_of_groups = 1,
                      .direct = type == TYPE_FLOAT64};
 
     *position = 0;
-    access.groups[0] = (Group){type, 1, reference, position};
+    access.groups[0] = (Group){type, 1, (uint32_t *)reference, position};
     return access;
 }
 
-Status part_get(Composite *me, size_t index, Type type, uint32_t reference, double *value) {
+Status part_get(Composite *me, size_t index, Type type, const uint32_t *reference, double *value) {
     uint32_t position;
-    const Access one = access_of_one(&me->system->parts[index], type, &reference, &position);
+    const Access one = access_of_one(&me->system->parts[index], type, reference, &position);
 
     return part_judge(me, index, access_get(&one, &me->libraries[index],
                                             me->parts.components[index], value, me->typed,
                                             me->floats));
 }
 
-Status part_set(Composite *me, size_t index, Type type, uint32_t reference, double value) {
+Status part_set(Composite *me, size_t index, Type type, const uint32_t *reference, double value) {
     uint32_t position;
-    const Access one = access_of_one(&me->system->parts[index], type, &reference, &position);
+    const Access one = access_of_one(&me->system->parts[index], type, reference, &position);
 
     return part_judge(me, index, access_set(&one, &me->libraries[index],
                                             me->parts.components[index], &value, me->typed,
@@ -98,7 +99,7 @@ static Status get_one(Composite *me, uint32_t reference, double *value) {
     } else if (end->input >= 0) {
         *value = me->inputs[end->input];
     } else {
-        status = part_get(me, end->part, end->type, end->reference, value);
+        status = part_get(me, end->part, end->type, &end->reference, value);
     }
     *value = scaled(end->scale, *value);
     return status;
@@ -143,7 +144,7 @@ static Status set_end(Composite *me, const End *end, double value) {
         return note(me, end, value, NULL);
     }
     me->is_fresh = false;
-    return part_set(me, end->part, end->type, end->reference, value);
+    return part_set(me, end->part, end->type, &end->reference, value);
 }
 
 Status system_set(const Library *library, void *component, Type type, const uint32_t *references,

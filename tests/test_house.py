@@ -23,7 +23,8 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
-    {"envs", "tools", "pettingzoo"},
+    {"export"},
+    {"envs", "pettingzoo", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

@@ -2,6 +2,7 @@
 
 import logging
 import pickle
+from dataclasses import replace
 
 import exchange_tools
 import fmu_tools
@@ -102,12 +103,12 @@ class TestAgainstClosedForms:
         build, exact, outputs = ORDERS[name]
         plan = build([fmus[2], fmus[3]], steps, master=master)
         errors = []
-        for count in (64, 128, 256):
+        for count in (24, 48, 96):
             rows = play(make(plan, (), outputs, native, time_step=2.0 / count), count)
             expected = exact(np.arange(count + 1) * 2.0 / count).T
             errors.append(np.abs(rows - expected).max())
-        assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.12)
-        assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.06)
+        assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
+        assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
 
     @by_each_master
     def test_the_start_is_exact(self, make, fmus, master):
@@ -261,8 +262,6 @@ class TestLoops:
     @in_each_engine
     def test_repeat_the_dynamics_from_the_beginning_of_the_step(self, make, fmus, native):
         """The coupled masses as a loop: what both compute agrees with what both got."""
-        from dataclasses import replace
-
         plan = masses([fmus[2], fmus[3]])
         loop = Loop("newton", 1e-12)
         plan = replace(plan, groups=(Group(("first", "second"), loop),))
@@ -441,8 +440,8 @@ class TestStates:
             one.step()
         one.save_by(lambda: SaveMethod.STATE)
         other.save_by(lambda: SaveMethod.STATE)
-        bundle = pickle.loads(pickle.dumps(one.save_states(np.arange(2))))
-        other.restore_states(bundle, np.arange(2), np.arange(2))
+        bundle = pickle.loads(pickle.dumps(one.save_instances(np.arange(2))))
+        other.restore_instances(bundle, np.arange(2), np.arange(2))
         for _ in range(5):
             assert one.step()[0].tobytes() == other.step()[0].tobytes()
 

@@ -33,6 +33,8 @@ MODULES: Final = {
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
     "PettingZoo": "fmugym.pettingzoo",
+    "RLlib": "fmugym.rllib",
+    "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",
     "Pictures": "fmugym.rendering",

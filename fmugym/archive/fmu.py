@@ -55,11 +55,9 @@ class LoadableFMU(ABC):
 
     Attributes:
         in_wine: Whether the library is one for Windows that can only run in Wine here.
-        parts: The FMUs of a system; none otherwise.
     """
 
     in_wine = False
-    parts: tuple[LoadableFMU, ...] = ()
 
     def __init__(self, path: Path, description: ModelDescription, preload: tuple[str, ...]) -> None:
         self.path = path
@@ -68,6 +66,11 @@ class LoadableFMU(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.path)!r})"
+
+    @property
+    def parts(self) -> tuple[LoadableFMU, ...]:
+        """The FMUs of a system; none otherwise."""
+        return ()
 
     @property
     def bundled(self) -> bool:

@@ -592,6 +592,8 @@ class SystemInstance(Instance):
 class _SystemState(SavedState):
     """The owner of the states of all components."""
 
+    release: Any
+
     def __init__(self, memory: _Memory) -> None:
         self.memory = memory
         self.release = weakref.finalize(self, _release, memory.states)
@@ -618,6 +620,7 @@ class SystemLibrary(Library):
     def __init__(
         self, fmu: LoadableFMU, layout: Layout, target: logging.Logger, solving: Solving | None
     ) -> None:
+        self.close: Any
         self._system, self._layout, self._target = fmu, layout, target
         self._libraries: list[Library] = []
         self.can_save_state = fmu.description.capabilities.can_get_and_set_fmu_state

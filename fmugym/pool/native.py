@@ -50,6 +50,7 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    manner_of,
     record_from,
     solving_settings,
     table_of,
@@ -193,9 +194,8 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = table_of(self._fmu.description)
-            is_exchange = self._fmu.description.model_exchange is not None
             parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, is_exchange)
+            access = _native.Access(version, *parts, manner_of(self._fmu.description))
             self._accesses[variables] = access
         return access
 
@@ -590,9 +590,9 @@ class _Receiver:
 
     def __init__(self, log: logging.Logger, description: ModelDescription, first: int) -> None:
         self._log, self._model, self._first_index = log, description.model_identifier, first
-        is_system = isinstance(description, SystemDescription)
-        components = description.plan.components if is_system else ()
-        self._parts = [f".{component.name}" for component in components] or [""]
+        self._parts = [""]
+        if isinstance(description, SystemDescription):
+            self._parts = [f".{component.name}" for component in description.plan.components]
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         instance, part = divmod(index, len(self._parts))

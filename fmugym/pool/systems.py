@@ -12,6 +12,7 @@ from fmugym.archive.description import ModelDescription, Variable
 from fmugym.pool.settings import (
     PlaceOfFMU,
     library_settings,
+    manner_of,
     solving_settings,
     types_and_references,
 )
@@ -53,14 +54,13 @@ def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
     label = part.label
     numbers = [(v, float(x)) for v, x in part.starts if v.numeric]
     texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
-    is_exchange = description.model_exchange is not None
     return (
         (
             part.component.name.encode(),
             label.encode(),
             f"{label}, whose outputs are not finite".encode(),
         ),
-        (version, is_exchange, part.has_mode),
+        (version, manner_of(description), part.has_mode),
         (known["model"], known["token"], known["resources"]),
         known["categories"],
         part.component.steps,

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import count
+from typing import Final
 
 from fmugym.archive.description import Capabilities, ModelDescription, Unit, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.plan import Connector, End, SystemPlan
 
 __all__ = ["PartVariable", "SystemDescription", "describe_system"]
+
+
+_NO_PLAN: Final = SystemPlan("", ())
+"""Dataclasses want a default here, for there are others before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,7 @@ class SystemDescription(ModelDescription):
         ends: What stands behind each variable; one, except for connectors with several ends.
     """
 
-    plan: SystemPlan = SystemPlan("", ())
+    plan: SystemPlan = _NO_PLAN
     parts: tuple[ModelDescription, ...] = ()
     ends: tuple[tuple[PartVariable, ...], ...] = ()
 

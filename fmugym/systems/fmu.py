@@ -32,7 +32,12 @@ class ExtractedSystem(ExtractedFMU):
 
     def __init__(self, path: Path, description: SystemDescription, folder: Path) -> None:
         super().__init__(path, description, (), folder)
-        self.parts = _parts_in(folder, description)
+        self._parts = _parts_in(folder, description)
+
+    @property
+    def parts(self) -> tuple[LoadableFMU, ...]:
+        """The FMUs of the components."""
+        return self._parts
 
 
 def _parts_in(folder: Path, description: SystemDescription) -> tuple[LoadableFMU, ...]:

@@ -88,13 +88,13 @@ static bool take_part(PyObject *tuple, Part *part) {
     PyObject *categories, *solving, *strings;
     Bytes in_types, in_references, in_starts, out_types, out_references;
     Bytes start_types, start_references, start_values;
-    int version, exchange, has_mode;
+    int version, manner, has_mode;
     long long steps;
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(ipp)(yyy)O!LO(y#y#y#)(y#y#)(y#y#y#)O!", &part->name, &part->label,
-            &part->not_finite, &version, &exchange, &has_mode, &part->model, &part->token,
+            tuple, "(yyy)(iip)(yyy)O!LO(y#y#y#)(y#y#)(y#y#y#)O!", &part->name, &part->label,
+            &part->not_finite, &version, &manner, &has_mode, &part->model, &part->token,
             &part->resources, &PyTuple_Type, &categories, &steps, &solving, &in_types.data,
             &in_types.size, &in_references.data, &in_references.size, &in_starts.data,
             &in_starts.size, &out_types.data, &out_types.size, &out_references.data,
@@ -103,7 +103,7 @@ static bool take_part(PyObject *tuple, Part *part) {
             &strings)) {
         return refuse("parts");
     }
-    part->fmi = version == 0 ? NULL : fmi_of(version, exchange);
+    part->fmi = version == 0 ? NULL : fmi_of(version, manner);
     if (part->fmi == NULL || steps < 1 ||
         count_of(in_starts, sizeof(double)) != (size_t)in_types.size ||
         count_of(start_values, sizeof(double)) != (size_t)start_types.size) {
