@@ -115,7 +115,7 @@ def price(hour):
 
 
 class HomeEnv(fmugym.FMUEnv):
-    """A day in March. The reward is the negative cost in euro, and a euro per kelvin hour of cold."""
+    """A day in March. The reward is the cost in euro, negative, as is a euro for a kelvin hour."""
 
     def __init__(self, system, **options):
         config = {
@@ -188,6 +188,7 @@ def train(envs, generations, seed):
 
 
 def draw_curve(curve, reference, path):
+    """Draw the median returns of the generations beside that of the thermostat."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 3.5), layout="constrained")
@@ -203,6 +204,7 @@ def draw_curve(curve, reference, path):
 
 
 def main(argv=None):
+    """Make the system, train, and compare on days that the training did not see."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=Path("results"))
     parser.add_argument("--generations", type=int, default=20)
@@ -214,11 +216,12 @@ def main(argv=None):
     system.plot(options.folder / "home.svg")
     envs = fmugym.FMUVectorEnv(lambda: HomeEnv(system), options.envs, autoreset_mode="Disabled")
     reference = float(np.mean(thermostat(envs, TEST_SEED)))
-    curve = []
-    for number, (mean, total) in enumerate(train(envs, options.generations, options.seed), 1):
+    curve, policy = [], np.zeros((6, 2))
+    for number, found in enumerate(train(envs, options.generations, options.seed), 1):
+        policy, total = found
         curve.append(float(np.median(total)))
         print(f"generation {number}: median return {curve[-1]:.2f} euro")
-    weights = np.broadcast_to(mean, (options.envs, 6, 2))
+    weights = np.broadcast_to(policy, (options.envs, 6, 2))
     final = float(np.mean(returns_of(envs, weights, TEST_SEED)))
     envs.close()
     draw_curve(curve, reference, options.folder / "curve.png")
