@@ -31,6 +31,7 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_systems",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -59,6 +60,7 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_systems": 5,
     "test_words": 5,
     "test_zoo": 5,
 }
@@ -67,6 +69,9 @@ EVERY_IN_CI = {
 The numbers have no factor in common with those of FMI versions and ways of running, so that each of
 these occurs with others in turn.
 """
+
+EVERY_IN_SYSTEMS = 17
+"""The same for the contract of pools with the FMU as a component of a system."""
 
 SLOW_TESTS = (
     "test_baselines_tuning.py::test_it_finds",
@@ -210,4 +215,5 @@ def is_exhaustive(node_id, number):
     module = node_id.partition(".py")[0]
     if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
-    return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0
+    every = EVERY_IN_SYSTEMS if "[system in " in node_id else EVERY_IN_CI.get(module, 1)
+    return is_slow(node_id, number) and number % every > 0
