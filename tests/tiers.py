@@ -9,7 +9,9 @@ SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
     "test_cli_docs",
+    "test_compile",
     "test_copies",
+    "test_events",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
@@ -170,6 +172,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )
