@@ -24,6 +24,7 @@ SLOW_MODULES = {
     "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
+    "test_nested_fmus",
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
