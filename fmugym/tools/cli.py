@@ -73,7 +73,8 @@ from importlib.metadata import version
 from typing import Final
 
 from fmugym.errors import FMUGymError
-<<<<<<< HEAD
+from fmugym.tools.exporting import add_export
+from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import (
     add_compile,
     add_info,
@@ -82,11 +83,6 @@ from fmugym.tools.inspecting import (
     add_stand_in,
     add_validate,
 )
-=======
-from fmugym.tools.exporting import add_export
-from fmugym.tools.gains import add_tune
-from fmugym.tools.inspecting import add_info, add_new, add_skeleton, add_stand_in, add_validate
->>>>>>> main
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import note
 from fmugym.tools.playing import add_bench, add_evaluate, add_record, add_simulate
@@ -97,13 +93,8 @@ __all__ = ["main"]
 _INTERRUPTED: Final = 130
 
 _COMMANDS: Final = (
-<<<<<<< HEAD
-    *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_record),
-    *(add_bench, add_demo, add_skeleton, add_stand_in, add_compile),
-=======
     *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
-    *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in),
->>>>>>> main
+    *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in, add_compile),
 )
 
 
