@@ -455,8 +455,14 @@ class FMUEnv(Constructed):
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
-        steps = self._warm_up_steps + self.step_count
-        return self._spec.communication_point(steps * self._spec.substeps)
+        steps = (self._warm_up_steps + self.step_count) * self._spec.substeps
+        return self._spec.communication_point(steps, self._start_time)
+
+    @property
+    def _start_time(self) -> Any:
+        """The first communication point of the episode."""
+        drawn = self.config.draws_start_time and self.parameters  # which are known after a reset
+        return self.parameters["start_time"] if drawn else self._spec.start_time
 
     def _fault_of_hooks(
         self, reward: float, observation: Any, before: tuple[Any, dict[str, Any] | None]
