@@ -283,8 +283,8 @@ class EnvConfig:
         taken = "start_time" in {*self.model_parameters, *self.episode_variables}
         if taken and self.draws_start_time:
             raise ConfigError(
-                "'start_time' is the name of the start time that is drawn for each episode; no model "
-                "parameter and no episode variable may have this name, too"
+                "'start_time' is the name of the start time that is drawn for each episode; no "
+                "model parameter and no episode variable may have this name, too"
             )
 
 

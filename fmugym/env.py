@@ -461,8 +461,9 @@ class FMUEnv(Constructed):
     @property
     def _start_time(self) -> Any:
         """The first communication point of the episode."""
-        drawn = self.config.draws_start_time and self.parameters  # which are known after a reset
-        return self.parameters["start_time"] if drawn else self._spec.start_time
+        if self.config.draws_start_time:
+            return self.parameters["start_time"]
+        return self._spec.start_time
 
     def _fault_of_hooks(
         self, reward: float, observation: Any, before: tuple[Any, dict[str, Any] | None]

@@ -31,7 +31,7 @@ OTHERS = {
     "tank": ["u", "discards"],
     "prothero": ["k"],
     "relay": ["turns", "last", "speed"],
-    "sun": ["now", "sine", "seconds"],
+    "sun": ["now", "sine", "seconds", "u"],
 }
 """The other variables in the order of their value references."""
 
@@ -49,7 +49,7 @@ START = {
     "tank": {"x": 0.01, "u": 0},
     "prothero": {"x": 1, "k": 1},
     "relay": {"x": 0, "last": 1e9, "speed": 1},
-    "sun": {"x": 0},
+    "sun": {"x": 0, "u": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

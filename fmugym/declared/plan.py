@@ -131,6 +131,7 @@ class Plan:
             [*self._kept, *self._sensors],
             switches,
             self.config["episode_variables"],
+            self.config.get("start_time"),
         )
 
     # The config.

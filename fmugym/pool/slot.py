@@ -490,9 +490,7 @@ class Slot:
         finally:
             state.release()
 
-    def deserialize(
-        self, data: bytes, count: int, start_time: float, outputs: FloatArray
-    ) -> int:
+    def deserialize(self, data: bytes, count: int, start_time: float, outputs: FloatArray) -> int:
         """Return to a serialized state.
 
         Args:

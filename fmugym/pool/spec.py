@@ -72,9 +72,7 @@ def is_start_time(variable: Variable) -> bool:
     return variable.type == START_TIME.type
 
 
-def start_variables(
-    known: Mapping[str, Variable], names: Iterable[str]
-) -> tuple[Variable, ...]:
+def start_variables(known: Mapping[str, Variable], names: Iterable[str]) -> tuple[Variable, ...]:
     """Find start variables by name, ``START_TIME`` included.
 
     Args:

@@ -190,7 +190,8 @@ class Constructed(Pictured):
         self.inputs = tuple(start for _, start in self._start_inputs)
         self.action = None
         self.previous_action = None
-        self.parameters: Mapping[str, Any] = MappingProxyType({})
+        start = {"start_time": self._spec.start_time} if self.config.draws_start_time else {}
+        self.parameters: Mapping[str, Any] = MappingProxyType(start)
         self.variables = EpisodeVariables(self.config.episode_variables)
         self.step_count = 0
         self.done = False

@@ -1,11 +1,11 @@
-/* Follows the time of day: x' = cos(t). It tells its own time and sin(t), and counts the full
+/* Follows the time of day: x' = cos(t) + u. It tells its own time and sin(t), and counts the full
    seconds by time events. */
 
 #include "exchange.h"
 
 const size_t STATES = 1, INDICATORS = 0;
 
-enum { X, DER_X, NOW, SINE, SECONDS };
+enum { X, DER_X, NOW, SINE, SECONDS, U };
 
 void model_start(Model *me) {
     me->v[X] = 0.0;
@@ -16,7 +16,7 @@ void model_initialize(Model *me) {
 }
 
 void model_rates(Model *me) {
-    me->v[DER_X] = cos(me->time);
+    me->v[DER_X] = cos(me->time) + me->v[U];
     me->v[NOW] = me->time;
     me->v[SINE] = sin(me->time);
 }
