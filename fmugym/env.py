@@ -157,7 +157,8 @@ class FMUEnv(Constructed):
         """Start a new episode with the FMU instance at hand.
 
         Random values are drawn from this environment's own generator: first the parameters in the
-        order of the config, then those that only the options have, then the episode variables.
+        order of the config, then the start time, then those that only the options have, then the
+        episode variables.
 
         Args:
             seed: Seeds the generator, an integer of at least 0; None goes on with the generator.

@@ -322,10 +322,8 @@ def test_snapshots_and_rollouts_keep_it(sun, way, version):
 def test_the_stop_time_ends_episodes(sun, way):
     make = partial(Sun, sun(), start_time=[1.0, 2.0, 3.0], stop_time=4.5, max_episode_steps=9)
     env, envs = make(), vector(make, 1, **way)
-    rows, expected = [], play(env, 5, 30)
-    rows.append(envs.reset(seed=5)[0][0].tolist())
-    for _ in range(30):
-        rows.append(envs.step(np.zeros((1, 1), np.float32)).observations[0].tolist())
+    rows, expected = [envs.reset(seed=5)[0][0].tolist()], play(env, 5, 30)
+    rows += [envs.step(np.zeros((1, 1), np.float32)).observations[0].tolist() for _ in range(30)]
     assert rows == [row[0] for row in expected][: len(rows)]
     lengths, count = set(), 0
     for row in expected:
