@@ -94,11 +94,11 @@ class Access:
         version: 1, 2 or 3.
         types: One byte for each variable, the number of its C type; see ``fmi.h``.
         references: Their value references, as bytes of native 32-bit integers.
-        is_exchange: Whether the FMU is run by model exchange.
+        manner: How the FMU is run; see ``fmi.h``.
     """
 
     def __new__(
-        cls, version: int, types: bytes, references: bytes, is_exchange: bool = False, /
+        cls, version: int, types: bytes, references: bytes, manner: int = 0, /
     ) -> Access: ...
 
 @final
@@ -151,6 +151,7 @@ class Library(TypedDict):
     """What the FMU is and how its instances are made."""
 
     version: int
+    manner: int
     model: bytes
     token: bytes
     resources: bytes

@@ -28,6 +28,7 @@ CONFIG, HOOKS, RELIABILITY = DOCS / "config.md", DOCS / "hooks.md", DOCS / "reli
 FENCE = re.compile(r"^(?P<indent> *)```(?P<language>[^\n`]*)\n(?P<code>.*?)^ *```$", re.M | re.S)
 CLASS_ATTRIBUTES = {"metadata", "render_size", "reset_options", "steps_after_end"}
 EXTRAS = {
+    "deploy.md": "torch",
     "stable-baselines3.md": "stable_baselines3",
     "train-torchrl.md": "torchrl",
 }  # what a document's Python needs

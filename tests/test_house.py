@@ -22,6 +22,7 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
+    {"export"},
     {"envs", "tools"},
     {"__init__", "__main__", "clock"},
 ]

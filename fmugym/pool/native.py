@@ -50,6 +50,7 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    manner_of,
     record_from,
     solving_settings,
     types_and_references,
@@ -189,9 +190,8 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
-            is_exchange = self._fmu.description.model_exchange is not None
             parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, is_exchange)
+            access = _native.Access(version, *parts, manner_of(self._fmu.description))
             self._accesses[variables] = access
         return access
 

@@ -205,6 +205,7 @@ def input_variable(description: ModelDescription, name: str) -> Variable:
     """
     variable = description.variable(name)
     _require_numeric(variable, "an input")
+    _require_known_clock(description, variable, "an input")
     if not variable.settable_in_step:
         raise ConfigError(
             f"{name!r} cannot be an input: it is a {variable.variability} {variable.causality}; "
@@ -221,7 +222,24 @@ def output_variable(description: ModelDescription, name: str) -> Variable:
     """
     variable = description.variable(name)
     _require_numeric(variable, "an output")
+    _require_known_clock(description, variable, "an output")
     return variable
+
+
+def _require_known_clock(description: ModelDescription, variable: Variable, role: str) -> None:
+    if not variable.ticking:
+        return
+    if variable not in description.clocks:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is a clock, and {description.model_name} has "
+            "no event mode in co-simulation"
+        )
+    if role == "an input" and not variable.settable_in_step:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is a clock of "
+            f"causality={variable.causality!r} and intervalVariability={variable.ticking!r}, which "
+            "ticks by itself; only triggered input clocks may be set"
+        )
 
 
 def _require_numeric(variable: Variable, role: str) -> None:
@@ -241,6 +259,8 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
             value.
     """
     variable = description.variable(name)
+    if variable.ticking:
+        raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
     if not variable.settable_at_start:
         raise ConfigError(
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "

@@ -8,6 +8,7 @@
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
     fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
         [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb] [KEY=VALUE ...]
+    fmugym export AGENT --task TASK --output agent.c [--algorithm PPO] [--all-inputs]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
@@ -67,6 +68,7 @@ from importlib.metadata import version
 from typing import Final
 
 from fmugym.errors import FMUGymError
+from fmugym.tools.exporting import add_export
 from fmugym.tools.inspecting import add_info, add_new, add_skeleton, add_stand_in, add_validate
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import note
@@ -79,7 +81,7 @@ _INTERRUPTED: Final = 130
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_record),
-    *(add_bench, add_demo, add_skeleton, add_stand_in),
+    *(add_export, add_bench, add_demo, add_skeleton, add_stand_in),
 )
 
 

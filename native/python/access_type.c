@@ -4,8 +4,8 @@
 
 PyTypeObject *access_type;
 
-const Fmi *fmi_of(int version, bool exchange) {
-    const Fmi *fmi = fmi_table(version, exchange);
+const Fmi *fmi_of(int version, int manner) {
+    const Fmi *fmi = fmi_table(version, manner);
 
     if (fmi == NULL) {
         PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);
@@ -39,14 +39,14 @@ static bool check_types(const uint8_t *types, Py_ssize_t count, Py_ssize_t size)
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     const char *types, *references;
     Py_ssize_t count, size;
-    int version, exchange = 0;
+    int version, manner = CO_SIMULATION_ALONE;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "iy#y#|p", &version, &types, &count, &references, &size,
-                          &exchange)) {
+    if (!PyArg_ParseTuple(args, "iy#y#|i", &version, &types, &count, &references, &size,
+                          &manner)) {
         return NULL;
     }
-    const Fmi *fmi = fmi_of(version, exchange);
+    const Fmi *fmi = fmi_of(version, manner);
     if (fmi == NULL || !check_types((const uint8_t *)types, count, size)) {
         return NULL;
     }
