@@ -34,6 +34,7 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_start_times",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -62,6 +63,7 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_start_times": 5,
     "test_words": 5,
     "test_zoo": 5,
 }
