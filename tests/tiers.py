@@ -10,7 +10,9 @@ SLOW_MODULES = {
     "test_call_order",
     "test_cli_docs",
     "test_cli_tuning",
+    "test_compile",
     "test_copies",
+    "test_events",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
@@ -25,12 +27,14 @@ SLOW_MODULES = {
     "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
+    "test_nested_fmus",
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_start_times",
     "test_systems",
     "test_without_native",
 }
@@ -60,6 +64,7 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_start_times": 5,
     "test_systems": 5,
     "test_words": 5,
     "test_zoo": 5,
@@ -179,6 +184,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )
