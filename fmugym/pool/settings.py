@@ -18,7 +18,7 @@ import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.pool.bundle import Record
-from fmugym.pool.spec import SAMPLINGS, PoolSpec, ResetMethod
+from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.systems.description import SystemDescription
 from fmugym.wine.loader import windows_path, windows_uri
 
@@ -51,8 +51,12 @@ _TYPES: Final = (
 )
 """The C types in the order of ``enum Type`` of ``native/fmi.h``."""
 
+_START_TIME: Final = 255
+"""Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
+
 _CLOCK: Final = struct.Struct("=IIdd")
 _CLOCKED: Final = struct.Struct("=II")
+
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
 
@@ -205,6 +209,8 @@ def types_and_references(variables: Sequence[Variable], version: int) -> tuple[b
 
 
 def _type_number(variable: Variable, version: int) -> int:
+    if is_start_time(variable):
+        return _START_TIME
     if version == 0:
         return _TYPES.index("Float64")
     if variable.kind == "enumeration":
@@ -222,6 +228,7 @@ def variables_of(
         for v in description.variables.values()
         if v.numeric
     }
+    known[_START_TIME, START_TIME.value_reference] = START_TIME
     return tuple(known[pair] for pair in zip(types, references, strict=True))
 
 
