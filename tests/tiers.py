@@ -17,6 +17,7 @@ SLOW_MODULES = {
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
+    "test_examples_system",
     "test_examples_train_house",
     "test_export",
     "test_export_sb3",
@@ -188,6 +189,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_examples_system.py",
     "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",

@@ -19,13 +19,43 @@ __all__ = ["FMUSystem"]
 
 
 class FMUSystem(WiredSystem):
-    """Several FMUs that run as one. It can stand wherever the path of an FMU can.
+    """Several FMUs that run as one. It can stand wherever an FMU can.
 
     The variables of the system are those of its components, named ``component.variable``. Inputs
     that nothing drives are inputs of the system. A connection that begins or ends at a name without
     a component gives the system an input, parameter or output of this name.
 
-    See ``WiredSystem`` for the arguments and attributes.
+    Args:
+        components: By name: the path of an FMU, an ``FMU`` or a ``Component``.
+        connections: ``"plant.y -> controller.u"``, pairs of names, or ``Connection`` objects.
+        name: The name of the system.
+        units: Units of the system's own inputs, outputs and parameters by name; without one, they
+            have the unit of the variable behind them.
+        master: ``"gauss_seidel"``, where each component gets the newest values, or ``"jacobi"``.
+        loops: How algebraic loops are solved: ``"newton"``, ``"fixed_point"``, or ``"refuse"``.
+        loop_tolerance: Relative, and absolute below 1, for the values in a loop.
+        loop_iterations: After so many, a step fails.
+        step_size: The default communication step size in seconds; without one, the smallest
+            default step size of the components.
+        start_time, stop_time: Of the default experiment, in seconds.
+        tolerance: For the solvers of the components; None for their own defaults.
+        description: For people.
+        own_names: Names of the system itself that contain a dot.
+        unit_definitions: Units that ``units`` use and that neither an FMU nor pint knows.
+        findings: What a file that described the system had of doubtful things.
+        file: The file that described the system.
+
+    Attributes:
+        name, description, units, unit_definitions, own_names, master, loops: As given.
+        components: The components by name, their FMUs read.
+        connections: As given, as ``Connection`` objects.
+        loop: How algebraic loops are solved.
+        times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
+
+    Raises:
+        ConfigError: If an argument does not fit, a name is unknown, two connections have one
+            target, or units or types do not fit.
+        FMULoadError: If an FMU cannot be read.
     """
 
     @classmethod
