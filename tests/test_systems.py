@@ -200,7 +200,7 @@ class TestBothEngines:
             pool = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
             pool.reset((), np.zeros((0, 2)))
             pool.step()
-            data, ends, _ = pool.serialize_states(np.arange(2))
+            data, ends, *_ = pool.serialize_states(np.arange(2))
             found.append((bytes(data), ends.tolist()))
         assert found[0][1] == found[1][1]
         assert len(found[0][0]) == len(found[1][0])
