@@ -1,11 +1,22 @@
 """SSP archives: what is read of them, compared with FMPy's reader, and what is written."""
 
+import copy
+import random
 import zipfile
 
 import pytest
 from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
+from lxml import etree
 
-from fmugym import Component, ConfigError, Connection, FMULoadError, FMUSystem, bundled_fmu
+from fmugym import (
+    Component,
+    ConfigError,
+    Connection,
+    FMUGymError,
+    FMULoadError,
+    FMUSystem,
+    bundled_fmu,
+)
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
 
@@ -429,6 +440,70 @@ class TestMistakes:
         for path, fact in (cases | {bomb: "DOCTYPE"}).items():
             with pytest.raises(FMULoadError, match=fact):
                 FMUSystem.read(path)
+
+
+class TestDamaged:
+    """Whatever is in a file, an error of this package says so, or the system can be written."""
+
+    WORDS = (
+        "",
+        "nan",
+        "-1",
+        "1e999",
+        "x",
+        "../../x",
+        "input",
+        "output",
+        "a",
+        "Q_em",
+        "K",
+        "\u202e",
+    )
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_by_chance(self, pack, seed, tmp_path):
+        draw = random.Random(seed)
+        texts = [NESTED, LINKED, self.with_parameters()]
+        read = 0
+        for _ in range(40):
+            root = draw.choice(texts)
+            text = etree.tostring(
+                self.damaged(draw, etree.fromstring((HEAD + root + TAIL).encode()))
+            )
+            path = pack(text.decode().partition(">")[2].rpartition("<")[0] or root)
+            try:
+                system = FMUSystem.read(path)
+                again = FMUSystem.read(system.write(tmp_path / "again.ssp"))
+            except FMUGymError:
+                continue
+            read += 1
+            assert (again.links, again.connectors) == (system.links, system.connectors)
+        assert read
+
+    def with_parameters(self):
+        own = bindings(values({"T_m_0": real(20, "degC"), "A_f": real(3)}, prefix=""))
+        steps = (
+            '<ssd:Annotations><ssc:Annotation type="fmugym"><x steps="2"/></ssc:Annotation>'
+            "</ssd:Annotations>"
+        )
+        return system("r", {}, [component("h", HOUSE_PORTS, more=own + steps)])
+
+    def damaged(self, draw, root):
+        for _ in range(draw.randint(1, 4)):
+            elements = [one for one in root.iter() if one.getparent() is not None]
+            if not elements:
+                return root
+            one, other = draw.choice(elements), draw.choice(elements)
+            change = draw.randrange(5)
+            if change <= 1 and one.attrib:
+                one.set(draw.choice(list(one.attrib)), draw.choice(self.WORDS))
+            elif change == 2 and one.attrib:
+                del one.attrib[draw.choice(list(one.attrib))]
+            elif change == 3:
+                one.getparent().remove(one)
+            elif other not in list(one.iter()):
+                other.append(copy.deepcopy(one))
+        return root
 
 
 class TestWriting:

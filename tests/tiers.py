@@ -190,6 +190,7 @@ SLOW_TESTS = (
 
 EXHAUSTIVE_TESTS = (
     "test_examples_system.py",
+    "test_systems_ssp.py::TestDamaged",
     "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",

@@ -117,7 +117,7 @@ class _Reader:
                 self._fmu(element),
                 values[path],
                 element.interface,
-                int(element.own.get("steps", "1")),
+                _own_value(element.own, "steps", int) if "steps" in element.own else 1,
                 False if element.own.get("feedthrough") == "false" else None,
             )
             for path, element in flat.components.items()
@@ -189,11 +189,18 @@ def _experiment(root: Any) -> dict[str, float]:
 
 def _master(own: Mapping[str, str]) -> dict[str, Any]:
     """What fmugym has written about the way in which a system is run."""
-    texts = {name: own[name] for name in ("master", "loops") if name in own}
-    numbers = {
-        name: float(own[name])
-        for name in ("step_size", "tolerance", "loop_tolerance")
-        if name in own
-    }
-    counts = {name: int(own[name]) for name in ("loop_iterations",) if name in own}
-    return texts | numbers | counts
+    return {name: _own_value(own, name, kind) for name, kind in _OWN.items() if name in own}
+
+
+_OWN: Final[dict[str, type]] = {
+    **dict.fromkeys(("master", "loops"), str),
+    **dict.fromkeys(("step_size", "tolerance", "loop_tolerance"), float),
+    "loop_iterations": int,
+}
+
+
+def _own_value(own: Mapping[str, str], name: str, kind: type) -> Any:
+    try:
+        return kind(own[name])
+    except ValueError:
+        raise FMULoadError(f"{name} is {shown(own[name])}, expected a number") from None
