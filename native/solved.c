@@ -112,9 +112,9 @@ Status solved_do_step(const Library *library, void *component, double time, doub
 }
 
 Status solved_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values) {
+                  size_t count, void *values, size_t size) {
     const Solver *me = component;
-    return fmi_of(me)->get(library, me->component, type, references, count, values);
+    return fmi_of(me)->get(library, me->component, type, references, count, values, size);
 }
 
 static size_t size_of(const Fmi *fmi, Type type) {
@@ -144,14 +144,13 @@ static bool is_repeated(LastSet *last, const uint32_t *references, const void *v
 
 /* New values of inputs and parameters are an event: they may jump. */
 Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
+                  size_t count, const void *values, size_t size) {
     Solved *me = component;
     const Fmi *fmi = fmi_of(&me->solver);
-    const size_t size = count * size_of(fmi, type);
     Status status = STATUS_OK;
 
     if (me->solver.memory.mode != BEFORE_EVENTS) {
-        if (is_repeated(&me->last[type], references, values, size)) {
+        if (is_repeated(&me->last[type], references, values, size * size_of(fmi, type))) {
             return STATUS_OK;
         }
         if (me->solver.memory.mode == IN_CONTINUOUS_TIME) {
@@ -159,7 +158,7 @@ Status solved_set(const Library *library, void *component, Type type, const uint
         }
     }
     if (good(status)) {
-        status = fmi->set(library, me->solver.component, type, references, count, values);
+        status = fmi->set(library, me->solver.component, type, references, count, values, size);
     }
     if (!good(status)) {
         me->last[type].references = NULL;

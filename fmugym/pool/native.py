@@ -50,9 +50,9 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     record_from,
     solving_settings,
-    types_and_references,
     variable_settings,
     variables_of,
 )
@@ -190,8 +190,7 @@ class NativePool(SavingPool):
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
             is_exchange = self._fmu.description.model_exchange is not None
-            parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, is_exchange)
+            access = _native.Access(version, *listing(variables, version), is_exchange)
             self._accesses[variables] = access
         return access
 
@@ -313,7 +312,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(tuple(self._variables[name] for name in record.names))
+        access = self._access(tuple(self._variable(name) for name in record.names))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
@@ -608,7 +607,7 @@ class _Listener:
     def _tape(
         self,
         types: bytes,
-        references: bytes,
+        elements: bytes,
         starts: bytes,
         first_outputs: bytes,
         inputs: bytes,
@@ -616,8 +615,9 @@ class _Listener:
         statuses: bytes,
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
+        references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
         return Tape(
-            variables_of(self._description, types, np.frombuffer(references, np.uint32).tolist()),
+            variables_of(self._description, types, references, places),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import weakref
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,13 +44,13 @@ class SavingPool(AttendedPool):
     A subclass calls ``_prepare_saving`` in its constructor.
     """
 
-    _variables: Mapping[str, Variable]
+    _variable: Callable[[str], Variable]
     _offered = SaveMethod.REPLAY
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
         """Take over what saving needs; returns whether the pool must keep records."""
-        self._variables = description.variables
+        self._variable = description.variable
         self._offered = offered_method(description, spec)
         return spec.records or self._offered is not SaveMethod.STATE
 
@@ -198,7 +198,7 @@ class SavingPool(AttendedPool):
             mask = np.zeros(self.num_instances, np.bool_)
             for record, index in group:
                 values[:, index], mask[index] = record.starts, True
-            self.reset(tuple(self._variables[name] for name in names), values, mask)
+            self.reset(tuple(self._variable(name) for name in names), values, mask)
 
     def _step_again(self, records: Sequence[tuple[Record, int]]) -> None:
         inputs, skip = self.inputs.copy(), np.ones(self.num_instances, np.bool_)

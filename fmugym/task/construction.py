@@ -25,7 +25,7 @@ from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import OwnHooks
 from fmugym.task.inputs import InputWriter
-from fmugym.task.interface import checked, resolve, start_variable
+from fmugym.task.interface import resolve, start_values
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
@@ -252,17 +252,19 @@ class Constructed(Pictured):
     def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
         """Prepare the draws of episodes in which these parameters replace the config's."""
         parameters = dict(self._interface.parameters)
-        for name, value in overrides.items():
-            value = as_distribution(repr(name), value)
-            variable = start_variable(self.fmu.description, name, value)
+        given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
+        own = start_values(self.fmu.description, given)
+        for variable, value in own:
             if not variable.numeric:
-                raise ConfigError(f"{name!r} is a String: it can be set in the config only")
-            parameters[name] = checked(variable, value)
+                raise ConfigError(
+                    f"{variable.name!r} is a String: it can be set in the config only"
+                )
+            parameters[variable.name] = value
         return EpisodePlan(
             tuple(map(self.fmu.variable, parameters)),
             parameters,
             self.config.episode_variables,
-            overrides.keys(),
+            [variable.name for variable, _ in own],
         )
 
 

@@ -30,9 +30,9 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     record_from,
     solving_settings,
-    types_and_references,
     variable_settings,
 )
 from fmugym.pool.spec import ResetMethod
@@ -93,7 +93,7 @@ class _Writer:
         self.parts.append(np.ascontiguousarray(array, dtype).tobytes())
 
     def access(self, variables: Sequence[Variable], version: int) -> None:
-        for part in types_and_references(variables, version):
+        for part in listing(variables, version):
             self.block(part)
 
     def optional(self, number: float | None) -> None:
@@ -307,16 +307,17 @@ class ProgramCoding:
         if reader.is_done:
             return None
         starts = [
-            (reader.integer(), reader.integer(), reader.number()) for _ in range(reader.integer())
+            (reader.integer(), reader.integer(), reader.integer(), reader.number())
+            for _ in range(reader.integer())
         ]
         steps = reader.integer()
         setup = self._setup
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
 
     def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
-        variables = self._setup.description.variables
+        variable = self._setup.description.variable
         writer.integers(index, len(record.inputs))
-        writer.access([variables[name] for name in record.names], self._version)
+        writer.access([variable(name) for name in record.names], self._version)
         for values in (record.starts, record.inputs):
             writer.block(np.ascontiguousarray(values, np.float64).tobytes())
 
