@@ -212,8 +212,8 @@ class Arrays(TypedDict):
     last_initialization: Array
 
 Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
-"""An episode: types and elements (see ``Access``) of the start variables, start values, first outputs, and rows of
-inputs, of outputs and of statuses."""
+"""An episode: types and elements (see ``Access``) of the start variables, start values, first
+outputs, and rows of inputs, of outputs and of statuses."""
 
 class Episodes(TypedDict):
     """See ``NativePool.prepare_play``."""
@@ -455,7 +455,9 @@ class Pool:
     def record_of(
         self, index: int, /
     ) -> tuple[tuple[tuple[int, int, int, float], ...], int, bytes] | None:
-        """The start values (type, reference, place, value), number of steps, and inputs of an episode.
+        """The start values, number of steps, and inputs of an episode.
+
+        A start value is a type, value reference, place in an array, and value.
 
         Returns:
             None if the episode is not known as a whole.

@@ -103,12 +103,20 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
 
 
 def _found(pattern: str, known: Sequence[str], others: Iterable[str]) -> list[str]:
-    """The names that a glob finds; constants and parameters must be named in full."""
-    found = [name for name in known if matches(pattern, name)]
-    found += [name for name in others if name == pattern and name not in found]
+    """The names that a glob finds; constants and parameters must be named in full.
+
+    The name of an array stands for its elements.
+    """
+    found = [name for name in known if matches(pattern, name) or _array_of(name) == pattern]
+    found += [n for n in others if pattern in {n, _array_of(n)} and n not in found]
     if not found:
         raise unknown_name("variable to record", pattern, [*known, *others])
     return found
+
+
+def _array_of(name: str) -> str:
+    """The name of the array of which this is an element; "" if it is none."""
+    return name.rpartition("[")[0] if name.endswith("]") else ""
 
 
 def _varies(variable: Variable) -> bool:

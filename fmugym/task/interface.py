@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.checks import LARGEST_COUNT, check_number, flattened
+from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -211,7 +211,8 @@ def _by_scalar(
         ConfigError: If a name is not that of any of the allowed variables.
     """
     names = {variable.name for variable in allowed}
-    arrays, scalars = {}, {}
+    arrays: dict[str, _Value] = {}
+    scalars: dict[str, _Value] = {}
     for name, value in given.items():
         meant = [v.name for v in _known_scalars(description, name) if v.name in names]
         if not meant:
@@ -395,7 +396,8 @@ def checked_value(variable: Variable, value: Any) -> float:
     if variable.kind == "boolean" and number not in {0.0, 1.0}:
         raise ConfigError(f"{variable.name!r} is a Boolean, got {number}")
     if variable.kind in {"integer", "enumeration"}:
-        _check_integer(variable, number)
+        whole = integer_of(value)  # which no float has rounded
+        _check_integer(variable, number if whole is None else whole)
     return number
 
 
@@ -408,7 +410,7 @@ def _item_value(variable: Variable, name: str) -> float:
 
 def _check_integer(variable: Variable, number: float) -> None:
     low, high = variable.integer_limits
-    if not number.is_integer() or not low <= number <= high:
+    if not float(number).is_integer() or not low <= number <= high:
         raise ConfigError(
             f"{variable.name!r} is of type {variable.type}: expected an integer from {low} to "
             f"{high}, got {number}"

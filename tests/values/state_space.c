@@ -112,7 +112,8 @@ static double *find(Model *me, unsigned reference, size_t *count, double *memory
 }
 
 static bool is_settable(const Model *me, unsigned reference) {
-    return reference == U || (reference >= A && reference <= X_0 && me->mode != RUNNING);
+    return reference == U || (reference >= A && reference < X_0) ||
+           (reference == X_0 && me->mode != RUNNING);
 }
 
 Model *fmi3InstantiateModelExchange(const char *name, const char *token, const char *resources,
