@@ -97,7 +97,7 @@ class Access:
             bytes of native 32-bit integers.
         rest: The values of the last of them, which are no part of the list but needed to set whole
             arrays, as bytes of float64.
-        is_exchange: Whether the FMU is run by model exchange.
+        manner: How the FMU is run; see ``fmi.h``.
     """
 
     def __new__(
@@ -106,7 +106,7 @@ class Access:
         types: bytes,
         elements: bytes,
         rest: bytes,
-        is_exchange: bool = False,
+        manner: int = 0,
         /,
     ) -> Access: ...
 
@@ -160,6 +160,7 @@ class Library(TypedDict):
     """What the FMU is and how its instances are made."""
 
     version: int
+    manner: int
     model: bytes
     token: bytes
     resources: bytes

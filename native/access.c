@@ -234,6 +234,9 @@ static void store(const Part *part, Type type, const double *values, void *typed
 /* A Boolean is a char in FMI 1.0, an int in FMI 2.0, a C bool in FMI 3.0. */
 static Type stored_type(const Access *access, const Group *group) {
     const Type boolean = access->fmi->boolean_size == 1 ? TYPE_UINT8 : TYPE_INT32;
+    if (group->type == TYPE_CLOCK) {
+        return TYPE_UINT8;
+    }
     return group->type == TYPE_BOOLEAN ? boolean : group->type;
 }
 

@@ -35,6 +35,7 @@ typedef enum {
     TYPE_UINT32,
     TYPE_UINT64,
     TYPE_BOOLEAN,
+    TYPE_CLOCK, /* whether it ticks; FMI 3.0 */
     NUMBER_OF_TYPES
 } Type;
 
@@ -57,10 +58,12 @@ typedef struct {
     bool has_tolerance;
 } Experiment;
 
-/* A callback that sets the start values and returns a status. */
+/* Callbacks for initialization; each returns a status. */
 typedef struct {
-    Status (*set)(void *context);
+    Status (*set)(void *context); /* sets the start values */
     void *context;
+    Status (*prepare)(void *prepared); /* in initialization mode of FMI 3.0, or NULL */
+    void *prepared;
 } StartValues;
 
 typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
@@ -133,11 +136,13 @@ typedef struct Fmi {
                           void **state);
 } Fmi;
 
-/* Of co-simulation and of model exchange. */
-extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3;
+/* How an FMU is run. fmugym/pool/settings.py has the same numbers. */
+typedef enum { CO_SIMULATION_ALONE, MODEL_EXCHANGE_SOLVED, CO_SIMULATION_WITH_EVENTS } Manner;
 
-/* NULL if there is no such version. */
-const Fmi *fmi_table(int64_t version, bool exchange);
+extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
+
+/* NULL if the version has no such manner. */
+const Fmi *fmi_table(int64_t version, int64_t manner);
 
 static inline bool has_outputs(Outcome outcome) {
     return outcome.stage == DOING_STEP &&

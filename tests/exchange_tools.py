@@ -58,7 +58,7 @@ def names(model):
     return [*states, *(f"der({name})" for name in states), *OTHERS[model]]
 
 
-def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags=""):
+def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags="", options=()):
     """Write an FMU.
 
     Args:
@@ -67,21 +67,24 @@ def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags=""
         version: Of FMI.
         interfaces: The elements of those that it offers.
         flags: More attributes of each.
+        options: More arguments of the compiler.
     """
     files = {
         "modelDescription.xml": describe(model, version, interfaces, flags),
-        fmu_tools.library_name(version, "Model"): library(model, version),
+        fmu_tools.library_name(version, "Model"): library(model, version, options),
     }
     return fmu_tools.write_fmu(Path(path), files)
 
 
-def library(model, version):
+def library(model, version, options=()):
     """The compiled library of a model for a version of FMI."""
     shim = f"exchange/fmi{version}.c"
     prefix = "Model_fmi" if version == 1 else f"fmi{version}"
     stubs = fmu_tools.stubs(version, prefix, building.HERE / shim)
     sources = [f"exchange/{name}.c" for name in ("core", "usual", model)]
-    return building.library(*sources, shim, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
+    return building.library(
+        *sources, shim, flags=(f"-DFMI_VERSION={version}", *options), stubs=stubs
+    )
 
 
 def describe(model, version, interfaces=("ModelExchange",), flags=""):

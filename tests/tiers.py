@@ -28,6 +28,7 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_value_types",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -56,6 +57,7 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,
 }

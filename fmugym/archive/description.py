@@ -18,7 +18,15 @@ import fmpy
 
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["INTERFACES", "Capabilities", "ModelDescription", "ModelExchange", "Unit", "Variable"]
+__all__ = [
+    "CLOCK_KINDS",
+    "INTERFACES",
+    "Capabilities",
+    "ModelDescription",
+    "ModelExchange",
+    "Unit",
+    "Variable",
+]
 
 INTERFACES = ("co_simulation", "model_exchange")
 """The interfaces by which an FMU may be run, the preferred one first."""
@@ -32,7 +40,7 @@ _KINDS = {
     "Enumeration": "enumeration",
     "String": "string",
     "Binary": "binary",
-    "Clock": "clock",
+    "Clock": "boolean",
 }
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 
@@ -42,6 +50,17 @@ MOST_ELEMENTS: Final = 100_000
 
 _ELEMENT: Final = re.compile(r"(.+)\[(\d{1,9}(?:, ?\d{1,9})*)\]")
 """The name of an element: that of its array, and its indices."""
+
+CLOCK_KINDS = (
+    "constant",
+    "fixed",
+    "calculated",
+    "tunable",
+    "changing",
+    "countdown",
+    "triggered",
+)
+"""The interval variabilities of clocks. Those before the last one have ticks of their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +76,10 @@ class Variable:
         shape: The shape of an array (FMI 3.0); () for a scalar.
         array: Of an element of an array, the array; None for other variables.
         place: Of an element, its place in the array, in row-major order.
+        clocks: The value references of the clocks that must tick whenever the value changes.
+        ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
+        interval, shift: Of a clock: the time between its ticks and that before the first one in
+            seconds; NaN where only the FMU knows.
     """
 
     name: str
@@ -75,10 +98,17 @@ class Variable:
     shape: tuple[int, ...] = ()
     array: Variable | None = None
     place: int = 0
+    clocks: tuple[int, ...] = ()
+    ticking: str = ""
+    interval: float = math.nan
+    shift: float = math.nan
 
     @property
     def kind(self) -> str:
-        """One of real, integer, boolean, enumeration, string, binary and clock."""
+        """One of real, integer, boolean, enumeration, string and binary.
+
+        A clock is a Boolean: whether it ticks.
+        """
         return _KINDS.get(self.type, "integer")
 
     @property
@@ -94,7 +124,7 @@ class Variable:
     @property
     def settable_at_start(self) -> bool:
         """Whether a value may be set between instantiation and initialization."""
-        if self.variability == "constant":
+        if self.variability == "constant" or self.ticking:
             return False
         return self.causality == "input" or self.initial in {"exact", "approx"}
 
@@ -102,7 +132,15 @@ class Variable:
     def settable_in_step(self) -> bool:
         """Whether a value may be set between two steps."""
         tunable = self.causality == "parameter" and self.variability == "tunable"
+        if self.ticking:
+            return self.causality == "input" and self.ticking == "triggered"
         return self.causality == "input" or tunable
+
+    @property
+    def number(self) -> int:
+        """Of a clock: its kind as ``enum ClockKind`` of ``native/clocks.h``."""
+        is_output = self.ticking == "triggered" and self.causality != "input"
+        return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
 
     @property
     def start_number(self) -> float:
@@ -264,6 +302,7 @@ class ModelDescription:
         findings: Rules of the standard that the file breaks, as texts.
         error_categories: The declared log categories of errors and warnings.
         units: The units that the XML defines, by name.
+        has_event_mode: Whether the FMU offers event mode in co-simulation.
     """
 
     fmi_version: str
@@ -286,11 +325,39 @@ class ModelDescription:
     units: Mapping[str, Unit] = field(default_factory=dict)
     interface: str = "co_simulation"
     model_exchange: ModelExchange | None = None
+    has_event_mode: bool = False
 
     @cached_property
     def fmi_major_version(self) -> int:
         """1, 2 or 3."""
         return int(self.fmi_version.split(".")[0])
+
+    @cached_property
+    def uses_event_mode(self) -> bool:
+        """Whether the pool handles events between the FMU's steps, in co-simulation of FMI 3.0.
+
+        It does so where only this gives them their time: where the FMU has clocks or discrete
+        inputs. Other FMUs handle their events within their steps.
+        """
+        needed = any(
+            variable.ticking or (variable.causality, variable.variability) == ("input", "discrete")
+            for variable in self.variables.values()
+        )
+        return self.has_event_mode and needed
+
+    @cached_property
+    def clocks(self) -> tuple[Variable, ...]:
+        """The clocks that tick; none where neither the pool nor model exchange has events."""
+        if not self.uses_event_mode and self.model_exchange is None:
+            return ()
+        return tuple(v for v in self.variables.values() if v.ticking and not v.shape)
+
+    @cached_property
+    def clocked_inputs(self) -> tuple[Variable, ...]:
+        """The inputs that may be set only while one of their clocks ticks."""
+        known = {clock.value_reference for clock in self.clocks}
+        inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
+        return tuple(v for v in inputs if known.issuperset(v.clocks))
 
     @property
     def has_reset(self) -> bool:

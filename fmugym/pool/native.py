@@ -51,6 +51,7 @@ from fmugym.pool.settings import (
     experiment_settings,
     library_settings,
     listing,
+    manner_of,
     record_from,
     solving_settings,
     variable_settings,
@@ -189,8 +190,8 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
-            is_exchange = self._fmu.description.model_exchange is not None
-            access = _native.Access(version, *listing(variables, version), is_exchange)
+            manner = manner_of(self._fmu.description)
+            access = _native.Access(version, *listing(variables, version), manner)
             self._accesses[variables] = access
         return access
 

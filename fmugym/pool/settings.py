@@ -6,7 +6,9 @@ program for Windows.
 
 from __future__ import annotations
 
+import math
 import os
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,7 @@ __all__ = [
     "experiment_settings",
     "library_settings",
     "listing",
+    "manner_of",
     "record_from",
     "solving_settings",
     "variable_settings",
@@ -43,9 +46,12 @@ _TYPES: Final = (
     "UInt32",
     "UInt64",
     "Boolean",
+    "Clock",
 )
 """The C types in the order of ``enum Type`` of ``native/fmi.h``."""
 
+_CLOCK: Final = struct.Struct("=IIdd")
+_CLOCKED: Final = struct.Struct("=II")
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
 
@@ -94,6 +100,7 @@ def library_settings(description: ModelDescription, place: PlaceOfFMU) -> dict[s
     """What to load, and what is known of it."""
     return {
         "version": description.fmi_major_version,
+        "manner": manner_of(description),
         "model": description.model_identifier.encode(),
         "token": description.instantiation_token.encode(),
         "resources": place.resources,
@@ -135,8 +142,11 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
 def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
     """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
     model = description.model_exchange
+    clocks = clocks_of(description)
     if model is None:
-        return None
+        if not description.uses_event_mode:
+            return None
+        return (b"by_fmu", 1.0, math.inf, 0, 0, False, None, None, *clocks)
     solving, states, rates = spec.solving, None, None
     if description.capabilities.provides_directional_derivatives and model.state_references:
         states = np.array(model.state_references, np.uint32).tobytes()
@@ -150,6 +160,28 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
         model.needs_completed_integrator_step,
         states,
         rates,
+        *clocks,
+    )
+
+
+def manner_of(description: ModelDescription) -> int:
+    """The number of the way in which the FMU is run, one of ``enum Manner`` of ``native/fmi.h``."""
+    if description.model_exchange is not None:
+        return 1
+    return 2 if description.uses_event_mode else 0
+
+
+def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
+    """The arrays of ``Clock`` and ``Clocked`` of ``native/clocks.h``."""
+    clocks = description.clocks
+    indices = {clock.value_reference: index for index, clock in enumerate(clocks)}
+    return (
+        b"".join(_CLOCK.pack(c.value_reference, c.number, c.interval, c.shift) for c in clocks),
+        b"".join(
+            _CLOCKED.pack(variable.value_reference, indices[reference])
+            for variable in description.clocked_inputs
+            for reference in variable.clocks
+        ),
     )
 
 

@@ -186,7 +186,9 @@ def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[
 
 
 def _resolved(
-    description: ModelDescription, names: Sequence[str], check: Callable[[Variable], None]
+    description: ModelDescription,
+    names: Sequence[str],
+    check: Callable[[ModelDescription, Variable], None],
 ) -> tuple[Variable, ...]:
     """Look up the scalars that names stand for, each at most once."""
     found: dict[Variable, str] = {}
@@ -194,7 +196,7 @@ def _resolved(
         for variable in description.scalars(name):
             if variable in found:
                 raise ConfigError(f"{variable.name!r} is named twice: it is in {found[variable]!r}")
-            check(variable)
+            check(description, variable)
             found[variable] = name
     return tuple(found)
 
@@ -303,16 +305,22 @@ def input_variable(description: ModelDescription, name: str) -> Variable:
         ConfigError: If no variable has this name, or it must not be written before a step.
     """
     variable = description.variable(name)
-    _check_input(variable)
+    _check_input(description, variable)
     return variable
 
 
-def _check_input(variable: Variable) -> None:
+def _check_input(description: ModelDescription, variable: Variable) -> None:
     _require_numeric(variable, "an input")
+    _require_known_clock(description, variable, "an input")
     if not variable.settable_in_step:
         raise ConfigError(
             f"{variable.name!r} cannot be an input: it is a {variable.variability} "
             f"{variable.causality}; only inputs and tunable parameters may be set between steps"
+        )
+    if variable.array is not None and description.clocks:
+        raise ConfigError(
+            f"{variable.name!r} cannot be an input: it is an element of an array, and inputs of "
+            f"FMUs with clocks must be scalars, as in {description.model_name}"
         )
 
 
@@ -323,12 +331,29 @@ def output_variable(description: ModelDescription, name: str) -> Variable:
         ConfigError: If no variable has this name, or a float cannot hold its value.
     """
     variable = description.variable(name)
-    _check_output(variable)
+    _check_output(description, variable)
     return variable
 
 
-def _check_output(variable: Variable) -> None:
+def _check_output(description: ModelDescription, variable: Variable) -> None:
     _require_numeric(variable, "an output")
+    _require_known_clock(description, variable, "an output")
+
+
+def _require_known_clock(description: ModelDescription, variable: Variable, role: str) -> None:
+    if not variable.ticking:
+        return
+    if variable not in description.clocks:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is a clock, and {description.model_name} has "
+            "no event mode in co-simulation"
+        )
+    if role == "an input" and not variable.settable_in_step:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is a clock of "
+            f"causality={variable.causality!r} and intervalVariability={variable.ticking!r}, which "
+            "ticks by itself; only triggered input clocks may be set"
+        )
 
 
 def _require_numeric(variable: Variable, role: str) -> None:
@@ -354,6 +379,8 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
 
 def _check_start(variable: Variable, value: Any) -> None:
     name = variable.name
+    if variable.ticking:
+        raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
     if not variable.settable_at_start:
         raise ConfigError(
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "

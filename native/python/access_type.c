@@ -4,8 +4,8 @@
 
 PyTypeObject *access_type;
 
-const Fmi *fmi_of(int version, bool exchange) {
-    const Fmi *fmi = fmi_table(version, exchange);
+const Fmi *fmi_of(int version, int manner) {
+    const Fmi *fmi = fmi_table(version, manner);
 
     if (fmi == NULL) {
         PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);
@@ -25,15 +25,15 @@ bool is_access(const PyPool *self, PyObject *object) {
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     const char *types, *elements, *rest;
     Py_ssize_t count, size, size_of_rest;
-    int version, exchange = 0;
+    int version, manner = CO_SIMULATION_ALONE;
     Listing listing;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "iy#y#y#|p", &version, &types, &count, &elements, &size, &rest,
-                          &size_of_rest, &exchange)) {
+    if (!PyArg_ParseTuple(args, "iy#y#y#|i", &version, &types, &count, &elements, &size, &rest,
+                          &size_of_rest, &manner)) {
         return NULL;
     }
-    const Fmi *fmi = fmi_of(version, exchange);
+    const Fmi *fmi = fmi_of(version, manner);
     if (fmi == NULL) {
         return NULL;
     }

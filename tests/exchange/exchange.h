@@ -12,6 +12,10 @@ enum { OK, WARNING, DISCARD, ERROR };
 enum { INSTANTIATED, INITIALIZING, EVENT, CONTINUOUS, STEPPING, TERMINATED };
 enum { MOST = 32 };
 
+#ifndef EARLY
+#define EARLY INFINITY
+#endif
+
 typedef struct {
     double v[MOST]; /* the variables */
     double time;

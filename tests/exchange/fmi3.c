@@ -52,7 +52,8 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
                bool *terminate, bool *early, double *last) {
     const int status = core_do_step(me, time, step);
 
-    *event = *early = false;
+    *event = false;
+    *early = !me->stops && me->time < time + step - 1e-9;
     *terminate = me->stops;
     *last = me->time;
     return status == DISCARD ? OK : status;

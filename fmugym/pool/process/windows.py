@@ -31,6 +31,7 @@ from fmugym.pool.settings import (
     experiment_settings,
     library_settings,
     listing,
+    manner_of,
     record_from,
     solving_settings,
     variable_settings,
@@ -221,7 +222,7 @@ class ProgramCoding:
         place = PlaceOfFMU.in_wine(
             setup.folder, setup.folder / setup.library, description.fmi_major_version
         )
-        writer.integers(description.fmi_major_version)
+        writer.integers(description.fmi_major_version, manner_of(description))
         _write_solving(writer, solving_settings(description, spec))
         _write_library(writer, library_settings(description, place), setup.log_level)
         experiment = experiment_settings(spec)
@@ -347,13 +348,13 @@ def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) 
 def _write_solving(writer: _Writer, solving: tuple[Any, ...] | None) -> None:
     writer.flags(solving is not None)
     if solving is not None:
-        name, tolerance, max_step, states, indicators, completes, references, rates = solving
+        name, tolerance, max_step, states, indicators, completes, *blocks = solving
         writer.text(name)
         writer.numbers(tolerance, max_step)
         writer.integers(states, indicators)
         writer.flags(completes)
-        writer.block(references or b"")
-        writer.block(rates or b"")
+        for block in blocks:
+            writer.block(block or b"")
 
 
 def _write_texts(writer: _Writer, texts: Sequence[bytes]) -> None:
