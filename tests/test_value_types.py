@@ -395,6 +395,30 @@ def test_series(state_space):
     env.close()
 
 
+def test_a_task_file_names_elements(state_space, tmp_path):
+    (tmp_path / "task.toml").write_text(
+        f"""
+        fmu = "{state_space}"
+        time_step = 0.1
+        [variables]
+        total = {{ name = "y[3]" }}
+        [agent]
+        actions = ["u[1]"]
+        observations = ["total", "x[2]"]
+        [reward]
+        near = "-total**2"
+        [parameters]
+        "A[1,2]" = {{ distribution = "uniform", low = 0.25, high = 0.5 }}
+        """
+    )
+    env = fmugym.load(tmp_path / "task.toml")
+    observation, _ = env.reset(seed=0)
+    assert env.observation_names == ("total", "x[2]")
+    assert observation == pytest.approx([env.out["y[3]"], env.out["x[2]"]])
+    assert 0.25 <= env.parameters["A[1,2]"] <= 0.5
+    env.close()
+
+
 def test_the_contract(state_space):
     env = state_space_env(state_space, model_parameters={"A": [[-1, 0.5], [0, -2]]})
     check_fmu_env(env, num_steps=20)

@@ -396,6 +396,13 @@ class ModelDescription:
         array = None if match is None else self.variables.get(match[1])
         return (array, match[2]) if array and match and array.shape else (None, "")
 
+    def find(self, name: str) -> Variable | None:
+        """Do what ``variable`` does, but return None if there is no such variable."""
+        try:
+            return self.variable(name)
+        except ConfigError:
+            return None
+
     def scalars(self, name: str) -> tuple[Variable, ...]:
         """Look up the scalars that a name stands for.
 
