@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -141,6 +141,15 @@ class Task:
         """The name of the file; ``"task"`` for a dict."""
         path = self.sources[0].path
         return "task" if path is None else path.name
+
+    def with_paths(self, path_of: Callable[[str], str]) -> dict[str, Any]:
+        """Return what the task declares, with other paths of its files.
+
+        Args:
+            path_of: Takes the absolute path of the FMU or of a file of data, and returns the new
+                one.
+        """
+        return _mapped_paths(dict(self.document), path_of)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the task to a new TOML file. Reading the file gives an equal task.

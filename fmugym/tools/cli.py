@@ -7,7 +7,12 @@
     fmugym validate TASK|model.fmu
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
     fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
-        [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb] [KEY=VALUE ...]
+        [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb]
+        [--record GLOB ...] [--record-env N ...] [--record-every SECONDS] [--record-format csv]
+        [KEY=VALUE ...]
+    fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
+        [--output tuned.toml] [--name NAME]
+    fmugym export AGENT --task TASK --output agent.c [--algorithm PPO] [--all-inputs]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
@@ -67,6 +72,8 @@ from importlib.metadata import version
 from typing import Final
 
 from fmugym.errors import FMUGymError
+from fmugym.tools.exporting import add_export
+from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_skeleton, add_stand_in, add_validate
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import note
@@ -78,8 +85,8 @@ __all__ = ["main"]
 _INTERRUPTED: Final = 130
 
 _COMMANDS: Final = (
-    *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_record),
-    *(add_bench, add_demo, add_skeleton, add_stand_in),
+    *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
+    *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in),
 )
 
 

@@ -41,6 +41,7 @@ from fmugym.vector.hooks.tables import Table, is_table, tables_in
 __all__ = [
     "SeenArray",
     "TracedTask",
+    "Tracer",
     "in_hook",
     "require_unchanged",
     "tables_of",
@@ -110,10 +111,10 @@ def trace_hooks(
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
     with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
-        return _Tracer(env, attributes).task()
+        return Tracer(env, attributes).task()
 
 
-class _Tracer:
+class Tracer:
     """Calls the hooks of one environment with symbols.
 
     Args:
