@@ -14,7 +14,7 @@ static bool are_sound(const char *types, const char *elements, size_t count) {
     for (size_t i = 0; i < count; i++) {
         Element element;
         memcpy(&element, elements + i * sizeof element, sizeof element);
-        if ((uint8_t)types[i] >= NUMBER_OF_TYPES || element.place >= element.size) {
+        if (!is_type((uint8_t)types[i]) || element.place >= element.size) {
             return false;
         }
     }
@@ -68,7 +68,9 @@ static void share_memory(Access *access, size_t all) {
     uint32_t *place = access->memory;
 
     for (size_t i = 0; i < all; i++) {
-        group_of(access, (Type)access->types[i])->count++;
+        if (access->types[i] != START_TIME) {
+            group_of(access, (Type)access->types[i])->count++;
+        }
     }
     for (size_t i = 0; i < access->number_of_groups; i++) {
         Group *group = &access->groups[i];
@@ -105,9 +107,10 @@ static void add(Group *group, Part *part, const Element *element, size_t positio
 static bool is_direct(const Access *access) {
     const Group *group = access->groups;
     bool direct = access->number_of_groups == 1 && group->type == TYPE_FLOAT64 &&
-                  group->size == access->count && group->rest.count == 0;
+                  group->size == group->listed.count && group->rest.count == 0 &&
+                  (access->start_time < 0 || access->start_time == (ptrdiff_t)access->count - 1);
 
-    for (size_t i = 0; direct && i < access->count; i++) {
+    for (size_t i = 0; direct && i < group->listed.count; i++) {
         direct = group->listed.places[i] == i;
     }
     return direct;
@@ -129,11 +132,16 @@ bool access_open(Access *access, const Fmi *fmi, const Listing *listing) {
     access->fmi = fmi;
     access->id = 1 + atomic_add(&next_id, 1);
     access->count = listing->count;
+    access->start_time = -1;
     if (!allocate(access, listing)) {
         return false;
     }
     share_memory(access, all);
     for (size_t i = 0; i < listing->count; i++) {
+        if (access->types[i] == START_TIME) {
+            access->start_time = (ptrdiff_t)i;
+            continue;
+        }
         Group *group = group_of(access, (Type)access->types[i]);
         add(group, &group->listed, &access->variables[i], i);
     }

@@ -5,6 +5,10 @@
 
 #include "fmi.h"
 
+/* What stands in a list of variables in the place of a type, where the value is no variable's but the
+ * start time of the episode. */
+enum { START_TIME = 255 };
+
 /* A variable: a scalar, or one element of an array. */
 typedef struct {
     uint32_t reference;
@@ -35,6 +39,7 @@ typedef struct {
     size_t width; /* the larger of count and the most values of a group */
     size_t number_of_groups;
     bool direct;        /* all values are doubles: the FMU uses the list's own memory */
+    ptrdiff_t start_time; /* position of the start time, or -1 */
     Element *variables; /* in the order of the list */
     uint8_t *types;
     double *rest;     /* the values of the elements that are not listed */
@@ -52,13 +57,18 @@ typedef struct {
     size_t number_of_rest;
 } Listing;
 
+/* Whether a byte is a Type or START_TIME. */
+static inline bool is_type(uint8_t type) {
+    return type < NUMBER_OF_TYPES || type == START_TIME;
+}
+
 /* Checks blocks of bytes and takes a listing from them, which refers to them. Returns what is wrong
  * with them, or NULL. */
 const char *listing_take(Listing *listing, const char *types, size_t count, const char *elements,
                          size_t size, const char *rest, size_t size_of_rest);
 
-/* Groups the variables by type, in the order in which the types first appear. Returns whether
- * there was enough memory. */
+/* Groups the variables by type, in the order in which the types first appear. The start time belongs
+ * to no group. Returns whether there was enough memory. */
 bool access_open(Access *access, const Fmi *fmi, const Listing *listing);
 void access_close(Access *access);
 

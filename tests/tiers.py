@@ -31,6 +31,7 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_start_times",
     "test_value_types",
     "test_without_native",
 }
@@ -60,6 +61,7 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_start_times": 5,
     "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,

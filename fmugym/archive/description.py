@@ -41,6 +41,7 @@ _KINDS = {
     "String": "string",
     "Binary": "binary",
     "Clock": "boolean",
+    "StartTime": "real",  # no type of FMI; see ``fmugym.pool.spec.START_TIME``
 }
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 

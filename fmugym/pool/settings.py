@@ -19,7 +19,7 @@ import numpy as np
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.fmi.access import unlisted
 from fmugym.pool.bundle import Record
-from fmugym.pool.spec import SAMPLINGS, PoolSpec, ResetMethod
+from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.wine.loader import windows_path, windows_uri
 
 __all__ = [
@@ -50,8 +50,12 @@ _TYPES: Final = (
 )
 """The C types in the order of ``enum Type`` of ``native/fmi.h``."""
 
+_START_TIME: Final = 255
+"""Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
+
 _CLOCK: Final = struct.Struct("=IIdd")
 _CLOCKED: Final = struct.Struct("=II")
+
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
 
@@ -201,6 +205,8 @@ def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, 
 
 
 def _type_number(variable: Variable, version: int) -> int:
+    if is_start_time(variable):
+        return _START_TIME
     if variable.kind == "enumeration":
         return _TYPES.index("Int64" if version == 3 else "Int32")
     return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
@@ -219,6 +225,7 @@ def variables_of(
         for v in description.variables.values()
         if v.is_number
     }
+    known[_START_TIME, START_TIME.value_reference] = START_TIME
     return tuple(
         known[type_, reference].elements[place]
         for type_, reference, place in zip(types, references, places, strict=True)

@@ -13,7 +13,12 @@ from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.pool.spec import FIXED_STEP_SOLVERS, PoolSpec, whole_number_of_steps
+from fmugym.pool.spec import (
+    FIXED_STEP_SOLVERS,
+    START_TIME,
+    PoolSpec,
+    whole_number_of_steps,
+)
 
 __all__ = [
     "Interface",
@@ -34,7 +39,16 @@ _LARGEST_EXACT_INTEGER: Final = 2.0**53
 
 @dataclass(frozen=True)
 class Interface:
-    """A config with its names looked up in one FMU."""
+    """A config with its names looked up in one FMU.
+
+    Attributes:
+        inputs, outputs, monitors: The variables.
+        parameters: The numeric parameters and their values or distributions by name, a start time
+            that is drawn last.
+        strings: The parameters that are texts.
+        config: The config.
+        description: That of the FMU.
+    """
 
     inputs: tuple[Variable, ...]
     outputs: tuple[Variable, ...]
@@ -62,6 +76,34 @@ class Interface:
             )
         return step
 
+    def parameter(self, name: str) -> Variable:
+        """The variable of one of the parameters, to which a start time belongs if it is drawn.
+
+        Raises:
+            ConfigError: If the FMU has no variable of this name.
+        """
+        if name == "start_time" and self.config.draws_start_time:
+            return START_TIME
+        return self.description.variable(name)
+
+    def start_values(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Check the parameters of episodes, by the names of scalars and elements.
+
+        Raises:
+            ConfigError: If a name is unknown, or its variable cannot start with the value, or is a
+                String.
+        """
+        own = {n: v for n, v in given.items() if n == "start_time" and self.config.draws_start_time}
+        values = {name: checked(START_TIME, value) for name, value in own.items()}
+        rest = {name: value for name, value in given.items() if name not in own}
+        for variable, value in start_values(self.description, rest):
+            if not variable.numeric:
+                raise ConfigError(
+                    f"{variable.name!r} is a String: it can be set in the config only"
+                )
+            values[variable.name] = value
+        return values
+
     def bounds(self, variable: Variable) -> tuple[float, float]:
         """The limits of a variable: the config's, or else the FMU's.
 
@@ -87,14 +129,14 @@ class Interface:
         """
         config, description = self.config, self.description
         self._require_retries()
-        start = config.start_time
+        start, drawn = config.start_time, config.draws_start_time
         return PoolSpec(
             inputs=self.inputs,
             outputs=self.outputs + self.monitors,
             time_step=self.time_step,
             num_observed=len(self.outputs),
             substeps=config.substeps,
-            start_time=description.start_time if start is None else start,
+            start_time=description.start_time if start is None or drawn else start,
             stop_time=config.stop_time,
             tolerance=description.tolerance if config.tolerance is None else config.tolerance,
             warm_up_steps=self._warm_up_steps(),
@@ -157,6 +199,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         ConfigError: If a name is unknown, or its variable cannot be used in that role.
     """
     given = start_values(description, config.model_parameters)
+    drawn = {"start_time": config.start_time} if config.draws_start_time else {}
     inputs = _resolved(description, config.model_input_names, _check_input)
     read = outputs_named(description, config.model_output_names + config.monitor_names)
     monitors = outputs_named(description, config.monitor_names)
@@ -167,7 +210,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         inputs=inputs,
         outputs=outputs,
         monitors=monitors,
-        parameters={v.name: value for v, value in given if v.numeric},
+        parameters={v.name: value for v, value in given if v.numeric} | drawn,
         strings=tuple((v, value) for v, value in given if not v.numeric),
         config=config,
         description=description,
