@@ -10,7 +10,9 @@ SLOW_MODULES = {
     "test_call_order",
     "test_cli_docs",
     "test_cli_tuning",
+    "test_compile",
     "test_copies",
+    "test_events",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
@@ -25,6 +27,7 @@ SLOW_MODULES = {
     "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
+    "test_nested_fmus",
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
@@ -178,6 +181,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )

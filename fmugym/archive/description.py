@@ -245,6 +245,12 @@ class Capabilities:
     provides_directional_derivatives: bool = False
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
+    provides_adjoint_derivatives: bool = False
+
+    @property
+    def provides_derivatives(self) -> bool:
+        """Whether the FMU differentiates itself, in one way or the other."""
+        return self.provides_directional_derivatives or self.provides_adjoint_derivatives
 
 
 @dataclass(frozen=True)
