@@ -413,13 +413,16 @@ class Pool:
             The index of an instance that failed, or -1.
         """
 
-    def bundle(self, indices: Array, ends: Array, steps: Array, /) -> bytes | int:
+    def bundle(
+        self, indices: Array, ends: Array, steps: Array, start_times: Array, /
+    ) -> bytes | int:
         """Serialize the states of M instances.
 
         Args:
             indices: The instances, int64, shape (M,).
             ends: Filled with where each state ends, int64, shape (M,).
             steps: Filled with the communication steps of each, int64, shape (M,).
+            start_times: Filled with the first communication point of each, float64, shape (M,).
 
         Returns:
             The states one after the other, or the index of an instance that failed.
@@ -432,6 +435,7 @@ class Pool:
         data: bytes,
         ends: Array,
         steps: Array,
+        start_times: Array,
         outputs: Array,
         /,
     ) -> int:

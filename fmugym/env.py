@@ -157,7 +157,8 @@ class FMUEnv(Constructed):
         """Start a new episode with the FMU instance at hand.
 
         Random values are drawn from this environment's own generator: first the parameters in the
-        order of the config, then those that only the options have, then the episode variables.
+        order of the config, then the start time, then those that only the options have, then the
+        episode variables.
 
         Args:
             seed: Seeds the generator, an integer of at least 0; None goes on with the generator.
@@ -455,8 +456,15 @@ class FMUEnv(Constructed):
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
-        steps = self._warm_up_steps + self.step_count
-        return self._spec.communication_point(steps * self._spec.substeps)
+        steps = (self._warm_up_steps + self.step_count) * self._spec.substeps
+        return self._spec.communication_point(steps, self._start_time)
+
+    @property
+    def _start_time(self) -> Any:
+        """The first communication point of the episode."""
+        if self.config.draws_start_time:
+            return self.parameters["start_time"]
+        return self._spec.start_time
 
     def _fault_of_hooks(
         self, reward: float, observation: Any, before: tuple[Any, dict[str, Any] | None]

@@ -38,20 +38,29 @@ bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const cha
     access->fmi = fmi;
     access->id = 1 + atomic_add(&next_id, 1);
     access->count = count;
+    access->start_time = -1;
     access->memory = malloc((2 * count + 1) * sizeof(uint32_t));
     if (access->memory == NULL) {
         return false;
     }
     for (size_t i = 0; i < count; i++) {
-        group_of(access, (Type)types[i])->count++;
+        if (types[i] == START_TIME) {
+            access->start_time = (ptrdiff_t)i;
+        } else {
+            group_of(access, (Type)types[i])->count++;
+        }
     }
     assign_memory(access);
     for (size_t i = 0; i < count; i++) {
+        if (types[i] == START_TIME) {
+            continue;
+        }
         Group *group = group_of(access, (Type)types[i]);
         memcpy(&group->references[group->count], references + i * sizeof(uint32_t), 4);
         group->positions[group->count++] = (uint32_t)i;
     }
-    access->direct = access->number_of_groups == 1 && access->groups[0].type == TYPE_FLOAT64;
+    access->direct = access->number_of_groups == 1 && access->groups[0].type == TYPE_FLOAT64 &&
+                     (access->start_time < 0 || access->start_time == (ptrdiff_t)count - 1);
     return true;
 }
 

@@ -5,6 +5,10 @@
 
 #include "fmi.h"
 
+/* What stands in a list of variables in the place of a type, where the value is no variable's but the
+ * start time of the episode. */
+enum { START_TIME = 255 };
+
 typedef struct {
     Type type;
     size_t count;
@@ -18,12 +22,19 @@ typedef struct {
     size_t count;
     size_t number_of_groups;
     bool direct;      /* all values are doubles: the FMU uses the list's own memory */
+    ptrdiff_t start_time; /* position of the start time, or -1 */
     uint32_t *memory; /* references and positions of all groups */
     Group groups[NUMBER_OF_TYPES];
 } Access;
 
-/* Groups the variables by type, in the order in which the types first appear. The references are
- * 32-bit numbers and need not be aligned. Returns whether there was enough memory. */
+/* Whether a byte is a Type or START_TIME. */
+static inline bool is_type(uint8_t type) {
+    return type < NUMBER_OF_TYPES || type == START_TIME;
+}
+
+/* Groups the variables by type, in the order in which the types first appear. The start time belongs
+ * to no group. The references are 32-bit numbers and need not be aligned. Returns whether there was
+ * enough memory. */
 bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const char *references,
                  size_t count);
 void access_close(Access *access);

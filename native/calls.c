@@ -3,6 +3,7 @@
 #include "schedule.h"
 
 #include <stdlib.h>
+#include <string.h>
 
 #include "failures.h"
 #include "initial_states.h"
@@ -25,9 +26,7 @@ static bool make_room_for_starts(Pool *pool, const Access *start) {
     free(pool->starts);
     pool->starts = starts;
     pool->start_width = start->count;
-    for (size_t i = 0; i < count; i++) {
-        pool->instances[i].start_id = 0;
-    }
+    memset(pool->start_ids, 0, count * sizeof *pool->start_ids);
     return true;
 }
 

@@ -32,6 +32,10 @@ static void note_starts(Record *record, const Access *start, const double *start
                                 (uint32_t)group->type};
         }
     }
+    if (start->start_time >= 0) {
+        record->starts[start->start_time] =
+            (RecordedStart){starts[start->start_time], 0, START_TIME};
+    }
 }
 
 void record_begin(Pool *pool, size_t index, const Access *start, const double *starts) {

@@ -24,6 +24,7 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
     if (status > STATUS_WARNING) {
         return status;
     }
+    me->start_time = task->snapshot->start_times[index];
     instance_count_from(me, task->snapshot->steps[index]);
     return instance_read_outputs(task->pool, me, scratch);
 }

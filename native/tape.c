@@ -61,6 +61,9 @@ static void note_starts(Tape *tape, const Access *start, const double *starts) {
             tape->start_references[group->positions[j]] = group->references[j];
         }
     }
+    if (start->start_time >= 0) {
+        tape->start_types[start->start_time] = START_TIME;
+    }
     memcpy(tape->starts, starts, start->count * sizeof *starts);
 }
 

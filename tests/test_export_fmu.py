@@ -376,7 +376,7 @@ def test_all_platforms(tmp_path):
     assert begins == {
         "x86_64-linux": b"\x7fELF",
         "aarch64-linux": b"\x7fELF",
-        "x86_64-windows": b"MZ\x90\0",
+        "x86_64-windows": b"MZx\0",
         "x86_64-darwin": b"\xcf\xfa\xed\xfe",
         "aarch64-darwin": b"\xcf\xfa\xed\xfe",
     }

@@ -23,7 +23,7 @@ STOREYS = [
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
     {"export"},
-    {"envs", "tools"},
+    {"envs", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

@@ -9,7 +9,10 @@ SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
     "test_cli_docs",
+    "test_cli_tuning",
+    "test_compile",
     "test_copies",
+    "test_events",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
@@ -25,12 +28,14 @@ SLOW_MODULES = {
     "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
+    "test_nested_fmus",
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_start_times",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -59,6 +64,7 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_start_times": 5,
     "test_words": 5,
     "test_zoo": 5,
 }
@@ -150,6 +156,7 @@ SLOW_TESTS = (
     "test_slow_models.py::TestProgress::test_of_a_trial_is_logged",
     "test_slow_models.py::TestTime::test_is_given_in_worker",
     "test_slow_models.py::TestTime::test_of_a_reset_in_a_worker",
+    "test_series.py::test_a_recorder_",
     "test_slow_models.py::TestTime::test_of_a_trial",
     "test_snapshots.py::TestForeign",
     "test_snapshots.py::TestSingle::test_goes_on_in_another_process",
@@ -173,6 +180,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )

@@ -38,6 +38,7 @@ _KINDS = {
     "String": "string",
     "Binary": "binary",
     "Clock": "boolean",
+    "StartTime": "real",  # no type of FMI; see ``fmugym.pool.spec.START_TIME``
 }
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 
@@ -161,6 +162,12 @@ class Capabilities:
     provides_directional_derivatives: bool = False
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
+    provides_adjoint_derivatives: bool = False
+
+    @property
+    def provides_derivatives(self) -> bool:
+        """Whether the FMU differentiates itself, in one way or the other."""
+        return self.provides_directional_derivatives or self.provides_adjoint_derivatives
 
 
 @dataclass(frozen=True)

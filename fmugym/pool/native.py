@@ -57,7 +57,7 @@ from fmugym.pool.settings import (
     variable_settings,
     variables_of,
 )
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import ResetMethod, start_variables
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -293,16 +293,19 @@ class NativePool(SavingPool):
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
-        data = self._open_pool().bundle(np.ascontiguousarray(indices), ends, steps)
+        start_times = np.empty(len(indices))
+        chosen = np.ascontiguousarray(indices)
+        data = self._open_pool().bundle(chosen, ends, steps, start_times)
         if isinstance(data, int):
             raise SimulationError(self.failure(data))
-        return data, ends, steps
+        return data, ends, steps, start_times
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``."""
         pool = self._open_pool()
         sources, indices = np.ascontiguousarray(sources), np.ascontiguousarray(indices)
-        pool.unbundle(indices, sources, bundle.data, bundle.ends, bundle.steps, bundle.outputs)
+        parts = bundle.data, bundle.ends, bundle.steps, bundle.start_times, bundle.outputs
+        pool.unbundle(indices, sources, *parts)
 
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
@@ -313,7 +316,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(tuple(self._variables[name] for name in record.names))
+        access = self._access(start_variables(self._variables, record.names))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.pool.bundle import Record
-from fmugym.pool.spec import SAMPLINGS, PoolSpec, ResetMethod
+from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.wine.loader import windows_path, windows_uri
 
 __all__ = [
@@ -49,8 +49,12 @@ _TYPES: Final = (
 )
 """The C types in the order of ``enum Type`` of ``native/fmi.h``."""
 
+_START_TIME: Final = 255
+"""Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
+
 _CLOCK: Final = struct.Struct("=IIdd")
 _CLOCKED: Final = struct.Struct("=II")
+
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
 
@@ -192,6 +196,8 @@ def types_and_references(variables: Sequence[Variable], version: int) -> tuple[b
 
 
 def _type_number(variable: Variable, version: int) -> int:
+    if is_start_time(variable):
+        return _START_TIME
     if variable.kind == "enumeration":
         return _TYPES.index("Int64" if version == 3 else "Int32")
     return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
@@ -207,6 +213,7 @@ def variables_of(
         for v in description.variables.values()
         if v.numeric
     }
+    known[_START_TIME, START_TIME.value_reference] = START_TIME
     return tuple(known[pair] for pair in zip(types, references, strict=True))
 
 

@@ -37,26 +37,34 @@ class Choice(NamedTuple):
     variables: tuple[Variable, ...]
     observed: tuple[int, ...]
 
-    def values(
-        self, present: FloatArray, pool: Pool, observations: FloatArray, indices: Any
-    ) -> FloatArray:
-        """Put the values of M environments together.
+    def present(self, values: FloatArray, pool: Pool, indices: Any) -> FloatArray:
+        """What M environments have at this moment, all but the observations.
 
         Args:
-            present: All of the task's quantities, shape (k, M).
+            values: All of the task's quantities, shape (k, M).
             pool: Reads variables of the FMU.
-            observations: Those of all environments, shape (N, m).
             indices: The M environments.
 
         Returns:
             One row for each environment, one column for each quantity.
         """
-        rows = [present[list(self.places)]]
+        rows = [values[list(self.places)]]
         if self.variables:
             rows.append(pool.read(self.variables)[:, indices])
-        if self.observed:
-            rows.append(observations[indices].T[list(self.observed)])
         return np.concatenate(rows).T
+
+    def seen(self, observations: FloatArray, indices: Any) -> FloatArray:
+        """What M environments observe.
+
+        Args:
+            observations: Those of all environments, shape (N, m).
+            indices: The M environments.
+
+        Returns:
+            One row for each environment, one column for each element.
+        """
+        chosen: FloatArray = observations[indices][:, list(self.observed)]
+        return chosen
 
 
 def matches(pattern: str, name: str) -> bool:

@@ -51,8 +51,9 @@ class Episode(NamedTuple):
 class EpisodePlan:
     """The draws of an episode, prepared once so that a reset only has to draw.
 
-    The parameters are drawn first, then the episode variables, each in the order of their dict.
-    The elements of an array are drawn in C order: the last index changes first.
+    The parameters are drawn first, then the episode variables, each in the order of their dict. A
+    start time that is drawn is the last of the parameters. The elements of an array are drawn in C
+    order: the last index changes first.
 
     Args:
         model_variables: The FMU's variables for the parameters.

@@ -13,7 +13,12 @@ from fmugym.checks import LARGEST_COUNT, check_number
 from fmugym.config import EnvConfig
 from fmugym.distributions import is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.pool.spec import FIXED_STEP_SOLVERS, PoolSpec, whole_number_of_steps
+from fmugym.pool.spec import (
+    FIXED_STEP_SOLVERS,
+    START_TIME,
+    PoolSpec,
+    whole_number_of_steps,
+)
 
 __all__ = [
     "Interface",
@@ -31,7 +36,16 @@ _LARGEST_EXACT_INTEGER: Final = 2.0**53
 
 @dataclass(frozen=True)
 class Interface:
-    """A config with its names looked up in one FMU."""
+    """A config with its names looked up in one FMU.
+
+    Attributes:
+        inputs, outputs, monitors: The variables.
+        parameters: The numeric parameters and their values or distributions by name, a start time
+            that is drawn last.
+        strings: The parameters that are texts.
+        config: The config.
+        description: That of the FMU.
+    """
 
     inputs: tuple[Variable, ...]
     outputs: tuple[Variable, ...]
@@ -51,6 +65,16 @@ class Interface:
                 "has no default step size"
             )
         return step
+
+    def parameter(self, name: str) -> Variable:
+        """The variable of one of the parameters, to which a start time belongs if it is drawn.
+
+        Raises:
+            ConfigError: If the FMU has no variable of this name.
+        """
+        if name == "start_time" and self.config.draws_start_time:
+            return START_TIME
+        return self.description.variable(name)
 
     def bounds(self, variable: Variable) -> tuple[float, float]:
         """The limits of a variable: the config's, or else the FMU's.
@@ -77,14 +101,14 @@ class Interface:
         """
         config, description = self.config, self.description
         self._require_retries()
-        start = config.start_time
+        start, drawn = config.start_time, config.draws_start_time
         return PoolSpec(
             inputs=self.inputs,
             outputs=self.outputs + self.monitors,
             time_step=self.time_step,
             num_observed=len(self.outputs),
             substeps=config.substeps,
-            start_time=description.start_time if start is None else start,
+            start_time=description.start_time if start is None or drawn else start,
             stop_time=config.stop_time,
             tolerance=description.tolerance if config.tolerance is None else config.tolerance,
             warm_up_steps=self._warm_up_steps(),
@@ -149,11 +173,12 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         (start_variable(description, name, value), value)
         for name, value in config.model_parameters.items()
     ]
+    drawn = {"start_time": config.start_time} if config.draws_start_time else {}
     interface = Interface(
         inputs=tuple(input_variable(description, n) for n in config.model_input_names),
         outputs=tuple(output_variable(description, n) for n in config.model_output_names),
         monitors=tuple(output_variable(description, n) for n in config.monitor_names),
-        parameters={v.name: checked(v, value) for v, value in given if v.numeric},
+        parameters={v.name: checked(v, value) for v, value in given if v.numeric} | drawn,
         strings=tuple((v, str.__str__(value)) for v, value in given if not v.numeric),
         config=config,
         description=description,

@@ -24,7 +24,7 @@ bool is_access(const PyPool *self, PyObject *object) {
 
 static bool check_types(const uint8_t *types, Py_ssize_t count, Py_ssize_t size) {
     for (Py_ssize_t i = 0; i < count; i++) {
-        if (types[i] >= NUMBER_OF_TYPES) {
+        if (!is_type(types[i])) {
             PyErr_SetString(PyExc_ValueError, "unknown C type");
             return false;
         }

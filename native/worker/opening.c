@@ -14,7 +14,7 @@ bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
     bool sound = reader->sound && size == count * sizeof(uint32_t);
 
     for (size_t i = 0; sound && i < count; i++) {
-        sound = (uint8_t)types[i] < NUMBER_OF_TYPES;
+        sound = is_type((uint8_t)types[i]);
     }
     return sound && access_open(access, fmi, (const uint8_t *)types, references, count);
 }
