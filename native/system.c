@@ -20,7 +20,7 @@ static Status carry(Composite *me, size_t begin, size_t end) {
 }
 
 static Status carry_to(Composite *me, size_t index) {
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
     return carry(me, part->first_route, part->end_route);
 }
 
@@ -30,7 +30,7 @@ typedef struct {
 } Span;
 
 static Status advance(Composite *me, size_t index, Span span) {
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
     const double size = span.step / (double)part->steps;
     Status status = STATUS_OK;
 

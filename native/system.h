@@ -30,8 +30,6 @@ typedef struct {
     int64_t steps; /* in one of the system */
     Solving solving;
     Access inputs, outputs; /* what a step sets and gets, in the order of the slots */
-    const uint8_t *input_types, *output_types;
-    const uint32_t *input_references, *output_references;
     const double *input_starts;
     size_t first_input, first_output; /* its first slots */
     size_t first_route, end_route;    /* the routes to its inputs */
@@ -39,7 +37,7 @@ typedef struct {
     const double *start_values;
     PartString *strings;
     size_t number_of_strings;
-} Part;
+} Component;
 
 /* target = gain * source + offset; without arithmetic if they are 1 and 0. */
 typedef struct {
@@ -86,7 +84,7 @@ typedef struct {
 } Transfer;
 
 typedef struct System {
-    Part *parts;
+    Component *parts;
     size_t count;
     size_t inputs, outputs; /* numbers of slots */
     Route *routes;          /* sorted by the parts of their targets */
@@ -155,9 +153,9 @@ Status system_do_step(const Library *library, void *component, double time, doub
 Status system_reset(const Library *library, void *component);
 Status system_terminate(const Library *library, void *component);
 Status system_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values);
+                  size_t count, void *values, size_t size);
 Status system_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values);
+                  size_t count, const void *values, size_t size);
 Status system_set_string(const Library *library, void *component, uint32_t reference,
                          const char *text);
 Status system_get_state(const Library *library, void *component, void **state);

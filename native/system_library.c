@@ -17,7 +17,7 @@ static Loaded *loaded(const Library *library) {
     return library->functions;
 }
 
-static bool load_part(Library *library, const Part *part, const char *path, char *error,
+static bool load_part(Library *library, const Component *part, const char *path, char *error,
                       size_t size) {
     char reason[512];
 
@@ -86,7 +86,7 @@ static bool allocate(Composite *me, const System *s) {
 }
 
 static bool instantiate_part(Composite *me, size_t index, const Identity *whole) {
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
     char *name = me->parts.names + index * LOG_NAME;
 
     log_name(name, part->name, whole->environment + index);
@@ -162,7 +162,7 @@ Status system_choose_messages(const Library *library, void *component,
     (void)library;
     (void)categories; /* each part has its own */
     for (size_t i = 0; i < me->system->count; i++) {
-        const Part *part = &me->system->parts[i];
+        const Component *part = &me->system->parts[i];
         if (part->fmi->choose_messages != NULL && part->number_of_categories > 0) {
             const Status status = part_judge(
                 me, i, part->fmi->choose_messages(&me->libraries[i], me->parts.components[i],

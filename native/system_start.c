@@ -20,7 +20,7 @@ typedef struct {
 
 static Status set_pending(Composite *me, size_t index, const Pending *pending) {
     const End *end = pending->end;
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
 
     if (pending->text == NULL) {
         return part_set(me, index, end->type, &end->reference, pending->value);
@@ -35,7 +35,7 @@ static Status set_starts(void *context) {
     const Place *place = context;
     Composite *me = place->beginning->me;
     const size_t index = place->index;
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
     const Library *library = &me->libraries[index];
     void *component = me->parts.components[index];
 
@@ -83,13 +83,13 @@ static Status begin_if_old(const Beginning *b, size_t index) {
 }
 
 static Status read_source(const Beginning *b, const Route *route, double *value) {
-    const Part *part = &b->me->system->parts[route->source_part];
+    const Component *part = &b->me->system->parts[route->source_part];
     const size_t place = route->source - part->first_output;
     Status status = begin_if_old(b, route->source_part);
 
     if (status <= STATUS_WARNING) {
-        status = part_get(b->me, route->source_part, (Type)part->output_types[place],
-                          &part->output_references[place], value);
+        status = part_get(b->me, route->source_part, (Type)part->outputs.types[place],
+                          &part->outputs.variables[place].reference, value);
     }
     return status > STATUS_WARNING ? status : route_carry(b->me, route, *value, value);
 }
@@ -97,13 +97,13 @@ static Status read_source(const Beginning *b, const Route *route, double *value)
 /* An FMU of FMI 1.0 that waits gets the value when it begins. */
 static Status write_target(const Beginning *b, const Route *route, double value) {
     Composite *me = b->me;
-    const Part *part = &me->system->parts[route->target_part];
+    const Component *part = &me->system->parts[route->target_part];
     const size_t place = route->target - part->first_input;
 
     me->inputs[route->target] = value;
     return me->parts.started[route->target_part]
-               ? part_set(me, route->target_part, (Type)part->input_types[place],
-                          &part->input_references[place], value)
+               ? part_set(me, route->target_part, (Type)part->inputs.types[place],
+                          &part->inputs.variables[place].reference, value)
                : STATUS_OK;
 }
 
@@ -183,7 +183,7 @@ static Status begin_from(const Beginning *b, size_t index) {
 
 static void forget(Composite *me) {
     for (size_t i = 0; i < me->system->count; i++) {
-        const Part *part = &me->system->parts[i];
+        const Component *part = &me->system->parts[i];
         memcpy(me->inputs + part->first_input, part->input_starts,
                part->inputs.count * sizeof(double));
     }

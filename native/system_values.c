@@ -14,15 +14,22 @@ Status part_judge(Composite *me, size_t index, Status status) {
     return status;
 }
 
-static Access access_of_one(const Part *part, Type type, const uint32_t *reference,
+static Access access_of_one(const Component *part, Type type, const uint32_t *reference,
                             uint32_t *position) {
     Access access = {.fmi = part->fmi,
                      .count = 1,
+                     .width = 1,
                      .number_of_groups = 1,
-                     .direct = type == TYPE_FLOAT64};
+                     .direct = type == TYPE_FLOAT64,
+                     .start_time = -1};
 
     *position = 0;
-    access.groups[0] = (Group){type, 1, (uint32_t *)reference, position};
+    access.groups[0] = (Group){.type = type,
+                               .count = 1,
+                               .size = 1,
+                               .references = (uint32_t *)reference,
+                               .offsets = position,
+                               .listed = {1, position, position}};
     return access;
 }
 
@@ -45,7 +52,7 @@ Status part_set(Composite *me, size_t index, Type type, const uint32_t *referenc
 }
 
 Status part_set_inputs(Composite *me, size_t index) {
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
 
     return part_judge(me, index,
                       access_set(&part->inputs, &me->libraries[index],
@@ -54,7 +61,7 @@ Status part_set_inputs(Composite *me, size_t index) {
 }
 
 Status part_read(Composite *me, size_t index) {
-    const Part *part = &me->system->parts[index];
+    const Component *part = &me->system->parts[index];
 
     return part_judge(me, index,
                       access_get(&part->outputs, &me->libraries[index],
@@ -106,12 +113,13 @@ static Status get_one(Composite *me, uint32_t reference, double *value) {
 }
 
 Status system_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values) {
+                  size_t count, void *values, size_t size) {
     Composite *me = component;
     double *numbers = values;
     Status worst = type == TYPE_FLOAT64 ? STATUS_OK : STATUS_ERROR;
 
     (void)library;
+    (void)size;
     me->blamed = NULL;
     for (size_t i = 0; i < count && worst <= STATUS_WARNING; i++) {
         const Status status = get_one(me, references[i], &numbers[i]);
@@ -148,13 +156,14 @@ static Status set_end(Composite *me, const End *end, double value) {
 }
 
 Status system_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
+                  size_t count, const void *values, size_t size) {
     Composite *me = component;
     const System *s = me->system;
     const double *numbers = values;
     Status worst = type == TYPE_FLOAT64 ? STATUS_OK : STATUS_ERROR;
 
     (void)library;
+    (void)size;
     me->blamed = NULL;
     for (size_t i = 0; i < count && worst <= STATUS_WARNING; i++) {
         if (references[i] >= s->number_of_variables) {

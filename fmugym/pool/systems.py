@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.pool.settings import (
     PlaceOfFMU,
     library_settings,
+    listing,
     manner_of,
     solving_settings,
-    types_and_references,
 )
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import PartVariable, SystemDescription
@@ -65,15 +65,13 @@ def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
         known["categories"],
         part.component.steps,
         solving_settings(description, spec),
-        (*types_and_references(part.inputs, version), _starts_of(part.inputs)),
-        types_and_references(part.outputs, version),
-        (*types_and_references([v for v, _ in numbers], version), _doubles(x for _, x in numbers)),
+        listing(part.inputs, version),
+        _doubles(variable.start_number for variable in part.inputs),
+        listing(part.outputs, version),
+        listing([v for v, _ in numbers], version),
+        _doubles(x for _, x in numbers),
         tuple(texts),
     )
-
-
-def _starts_of(variables: Sequence[Variable]) -> bytes:
-    return _doubles(variable.start_number for variable in variables)
 
 
 def _routes(layout: Layout) -> tuple[bytes, ...]:
@@ -108,7 +106,7 @@ def _type(layout: Layout, end: PartVariable) -> bytes:
     if not end.variable.numeric:
         return b"\0"
     version = layout.parts[end.part].description.fmi_major_version
-    return types_and_references([end.variable], version)[0]
+    return listing([end.variable], version)[0]
 
 
 def _groups(layout: Layout) -> tuple[tuple[Any, ...], ...]:

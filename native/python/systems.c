@@ -55,24 +55,33 @@ static void *array_for(PyObject *tuple, size_t size, size_t *count) {
 
 /* Parts */
 
-static bool open_access(Access *access, const Part *part, Bytes types, Bytes references) {
-    const size_t count = (size_t)types.size;
-    bool sound = count == count_of(references, sizeof(uint32_t));
+/* The types, elements and other values of a list of variables. */
+typedef struct {
+    Bytes types, elements, rest;
+} Variables;
 
-    for (size_t i = 0; i < count; i++) {
-        sound = sound && (uint8_t)types.data[i] < NUMBER_OF_TYPES;
-    }
-    if (!sound) {
+#define BYTES(bytes) &(bytes).data, &(bytes).size
+#define VARIABLES(variables)                                                                       \
+    BYTES((variables).types), BYTES((variables).elements), BYTES((variables).rest)
+
+/* Each variable has a value. */
+static bool open_access(Access *access, const Component *part, Variables v, Bytes values) {
+    Listing listing;
+    const char *fault =
+        listing_take(&listing, v.types.data, (size_t)v.types.size, v.elements.data,
+                     (size_t)v.elements.size, v.rest.data, (size_t)v.rest.size);
+
+    if (fault != NULL || (values.data != NULL && count_of(values, 8) != listing.count)) {
         return refuse("variables");
     }
-    if (!access_open(access, part->fmi, (const uint8_t *)types.data, references.data, count)) {
+    if (!access_open(access, part->fmi, &listing)) {
         PyErr_NoMemory();
         return false;
     }
-    return true;
+    return access->start_time < 0 || refuse("variables");
 }
 
-static bool take_part_strings(PyObject *tuple, Part *part) {
+static bool take_part_strings(PyObject *tuple, Component *part) {
     part->strings = array_for(tuple, sizeof *part->strings, &part->number_of_strings);
     for (size_t i = 0; part->strings != NULL && i < part->number_of_strings; i++) {
         PyObject *pair = PyTuple_GetItem(tuple, (Py_ssize_t)i);
@@ -84,54 +93,45 @@ static bool take_part_strings(PyObject *tuple, Part *part) {
     return part->strings != NULL;
 }
 
-static bool take_part(PyObject *tuple, Part *part) {
+static bool take_part(PyObject *tuple, Component *part) {
     PyObject *categories, *solving, *strings;
-    Bytes in_types, in_references, in_starts, out_types, out_references;
-    Bytes start_types, start_references, start_values;
+    Variables inputs, outputs, starts;
+    Bytes input_starts, start_values, none = {NULL, 0};
     int version, manner, has_mode;
     long long steps;
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(iip)(yyy)O!LO(y#y#y#)(y#y#)(y#y#y#)O!", &part->name, &part->label,
+            tuple, "(yyy)(iip)(yyy)O!LO(y#y#y#)y#(y#y#y#)(y#y#y#)y#O!", &part->name, &part->label,
             &part->not_finite, &version, &manner, &has_mode, &part->model, &part->token,
-            &part->resources, &PyTuple_Type, &categories, &steps, &solving, &in_types.data,
-            &in_types.size, &in_references.data, &in_references.size, &in_starts.data,
-            &in_starts.size, &out_types.data, &out_types.size, &out_references.data,
-            &out_references.size, &start_types.data, &start_types.size, &start_references.data,
-            &start_references.size, &start_values.data, &start_values.size, &PyTuple_Type,
-            &strings)) {
+            &part->resources, &PyTuple_Type, &categories, &steps, &solving, VARIABLES(inputs),
+            BYTES(input_starts), VARIABLES(outputs), VARIABLES(starts), BYTES(start_values),
+            &PyTuple_Type, &strings)) {
         return refuse("parts");
     }
     part->fmi = version == 0 ? NULL : fmi_of(version, manner);
-    if (part->fmi == NULL || steps < 1 ||
-        count_of(in_starts, sizeof(double)) != (size_t)in_types.size ||
-        count_of(start_values, sizeof(double)) != (size_t)start_types.size) {
+    if (part->fmi == NULL || steps < 1) {
         return refuse("parts");
     }
     part->has_mode = has_mode;
     part->steps = steps;
-    part->input_types = (const uint8_t *)in_types.data;
-    part->input_references = numbers_of(in_references);
-    part->input_starts = doubles_of(in_starts);
-    part->output_types = (const uint8_t *)out_types.data;
-    part->output_references = numbers_of(out_references);
+    part->input_starts = doubles_of(input_starts);
     part->start_values = doubles_of(start_values);
     part->number_of_categories = (size_t)PyTuple_Size(categories);
     part->categories = take_texts(categories);
     return part->categories != NULL && take_solving(solving, &part->solving) &&
-           open_access(&part->inputs, part, in_types, in_references) &&
-           open_access(&part->outputs, part, out_types, out_references) &&
-           open_access(&part->starts, part, start_types, start_references) &&
+           open_access(&part->inputs, part, inputs, input_starts) &&
+           open_access(&part->outputs, part, outputs, none) &&
+           open_access(&part->starts, part, starts, start_values) &&
            take_part_strings(strings, part);
 }
 
 static void count_slots(System *s) {
     for (size_t i = 0; i < s->count; i++) {
-        Part *part = &s->parts[i];
-        const size_t most = part->inputs.count > part->outputs.count ? part->inputs.count
-                                                                     : part->outputs.count;
-        const size_t scratch = most > part->starts.count ? most : part->starts.count;
+        Component *part = &s->parts[i];
+        const size_t most = part->inputs.width > part->outputs.width ? part->inputs.width
+                                                                     : part->outputs.width;
+        const size_t scratch = most > part->starts.width ? most : part->starts.width;
         part->first_input = s->inputs;
         part->first_output = s->outputs;
         s->inputs += part->inputs.count;
@@ -346,7 +346,7 @@ bool take_system(PyObject *object, System **system) {
 
 void drop_system(System *s) {
     for (size_t i = 0; s != NULL && s->parts != NULL && i < s->count; i++) {
-        Part *part = &s->parts[i];
+        Component *part = &s->parts[i];
         access_close(&part->inputs);
         access_close(&part->outputs);
         access_close(&part->starts);
