@@ -83,7 +83,7 @@ static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count) {
             PyErr_SetString(PyExc_ValueError, "a row of a program is not aligned");
             return false;
         }
-        p->rows[i] = (Row){buffer->buf, (size_t)buffer->itemsize, false};
+        p->rows[i] = (Row){.data = buffer->buf, .size = (size_t)buffer->itemsize};
     }
     return true;
 }
