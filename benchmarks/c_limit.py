@@ -183,9 +183,7 @@ def repeat(loop: Loop, num_envs: int, record: Path, seconds: float = 1.0) -> lis
     return _run(loop, num_envs, 1, seconds, f"@{record}")
 
 
-def _run(
-    loop: Loop, num_envs: int, threads: int, seconds: float, *arguments: str
-) -> list[float]:
+def _run(loop: Loop, num_envs: int, threads: int, seconds: float, *arguments: str) -> list[float]:
     fmu = loop.fmu
     command = [str(build()), str(fmu.extract() / fmu.library), fmu.description.instantiation_token]
     command += [str(num_envs), str(threads), str(seconds), str(loop.time_step), *loop.items()]

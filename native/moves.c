@@ -191,7 +191,7 @@ static void store_floats(const Evaluation *e, const Row *rows, const Slot *slots
     }
 }
 
-bool operation_move(const Evaluation *e, Instruction i) {
+void operation_move(const Evaluation *e, Instruction i) {
     const Program *program = e->program;
     Register *to = &e->registers->own[i.to];
     const void **place = &e->registers->places[i.to];
@@ -199,31 +199,28 @@ bool operation_move(const Evaluation *e, Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
         *place = load_row(e, &program->rows[i.extra], to);
-        return true;
+        break;
     case LOAD_ACTION:
         *place = load_action(e, e->source->actions, i.extra, to);
-        return true;
+        break;
     case LOAD_PREVIOUS_ACTION:
         *place = load_action(e, e->source->previous_actions, i.extra, to);
-        return true;
+        break;
     case LOAD_ACTIVE:
         *place = to;
         load_active(e, to->flags);
-        return true;
+        break;
     case LOAD_STOPPED:
         *place = to;
         load_stopped(e, to->flags);
-        return true;
+        break;
     case STORE_ROW:
         store_row(e, &program->rows[i.extra], e->registers->places[i.a]);
-        return true;
+        break;
     case STORE_SEEN:
         store_seen(e, &program->slots[i.extra], e->registers->places[i.a]);
-        return true;
-    case STORE_FLOATS:
-        store_floats(e, &program->rows[i.a], &program->slots[i.extra], i.b);
-        return true;
+        break;
     default:
-        return false;
+        store_floats(e, &program->rows[i.a], &program->slots[i.extra], i.b);
     }
 }

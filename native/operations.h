@@ -26,9 +26,8 @@ static inline void clear_rest(void *values, size_t count, size_t lanes, size_t s
     }
 }
 
-/* moves.c: moves values between registers and memory that is not the program's. Returns false for
- * any other instruction. */
-bool operation_move(const Evaluation *e, Instruction i);
+/* moves.c: moves values between registers and memory that is not the program's. */
+void operation_move(const Evaluation *e, Instruction i);
 
 /* numpy_loops.c: calls a loop of numpy with all values, or with the few that need it. Returns how
  * many instructions it has done: the sine and the cosine of the same values are computed at once. */
@@ -40,7 +39,7 @@ void operation_cast(uint16_t types, const void *from, size_t blocks, void *to);
 /* look_ups.c: what is looked up outside of a table is noted, and becomes the first value. */
 void operation_take(const Table *table, const int64_t *indices, size_t count, char *to,
                     Notes *notes);
-void operation_interpolate(const Table *table, const double *from, size_t count, double *to);
+void operation_interpolate(const Table *table, const double *x, size_t count, double *to);
 
 /* arithmetic.c */
 void operation_compute(uint16_t operation, const void *first, const void *second,

@@ -24,44 +24,51 @@ void program_prepare(const Program *program, Register *memory, Registers *regist
     }
 }
 
-static size_t run_one(const Evaluation *e, const Instruction *next) {
+/* The operations that are neither moves nor arithmetic. */
+static size_t run_other(const Evaluation *e, const Instruction *next) {
     const Instruction i = *next;
-    const void **places = e->registers->places;
-    const size_t blocks = e->lanes / PROGRAM_BLOCK;
+    const void *first = e->registers->places[i.a];
     Register *to = &e->registers->own[i.to];
 
-    if (operation_move(e, i)) {
-        return 1;
-    }
-    places[i.to] = to;
     switch (i.operation) {
-    case CALL:
-    case CALL_SINE:
-    case CALL_SQUARE:
-    case CALL_REMAINDER:
-    case CALL_COSINE:
-        return operation_call(e, next);
     case CAST:
-        operation_cast(i.extra, places[i.a], blocks, to);
+        operation_cast(i.extra, first, e->lanes / PROGRAM_BLOCK, to);
         break;
     case TAKE:
-        operation_take(&e->program->tables[i.extra], places[i.a], e->count, (char *)to->bytes,
-                       e->notes);
+        operation_take(&e->program->tables[i.extra], first, e->count, (char *)to->bytes, e->notes);
         clear_rest(to, e->count, e->lanes, e->program->tables[i.extra].size);
         break;
     case INTERPOLATE:
-        operation_interpolate(&e->program->tables[i.extra], places[i.a], e->count, to->doubles);
+        operation_interpolate(&e->program->tables[i.extra], first, e->count, to->doubles);
         clear_rest(to, e->count, e->lanes, sizeof(double));
         break;
     case POWER_D:
     case POWER_F:
-        operation_power(i.operation, e->count, places[i.a], places[i.b], to);
+        operation_power(i.operation, e->count, first, e->registers->places[i.b], to);
         clear_rest(to, e->count, e->lanes,
                    i.operation == POWER_D ? sizeof(double) : sizeof(float));
         break;
     default:
-        operation_compute(i.operation, places[i.a], places[i.b], places[i.c], blocks, to);
+        return operation_call(e, next);
     }
+    return 1;
+}
+
+static inline size_t run_one(const Evaluation *e, const Instruction *next) {
+    const Instruction i = *next;
+    const void **places = e->registers->places;
+    Register *to = &e->registers->own[i.to];
+
+    if (i.operation < CALL) {
+        operation_move(e, i);
+        return 1;
+    }
+    places[i.to] = to;
+    if (i.operation < ADD_D || i.operation >= POWER_D) {
+        return run_other(e, next);
+    }
+    operation_compute(i.operation, places[i.a], places[i.b], places[i.c], e->lanes / PROGRAM_BLOCK,
+                      to);
     return 1;
 }
 

@@ -18,7 +18,8 @@ enum {
 
 /* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
  * that module compares the two. The letters are those of numpy's types: d float64, f float32,
- * q int64. Booleans are bytes, 0 or 1. */
+ * q int64. Booleans are bytes, 0 or 1. Those that move values come first; arithmetic is from ADD_D
+ * to WHERE_1. */
 #define EACH_OPERATION(X)                                                                          \
     X(LOAD_ROW, "load_row")                                                                        \
     X(LOAD_ACTION, "load_action")                                                                  \
