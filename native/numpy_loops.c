@@ -5,8 +5,8 @@
 
 enum { FEW = 8 };
 
-WIDE static bool is_any_set(const uint8_t *flags, size_t lanes) {
-    uint8_t any = 0;
+WIDE static bool is_any_set(const int64_t *flags, size_t lanes) {
+    int64_t any = 0;
 
     for (size_t j = 0; j < lanes / PROGRAM_BLOCK * PROGRAM_BLOCK; j++) {
         any |= flags[j];
@@ -31,7 +31,7 @@ static void call_all(const Evaluation *e, Instruction i) {
 }
 
 /* Calls the loop for the values that are doubtful. */
-static void call_where(const Called *called, size_t count, const uint8_t *doubtful,
+static void call_where(const Called *called, size_t count, const int64_t *doubtful,
                        const double *x, const double *y, double *to) {
     double first[PROGRAM_WIDTH], second[PROGRAM_WIDTH], found[PROGRAM_WIDTH];
     uint8_t places[PROGRAM_WIDTH];
@@ -54,7 +54,7 @@ static void call_where(const Called *called, size_t count, const uint8_t *doubtf
 }
 
 static void compute_quickly(uint16_t operation, const double *x, const double *y, size_t blocks,
-                            double *to, uint8_t *doubtful) {
+                            double *to, int64_t *doubtful) {
     switch (operation) {
     case CALL_SQUARE:
         quick_square(x, blocks, to, doubtful);
@@ -75,7 +75,7 @@ static void call_quick(const Evaluation *e, Instruction i) {
     const double *x = e->registers->places[i.a];
     const double *y = called->inputs == 1 ? x : e->registers->places[i.b];
     double *to = e->registers->own[i.to].doubles;
-    _Alignas(64) uint8_t doubtful[PROGRAM_WIDTH];
+    _Alignas(64) int64_t doubtful[PROGRAM_WIDTH];
 
     if (called->inputs == 1 && e->count < FEW) { /* for a few, a block takes more time */
         call_all(e, i);
@@ -99,7 +99,7 @@ static void call_pair(const Evaluation *e, const Instruction *pair) {
     const double *x = e->registers->places[pair[0].a];
     double *sine = e->registers->own[pair[0].to].doubles;
     double *cosine = e->registers->own[pair[1].to].doubles;
-    _Alignas(64) uint8_t doubtful[2][PROGRAM_WIDTH];
+    _Alignas(64) int64_t doubtful[2][PROGRAM_WIDTH];
 
     e->registers->places[pair[1].to] = cosine;
     quick_sine_and_cosine(x, e->lanes / PROGRAM_BLOCK, sine, cosine, doubtful[0], doubtful[1]);
