@@ -29,6 +29,7 @@ from tables import Table, duration, times
 
 import fmugym
 from fmugym.task.interface import resolve
+from fmugym.vector.hooks.program import OPERATIONS
 
 __all__ = ["TASKS", "Task", "fmugym_run", "tables"]
 
@@ -39,6 +40,9 @@ TITLE = (
 )
 STEPS = 256
 """The steps that are repeated: at least one episode of most tasks."""
+
+_ALLOWED_CALL = 6e-6
+"""The time in s that a call of ``step`` may take beyond what it takes for each environment."""
 
 FMU, BY_HAND = "FMUs alone, in C", "by hand in numpy"
 MOST = {"SyncVectorEnv": 64, "AsyncVectorEnv": 8}
@@ -112,11 +116,39 @@ def _add(table: Table, task: Task, sizes: tuple[int, ...], effort: Effort) -> No
     for name in makers:
         cells = [_cell(name, seconds, missing) for seconds, missing, _ in columns]
         table.rows.append([f"{task.name}: {name}", *cells])
+    each = _allowed_each(task)
+    cells = [_rest(seconds, size, each) for seconds, _, size in columns]
+    table.rows.append([f"{task.name}: fmugym without the FMUs / allowed", *cells])
     table.data += [
         {"task": task.name, "way": name, "num_envs": size, "call_s": taken}
         for seconds, _, size in columns
         for name, taken in seconds.items()
     ]
+
+
+def _allowed_each(task: Task) -> float:
+    """The time in s that an environment may take beyond its FMU, according to its programs."""
+    with ExitStack() as stack:
+        programs = _fmugym(stack, task, 1, "auto")._engine._task
+    if programs is None:
+        return float("nan")
+    codes = np.concatenate([programs.inputs.code[:, 0], programs.judgement.code[:, 0]])
+    names = [OPERATIONS[code] for code in codes.tolist()]
+    return 1e-9 * (10.0 + sum(map(_allowed, names)))
+
+
+def _allowed(operation: str) -> float:
+    """The time in ns that an operation may take; moving values belongs to the environment."""
+    if operation.startswith(("load_", "store_")):
+        return 0.0
+    if operation.startswith("scalar_power") or operation == "call_square":
+        return 60.0
+    return 30.0 if operation in {"call", "call_sine", "call_cosine"} else 1.0
+
+
+def _rest(seconds: dict[str, float], size: int, each: float) -> str:
+    """What a call costs beyond the FMUs, and what it may cost."""
+    return f"{duration(seconds['fmugym'] - seconds[FMU])} / {duration(_ALLOWED_CALL + each * size)}"
 
 
 Blocks = list[float]
