@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
@@ -46,6 +46,7 @@ def make_sb3_env(
     seed: int | None = None,
     monitor: bool = True,
     overlap: bool = False,
+    wrap: Callable[[FMUVectorEnv], Any] = lambda envs: envs,
     **kwargs: Any,
 ) -> VecEnv:
     """Make N environments for Stable-Baselines3, as its own ``make_vec_env`` does.
@@ -57,6 +58,8 @@ def make_sb3_env(
         monitor: Whether to wrap them in a ``VecMonitor``, which writes returns and lengths to the
             log of the training.
         overlap: As for ``FMUVecEnv``.
+        wrap: Puts wrappers of Gymnasium around the ``FMUVectorEnv``, such as
+            ``RecordVectorSeries``.
         kwargs: Arguments of ``FMUVectorEnv`` (``max_episode_steps``, ``hooks``, ``threads``, ...)
             and of the environment.
 
@@ -66,7 +69,12 @@ def make_sb3_env(
     """
     seed = check_seed(seed)
     kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
-    venv = FMUVecEnv(make_vector_env(env, num_envs, kwargs), overlap)
+    envs = make_vector_env(env, num_envs, kwargs)
+    try:
+        venv = FMUVecEnv(wrap(envs), overlap)
+    except BaseException:
+        envs.close()
+        raise
     if seed is not None:
         venv.seed(seed)
         venv.action_space.seed(seed)
@@ -80,22 +88,28 @@ class FMUVecEnv(VecEnv):
     speed of ``FMUVectorEnv``. All arrays and dicts that it returns are new.
 
     Args:
-        env: The vector environment, made with ``autoreset_mode="same_step"``.
+        env: The vector environment, made with ``autoreset_mode="same_step"``, or a wrapper around
+            it that returns observations and infos as it does, such as ``RecordVectorSeries``.
         overlap: Whether the FMUs step between ``step_async`` and ``step_wait``, while the caller
             computes; otherwise they step in ``step_wait``. The algorithms of Stable-Baselines3 call
             both at once, and handing a step to a thread takes some 50 us. So this is of use for
             loops of your own.
 
     Attributes:
-        vector_env: The vector environment, as given.
+        vector_env: The vector environment, without wrappers.
 
     Raises:
         ConfigError: If ``env`` is something else, or has another autoreset mode.
     """
 
-    def __init__(self, env: FMUVectorEnv, overlap: bool = False) -> None:
-        if not isinstance(env, FMUVectorEnv):
-            raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
+    def __init__(self, env: FMUVectorEnv | VectorWrapper, overlap: bool = False) -> None:
+        self._outer: Any = env
+        inner: Any = env.unwrapped if isinstance(env, VectorWrapper) else env
+        if not isinstance(inner, FMUVectorEnv):
+            raise ConfigError(f"expected a FMUVectorEnv, got {type(inner).__name__}")
+        self._take(inner, overlap)
+
+    def _take(self, env: FMUVectorEnv, overlap: bool) -> None:
         mode = env.autoreset_mode
         if mode is not AutoresetMode.SAME_STEP:
             raise ConfigError(
@@ -119,11 +133,11 @@ class FMUVecEnv(VecEnv):
         """
         groups = self._groups_of_options()
         if len(groups) > 1 and not self.vector_env._started:
-            self.vector_env.reset()
+            self._outer.reset()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for mask, options in groups:
             options = {**options, "reset_mask": mask}
-            observations, infos = self.vector_env.reset(seed=self._seeds, options=options)
+            observations, infos = self._outer.reset(seed=self._seeds, options=options)
             handed_out(infos, self.reset_infos)
         self._reset_seeds()
         self._reset_options()
@@ -141,7 +155,7 @@ class FMUVecEnv(VecEnv):
         """Begin a step, or keep the actions for ``step_wait``; see ``overlap``."""
         self._actions = actions
         if self._overlap:
-            self.vector_env.step_async(actions)
+            self._outer.step_async(actions)
 
     def step_wait(self) -> StepReturn:
         """Step all environments; those whose episode ends start the next one.
@@ -151,7 +165,7 @@ class FMUVecEnv(VecEnv):
             observation is the first of the next episode, and the info has
             ``"terminal_observation"``.
         """
-        env = self.vector_env
+        env = self._outer
         result = env.step_wait() if self._overlap else env.step(self._actions)
         observations, rewards, terminated, truncated, infos = result
         dones = terminated | truncated
@@ -181,7 +195,7 @@ class FMUVecEnv(VecEnv):
 
     def close(self) -> None:
         """Free the FMU instances."""
-        self.vector_env.close()
+        self._outer.close()
 
     # Single environments.
 

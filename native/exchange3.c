@@ -5,6 +5,7 @@
 
 static const Binding bindings[] = {
     SHARED_BINDINGS,
+    BINDINGS_OF_EVENTS,
     {"InstantiateModelExchange", offsetof(Functions, instantiate_equations), true},
     {"SetTime", offsetof(Functions, equations.set_time), true},
     {"SetContinuousStates", offsetof(Functions, equations.set_states), true},
@@ -12,8 +13,6 @@ static const Binding bindings[] = {
     {"GetContinuousStateDerivatives", offsetof(Functions, equations.get_rates), true},
     {"GetEventIndicators", offsetof(Functions, equations.get_indicators), true},
     {"GetNominalsOfContinuousStates", offsetof(Functions, equations.get_nominals), true},
-    {"EnterEventMode", offsetof(Functions, equations.enter_events), true},
-    {"UpdateDiscreteStates", offsetof(Functions, update), true},
     {"EnterContinuousTimeMode", offsetof(Functions, equations.enter_continuous), true},
     {"CompletedIntegratorStep", offsetof(Functions, complete), true},
     {"GetDirectionalDerivative", offsetof(Functions, differentiate), false},
@@ -22,15 +21,6 @@ static const Binding bindings[] = {
 static bool bind(Library *library, char *error, size_t size) {
     return library_bind(library, "fmi3", bindings, COUNT_OF(bindings), sizeof(Functions),
                         error, size);
-}
-
-static Status update(const Library *library, void *instance, Events *events) {
-    bool nominals_changed = false, states_changed = false;
-
-    *events = (Events){0};
-    return sane(functions_of(library)->update(instance, &events->again, &events->terminate,
-                                              &nominals_changed, &states_changed,
-                                              &events->has_next, &events->next));
 }
 
 static Status complete(const Library *library, void *instance, bool *event, bool *terminate) {
@@ -62,9 +52,10 @@ static const Fmi fmu = {
 static const Model model = {
     .fmi = &fmu,
     .equations = offsetof(Functions, equations),
-    .update = update,
+    .update = update3,
     .complete = complete,
     .differentiate = differentiate,
+    .clocks = offsetof(Functions, clocks),
 };
 
 static void *instantiate(const Library *library, const Identity *identity) {

@@ -1,7 +1,12 @@
 #include "fmi.h"
 
-const Fmi *fmi_table(int64_t version, bool exchange) {
-    static const Fmi *const versions[2][3] = {{&fmi1, &fmi2, &fmi3},
-                                              {&exchange1, &exchange2, &exchange3}};
-    return version < 1 || version > 3 ? NULL : versions[exchange][version - 1];
+const Fmi *fmi_table(int64_t version, int64_t manner) {
+    static const Fmi *const tables[3][3] = {
+        [CO_SIMULATION_ALONE] = {&fmi1, &fmi2, &fmi3},
+        [MODEL_EXCHANGE_SOLVED] = {&exchange1, &exchange2, &exchange3},
+        [CO_SIMULATION_WITH_EVENTS] = {NULL, NULL, &events3},
+    };
+    const bool sound = version >= 1 && version <= 3 && manner >= 0 && manner < 3;
+
+    return sound ? tables[manner][version - 1] : NULL;
 }

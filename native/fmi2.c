@@ -2,12 +2,14 @@
 
 #include "fmi2.h"
 
-enum { CO_SIMULATION = 1, TERMINATED = 3 /* fmi2Terminated of fmi2StatusKind */ };
+enum { CO_SIMULATION = 1 };
+enum { LAST_SUCCESSFUL_TIME = 2, TERMINATED = 3 }; /* of fmi2StatusKind */
 
 static const Binding bindings[] = {
     SHARED_BINDINGS,
     {"DoStep", offsetof(Functions, do_step), true},
     {"GetBooleanStatus", offsetof(Functions, get_boolean_status), false},
+    {"GetRealStatus", offsetof(Functions, get_real_status), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -34,11 +36,42 @@ static Status judge_discard(const Functions *f, void *component) {
     return status <= STATUS_WARNING && terminated != 0 ? STATUS_TERMINATED : STATUS_DISCARD;
 }
 
+/* The time at which a discarded step ended; the FMU need not tell it. */
+static double last_successful_time(const Functions *f, void *component, double time) {
+    double last = time;
+
+    if (f->get_real_status == NULL ||
+        sane(f->get_real_status(component, LAST_SUCCESSFUL_TIME, &last)) > STATUS_WARNING) {
+        return time;
+    }
+    return last;
+}
+
+/* Does the rest of a discarded step, from where the FMU returned. An FMU that has done nothing of
+ * it, or refuses to go on, has discarded it. */
+static Status go_on(const Functions *f, void *component, double time, double end, bool no_return) {
+    Status status = judge_discard(f, component);
+
+    while (status == STATUS_DISCARD) {
+        const double reached = last_successful_time(f, component, time);
+        if (!(reached > time && reached < end)) {
+            return STATUS_DISCARD;
+        }
+        time = reached;
+        status = sane(f->do_step(component, time, end - time, no_return));
+        if (status == STATUS_ERROR) {
+            return STATUS_DISCARD;
+        }
+        status = status == STATUS_DISCARD ? judge_discard(f, component) : status;
+    }
+    return status;
+}
+
 static Status do_step(const Library *library, void *component, double time, double step,
                       bool no_return) {
     const Functions *f = functions_of(library);
     const Status status = sane(f->do_step(component, time, step, no_return));
-    return status == STATUS_DISCARD ? judge_discard(f, component) : status;
+    return status == STATUS_DISCARD ? go_on(f, component, time, time + step, no_return) : status;
 }
 
 static bool exchange(const Library *library, const Exchange *e) {

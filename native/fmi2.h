@@ -41,6 +41,7 @@ typedef struct {
     /* co-simulation */
     int (*do_step)(void *component, double time, double step, int no_set_state);
     int (*get_boolean_status)(void *component, int kind, int *value);
+    int (*get_real_status)(void *component, int kind, double *value);
 
     /* model exchange */
     Equations equations;

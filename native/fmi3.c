@@ -1,4 +1,4 @@
-/* FMI 3.0 for co-simulation, without event mode, early return and intermediate update. */
+/* FMI 3.0 for co-simulation: the FMU handles its events within its steps. */
 
 #include "fmi3.h"
 
@@ -14,24 +14,42 @@ static bool bind(Library *library, char *error, size_t size) {
 }
 
 static void *instantiate(const Library *library, const Identity *identity) {
-    return functions_of(library)->instantiate_steps(
-        identity->name, identity->token, identity->resources, false, identity->logging, false,
-        false, NULL, 0, environment_of(identity), log_message_fmi3, NULL);
+    return instantiate_steps(library, identity, false);
 }
 
-static Status do_step(const Library *library, void *instance, double time, double step,
-                      bool no_return) {
+/* Sets early to the time at which the FMU returned, if that is before the end of the step. */
+static Status step_once(const Library *library, void *instance, double time, double step,
+                        bool no_return, double *early) {
     bool event_handling_needed = false, terminate = false, early_return = false;
-    double last_successful_time = time;
+    double reached = time;
     const Status status =
         sane(functions_of(library)->do_step(instance, time, step, no_return, &event_handling_needed,
-                                            &terminate, &early_return, &last_successful_time));
+                                            &terminate, &early_return, &reached));
 
     if (status <= STATUS_WARNING && terminate) {
         return STATUS_TERMINATED;
     }
-    if (status <= STATUS_WARNING && early_return) { /* early return was not allowed */
-        return STATUS_DISCARD;
+    if (status <= STATUS_WARNING && early_return) {
+        *early = reached;
+    }
+    return status;
+}
+
+/* Some FMUs return early although it is not allowed: then the rest of the step follows. */
+static Status do_step(const Library *library, void *instance, double time, double step,
+                      bool no_return) {
+    const double end = time + step;
+    double early = end;
+    Status status = step_once(library, instance, time, step, no_return, &early);
+
+    while (status <= STATUS_WARNING && early < end) {
+        const double reached = early;
+        if (!(reached > time)) {
+            return STATUS_DISCARD;
+        }
+        time = reached;
+        early = end;
+        status = step_once(library, instance, time, end - time, no_return, &early);
     }
     return status;
 }

@@ -17,6 +17,10 @@ typedef int Set3(void *instance, const uint32_t *references, size_t number_of_re
 
 typedef void Logger3(void *environment, int status, const char *category, const char *text);
 
+typedef void IntermediateUpdate3(void *environment, double time, bool set_requested,
+                                 bool get_allowed, bool step_finished, bool can_return_early,
+                                 bool *early_return_requested, double *early_return_time);
+
 typedef struct {
     Common common;
     int (*set_debug_logging)(void *instance, bool on, size_t count, const char *const *categories);
@@ -33,7 +37,7 @@ typedef struct {
                                bool visible, bool logging, bool event_mode_used,
                                bool early_return_allowed, const uint32_t *intermediate_variables,
                                size_t number_of_variables, void *environment, Logger3 *logger,
-                               void (*intermediate_update)(void));
+                               IntermediateUpdate3 *intermediate_update);
     int (*do_step)(void *instance, double time, double step, bool no_set_state,
                    bool *event_handling_needed, bool *terminate, bool *early_return,
                    double *last_successful_time);
@@ -45,6 +49,7 @@ typedef struct {
     int (*update)(void *instance, bool *needs_update, bool *terminate, bool *nominals_changed,
                   bool *states_changed, bool *has_next_time, double *next_time);
     int (*complete)(void *instance, bool no_set_state, bool *event, bool *terminate);
+    ClockFunctions clocks;
     int (*differentiate)(void *instance, const uint32_t *unknowns, size_t number_of_unknowns,
                          const uint32_t *knowns, size_t number_of_knowns, const double *seed,
                          size_t number_of_seeds, double *sensitivity,
@@ -53,6 +58,16 @@ typedef struct {
 
 #define VALUES(name, type)                                                                         \
     ELEMENT("Get" name, Functions, get, type), ELEMENT("Set" name, Functions, set, type)
+
+/* The bindings of functions for events and clocks. */
+#define BINDINGS_OF_EVENTS                                                                         \
+    {"EnterEventMode", offsetof(Functions, equations.enter_events), true},                         \
+    {"UpdateDiscreteStates", offsetof(Functions, update), true},                                   \
+    {"GetClock", offsetof(Functions, clocks.get), false},                                          \
+    {"SetClock", offsetof(Functions, clocks.set), false},                                          \
+    {"GetIntervalDecimal", offsetof(Functions, clocks.get_interval), false},                       \
+    {"GetShiftDecimal", offsetof(Functions, clocks.get_shift), false},                             \
+    {"SetIntervalDecimal", offsetof(Functions, clocks.set_interval), false}
 
 /* The bindings of functions that both interfaces have. */
 #define SHARED_BINDINGS                                                                            \
@@ -108,6 +123,10 @@ static inline Status initialize(const Library *library, void *instance,
         status = sane(f->enter_initialization(instance, e->has_tolerance, e->tolerance,
                                               e->start_time, e->has_stop_time, e->stop_time));
     }
+    if (status <= STATUS_WARNING && start_values.prepare != NULL) {
+        *doing = "preparing the clocks";
+        status = start_values.prepare(start_values.prepared);
+    }
     if (status <= STATUS_WARNING) {
         *doing = "initialization";
         status = sane(f->exit_initialization(instance));
@@ -115,22 +134,55 @@ static inline Status initialize(const Library *library, void *instance,
     return status;
 }
 
+static inline Status update3(const Library *library, void *instance, Events *events) {
+    bool nominals_changed = false, states_changed = false;
+
+    *events = (Events){0};
+    return sane(functions_of(library)->update(instance, &events->again, &events->terminate,
+                                              &nominals_changed, &states_changed,
+                                              &events->has_next, &events->next));
+}
+
+/* FMUs may call it without asking whether it is there. Nobody wants an early return. */
+static inline void ignore_intermediate_update(void *environment, double time, bool set_requested,
+                                              bool get_allowed, bool step_finished,
+                                              bool can_return_early, bool *early_return_requested,
+                                              double *early_return_time) {
+    (void)environment, (void)set_requested, (void)get_allowed, (void)step_finished;
+    (void)can_return_early;
+    if (early_return_requested != NULL) {
+        *early_return_requested = false;
+    }
+    if (early_return_time != NULL) {
+        *early_return_time = time;
+    }
+}
+
+static inline void *instantiate_steps(const Library *library, const Identity *identity,
+                                      bool with_events) {
+    return functions_of(library)->instantiate_steps(
+        identity->name, identity->token, identity->resources, false, identity->logging, with_events,
+        with_events, NULL, 0, environment_of(identity), log_message_fmi3,
+        ignore_intermediate_update);
+}
+
 static inline Status get3(const Library *library, void *instance, Type type,
-                          const uint32_t *references, size_t count, void *values) {
+                          const uint32_t *references, size_t count, void *values, size_t size) {
     Get3 *function = functions_of(library)->get[type];
     if (function == NULL) {
         return STATUS_ERROR;
     }
-    return sane(function(instance, references, count, values, count));
+    return sane(function(instance, references, count, values, size));
 }
 
 static inline Status set3(const Library *library, void *instance, Type type,
-                          const uint32_t *references, size_t count, const void *values) {
+                          const uint32_t *references, size_t count, const void *values,
+                          size_t size) {
     Set3 *function = functions_of(library)->set[type];
     if (function == NULL) {
         return STATUS_ERROR;
     }
-    return sane(function(instance, references, count, values, count));
+    return sane(function(instance, references, count, values, size));
 }
 
 static inline Status set_string3(const Library *library, void *instance, uint32_t reference,

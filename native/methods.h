@@ -4,6 +4,7 @@
 #ifndef FMUGYM_METHODS_H
 #define FMUGYM_METHODS_H
 
+#include "clocks.h"
 #include "fmi.h"
 
 struct Solver;
@@ -22,6 +23,8 @@ typedef struct Method {
 } Method;
 
 extern const Method euler, rk4, dormand_prince, rosenbrock;
+/* No method: the FMU does its steps by itself, and wants events between them. */
+extern const Method by_fmu;
 
 /* NULL if there is none of this name. */
 const Method *method_of(const char *name);
@@ -35,6 +38,9 @@ typedef struct Solving {
     bool completes; /* whether the FMU wants to know of complete steps */
     /* one for each state; NULL if the FMU gives no directional derivatives */
     const uint32_t *state_references, *rate_references;
+    const Clock *clocks;
+    const Clocked *clocked;
+    size_t number_of_clocks, number_of_clocked;
 } Solving;
 
 #endif

@@ -21,7 +21,12 @@ typedef struct {
 typedef struct {
     void *state; /* of the FMU */
     Memory memory;
+    Ticks ticks[]; /* one for each clock */
 } SolvedState;
+
+static size_t size_of_ticks(const Solver *me) {
+    return me->solving->number_of_clocks * sizeof(Ticks);
+}
 
 static const Fmi *fmi_of(const Solver *me) {
     return me->model->fmi;
@@ -39,10 +44,18 @@ static void forget_last(Solved *me) {
 
 static void forget(Solved *me) {
     memset(&me->solver.memory, 0, sizeof me->solver.memory);
+    memset(me->solver.ticks, 0, size_of_ticks(&me->solver));
     me->solver.memory.next_event = INFINITY;
     me->solver.stale = true;
     forget_last(me);
 }
+
+/* The parts of the library's table of functions that are the same for several versions. */
+static const void *functions_at(const Library *library, size_t offset) {
+    return offset == 0 ? NULL : (const char *)library->functions + offset;
+}
+
+static Status set_clocked(Solver *me, size_t clock);
 
 void *solved_take(const Model *model, const Library *library, const Identity *identity,
                   void *component) {
@@ -50,15 +63,16 @@ void *solved_take(const Model *model, const Library *library, const Identity *id
 
     if (me != NULL) {
         me->solver = (Solver){.model = model,
-                              .equations = (const Equations *)((const char *)library->functions +
-                                                               model->equations),
+                              .equations = functions_at(library, model->equations),
+                              .clock_functions = functions_at(library, model->clocks),
+                              .set_clocked = set_clocked,
                               .library = library,
                               .component = component,
                               .solving = identity->solving,
                               .floats = identity->floats,
                               .environment = identity->environment};
-        forget(me);
         if (solver_open(&me->solver)) {
+            forget(me);
             return me;
         }
     }
@@ -86,6 +100,10 @@ Status solved_choose_messages(const Library *library, void *component,
     return fmi_of(me)->choose_messages(library, me->component, categories, count);
 }
 
+static Status prepare(void *solver) {
+    return clocks_prepare(solver);
+}
+
 /* Afterwards the FMU is in continuous time, unless it has asked to stop: the first step then tells
  * so. */
 Status solved_initialize(const Library *library, void *component, const Experiment *experiment,
@@ -94,6 +112,10 @@ Status solved_initialize(const Library *library, void *component, const Experime
 
     forget(component);
     me->memory.time = experiment->start_time;
+    if (me->solving->number_of_clocks > 0) {
+        start_values.prepare = prepare;
+        start_values.prepared = me;
+    }
     const Status status =
         fmi_of(me)->initialize(library, me->component, experiment, start_values, doing);
     if (!good(status)) {
@@ -106,19 +128,30 @@ Status solved_initialize(const Library *library, void *component, const Experime
 
 Status solved_do_step(const Library *library, void *component, double time, double step,
                       bool no_return) {
+    Solver *me = component;
+
     (void)library;
     (void)no_return;
-    return solver_advance(component, time + step);
+    if (me->model->step != NULL) {
+        me->memory.time = time; /* which may differ from the end of the last step by its rounding */
+    }
+    clocks_begin_step(me);
+    return solver_advance(me, time + step);
 }
 
 Status solved_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values) {
+                  size_t count, void *values, size_t size) {
     const Solver *me = component;
-    return fmi_of(me)->get(library, me->component, type, references, count, values);
+
+    if (type == TYPE_CLOCK) {
+        clocks_tell(me, references, count, values);
+        return STATUS_OK;
+    }
+    return fmi_of(me)->get(library, me->component, type, references, count, values, size);
 }
 
 static size_t size_of(const Fmi *fmi, Type type) {
-    static const size_t sizes[NUMBER_OF_TYPES] = {8, 4, 1, 2, 4, 8, 1, 2, 4, 8, 0};
+    static const size_t sizes[NUMBER_OF_TYPES] = {8, 4, 1, 2, 4, 8, 1, 2, 4, 8, 0, 1};
     return type == TYPE_BOOLEAN ? fmi->boolean_size : sizes[type];
 }
 
@@ -142,24 +175,72 @@ static bool is_repeated(LastSet *last, const uint32_t *references, const void *v
     return false;
 }
 
-/* New values of inputs and parameters are an event: they may jump. */
-Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
-    Solved *me = component;
+/* Sets some of the values that were last set, all of them scalars: those of inputs with this clock, or, if there is no
+ * such clock, those of inputs without clocks. */
+static Status set_one_by_one(Solved *me, Type type, size_t clock) {
+    const Solving *s = me->solver.solving;
     const Fmi *fmi = fmi_of(&me->solver);
-    const size_t size = count * size_of(fmi, type);
+    const LastSet *last = &me->last[type];
+    const size_t size = size_of(fmi, type), count = last->references == NULL ? 0 : last->size / size;
     Status status = STATUS_OK;
 
+    for (size_t i = 0; i < count && good(status); i++) {
+        bool due = clock == SIZE_MAX && !clocks_own(&me->solver, last->references[i]);
+        for (size_t j = 0; j < s->number_of_clocked; j++) {
+            due |= s->clocked[j].clock == clock && s->clocked[j].reference == last->references[i];
+        }
+        if (due) {
+            status = fmi->set(me->solver.library, me->solver.component, type, &last->references[i],
+                              1, last->bytes + i * size, 1);
+            floats_restore_if_seen(me->solver.floats);
+        }
+    }
+    return status;
+}
+
+static Status set_clocked(Solver *solver, size_t clock) {
+    Status status = STATUS_OK;
+
+    for (int type = 0; type < TYPE_CLOCK && good(status); type++) {
+        status = set_one_by_one((Solved *)solver, (Type)type, clock);
+    }
+    return status;
+}
+
+static Status set_clocks(Solver *me, const uint32_t *references, size_t count,
+                         const bool *values) {
+    bool any = false;
+
+    for (size_t i = 0; i < count; i++) {
+        any |= values[i];
+    }
+    clocks_ask(me, references, count, values);
+    return any && me->memory.mode == IN_CONTINUOUS_TIME ? solver_enter_events(me) : STATUS_OK;
+}
+
+/* New values of inputs and parameters are an event: they may jump. */
+Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
+                  size_t count, const void *values, size_t size) {
+    Solved *me = component;
+    const Fmi *fmi = fmi_of(&me->solver);
+    Status status = STATUS_OK;
+
+    if (type == TYPE_CLOCK) {
+        return set_clocks(&me->solver, references, count, values);
+    }
     if (me->solver.memory.mode != BEFORE_EVENTS) {
-        if (is_repeated(&me->last[type], references, values, size)) {
+        if (is_repeated(&me->last[type], references, values, size * size_of(fmi, type))) {
             return STATUS_OK;
         }
         if (me->solver.memory.mode == IN_CONTINUOUS_TIME) {
             status = solver_enter_events(&me->solver);
         }
     }
-    if (good(status)) {
-        status = fmi->set(library, me->solver.component, type, references, count, values);
+    if (good(status) && me->solver.solving->number_of_clocked > 0 &&
+        me->solver.memory.mode != BEFORE_EVENTS) {
+        status = set_one_by_one(me, type, SIZE_MAX);
+    } else if (good(status)) {
+        status = fmi->set(library, me->solver.component, type, references, count, values, size);
     }
     if (!good(status)) {
         me->last[type].references = NULL;
@@ -196,13 +277,15 @@ Status solved_get_state(const Library *library, void *component, void **state) {
     const Status status = fmi_of(me)->get_state(library, me->component, &inner);
 
     if (old == NULL || old->state != inner) {
-        saved = malloc(sizeof *saved);
+        saved = malloc(sizeof *saved + size_of_ticks(me));
         free(saved == NULL ? NULL : old);
     }
     if (saved == NULL) {
         return STATUS_ERROR;
     }
-    *saved = (SolvedState){inner, me->memory};
+    saved->state = inner;
+    saved->memory = me->memory;
+    memcpy(saved->ticks, me->ticks, size_of_ticks(me));
     *state = saved;
     if (!good(status) && inner == NULL) {
         free(saved);
@@ -217,6 +300,7 @@ Status solved_set_state(const Library *library, void *component, void *state) {
 
     forget(component);
     me->memory = saved->memory;
+    memcpy(me->ticks, saved->ticks, size_of_ticks(me));
     return fmi_of(me)->set_state(library, me->component, saved->state);
 }
 
@@ -230,11 +314,16 @@ Status solved_free_state(const Library *library, void *component, void **state) 
     return status;
 }
 
+/* Of what is serialized beside the FMU's state. */
+static size_t size_of_memory(const Solver *me) {
+    return sizeof(Memory) + size_of_ticks(me);
+}
+
 size_t solved_state_size(const Library *library, void *component, void *state) {
     const Solver *me = component;
     const SolvedState *saved = state;
     const size_t size = fmi_of(me)->state_size(library, me->component, saved->state);
-    return size == 0 ? 0 : size + sizeof(Memory);
+    return size == 0 ? 0 : size + size_of_memory(me);
 }
 
 Status solved_serialize(const Library *library, void *component, void *state, char *bytes,
@@ -242,23 +331,25 @@ Status solved_serialize(const Library *library, void *component, void *state, ch
     const Solver *me = component;
     const SolvedState *saved = state;
 
+    const size_t own = size_of_memory(me);
     memcpy(bytes, &saved->memory, sizeof(Memory));
-    return fmi_of(me)->serialize(library, me->component, saved->state, bytes + sizeof(Memory),
-                                 size - sizeof(Memory));
+    memcpy(bytes + sizeof(Memory), saved->ticks, size_of_ticks(me));
+    return fmi_of(me)->serialize(library, me->component, saved->state, bytes + own, size - own);
 }
 
 Status solved_deserialize(const Library *library, void *component, const char *bytes, size_t size,
                           void **state) {
     const Solver *me = component;
-    SolvedState *saved = size < sizeof(Memory) ? NULL : calloc(1, sizeof *saved);
+    const size_t own = size_of_memory(me);
+    SolvedState *saved = size < own ? NULL : calloc(1, sizeof *saved + size_of_ticks(me));
 
     if (saved == NULL) {
         return STATUS_ERROR;
     }
     memcpy(&saved->memory, bytes, sizeof(Memory));
-    const Status status =
-        fmi_of(me)->deserialize(library, me->component, bytes + sizeof(Memory),
-                                size - sizeof(Memory), &saved->state);
+    memcpy(saved->ticks, bytes + sizeof(Memory), size_of_ticks(me));
+    const Status status = fmi_of(me)->deserialize(library, me->component, bytes + own, size - own,
+                                                  &saved->state);
     *state = saved;
     if (!good(status)) {
         free(saved);

@@ -60,12 +60,13 @@ bool solver_open(Solver *me) {
     me->n = s->states;
     double *memory = calloc(me->n * rows + 4 * s->indicators + 1, sizeof *memory);
     me->pivots = calloc(me->n + 1, sizeof *me->pivots);
-    if (memory == NULL || me->pivots == NULL) {
-        free(memory);
-        free(me->pivots);
+    me->ticks = calloc(s->number_of_clocks + 1, sizeof *me->ticks);
+    me->active = calloc(s->number_of_clocks + 1, sizeof *me->active);
+    me->arrays = memory;
+    if (memory == NULL || me->pivots == NULL || me->ticks == NULL || me->active == NULL) {
+        solver_close(me);
         return false;
     }
-    me->arrays = memory;
     share_out(me, memory);
     return true;
 }
@@ -73,10 +74,12 @@ bool solver_open(Solver *me) {
 void solver_close(Solver *me) {
     free(me->arrays);
     free(me->pivots);
+    free(me->ticks);
+    free(me->active);
 }
 
 /* Messages of the solver itself look like the FMU's. */
-static Status fail(const Solver *me, const char *format, ...) {
+Status solver_fail(const Solver *me, const char *format, ...) {
     char text[200];
     va_list values;
 
@@ -89,7 +92,7 @@ static Status fail(const Solver *me, const char *format, ...) {
 
 /* Calls of the FMU. Each restores the floating-point environment. */
 
-static void restore_floats(const Solver *me) {
+void solver_restore_floats(const Solver *me) {
     floats_restore_if_seen(me->floats);
 }
 
@@ -99,7 +102,7 @@ static Status place(Solver *me, double time, const double *x) {
     if (good(status) && me->n > 0) {
         status = sane(me->equations->set_states(me->component, x, me->n));
     }
-    restore_floats(me);
+    solver_restore_floats(me);
     return status;
 }
 
@@ -107,7 +110,7 @@ static Status get_indicators(Solver *me, double *z) {
     const size_t count = me->solving->indicators;
     const Status status =
         count == 0 ? STATUS_OK : sane(me->equations->get_indicators(me->component, z, count));
-    restore_floats(me);
+    solver_restore_floats(me);
     return status;
 }
 
@@ -116,7 +119,7 @@ Status solver_rates(Solver *me, double time, const double *x, double *rates) {
 
     if (good(status) && me->n > 0) {
         status = sane(me->equations->get_rates(me->component, rates, me->n));
-        restore_floats(me);
+        solver_restore_floats(me);
     }
     return status;
 }
@@ -131,7 +134,7 @@ static Status read_states(Solver *me) {
     if (good(status) && me->n > 0 && me->solving->method->order > 0.0) {
         status = sane(me->equations->get_nominals(me->component, me->nominals, me->n));
     }
-    restore_floats(me);
+    solver_restore_floats(me);
     for (size_t i = 0; i < me->n; i++) {
         const double nominal = fabs(me->nominals[i]);
         me->nominals[i] = nominal > 0.0 && nominal <= DBL_MAX ? nominal : 1.0;
@@ -159,7 +162,7 @@ static Status know(Solver *me) {
 static Status enter(Solver *me, int (*mode)(void *component)) {
     const Status status = mode == NULL ? STATUS_OK : sane(mode(me->component));
 
-    restore_floats(me);
+    solver_restore_floats(me);
     return status;
 }
 
@@ -170,25 +173,38 @@ Status solver_enter_events(Solver *me) {
     return status;
 }
 
+static Status update(Solver *me, Events *events) {
+    *events = (Events){0};
+    const Status status = me->model->update(me->library, me->component, events);
+
+    solver_restore_floats(me);
+    return status;
+}
+
 Status solver_settle(Solver *me) {
     Events events = {.again = true};
-    Status status = STATUS_OK;
+    Status status = clocks_activate(me);
 
     for (int i = 0; events.again && !events.terminate && good(status); i++) {
         if (i == MOST_UPDATES) {
-            return fail(me, "the discrete states at t = %g s do not settle in %d updates",
+            return solver_fail(me, "the discrete states at t = %g s do not settle in %d updates",
                         me->memory.time, MOST_UPDATES);
         }
-        events = (Events){0};
-        status = me->model->update(me->library, me->component, &events);
-        restore_floats(me);
+        status = clocks_watch(me);
+        if (good(status)) {
+            status = update(me, &events);
+        }
     }
-    me->memory.next_event =
-        events.has_next && !isnan(events.next) ? events.next : INFINITY;
     me->memory.terminated |= events.terminate;
     if (!good(status) || events.terminate) {
         return status;
     }
+    status = clocks_plan(me);
+    if (!good(status)) {
+        return status;
+    }
+    const double next = events.has_next && !isnan(events.next) ? events.next : INFINITY;
+    me->memory.next_event = fmin(next, clocks_next(me));
     status = enter(me, me->equations->enter_continuous);
     me->memory.mode = IN_CONTINUOUS_TIME;
     return good(status) ? read_states(me) : status;
@@ -196,7 +212,7 @@ Status solver_settle(Solver *me) {
 
 static Status handle_event(Solver *me) {
     if (++me->events > MOST_EVENTS) {
-        return fail(me, "the model has more than %d events in a step, the last at t = %.17g s",
+        return solver_fail(me, "the model has more than %d events in a step, the last at t = %.17g s",
                     MOST_EVENTS, me->memory.time);
     }
     const Status status = solver_enter_events(me);
@@ -318,7 +334,7 @@ static Status differentiate_by(Solver *me, size_t state, double *column) {
         const Status status =
             me->model->differentiate(me->library, me->component, s->rate_references, me->n,
                                      s->state_references[state], column);
-        restore_floats(me);
+        solver_restore_floats(me);
         return status;
     }
     memcpy(me->trial, me->x, me->n * sizeof(double));
@@ -420,7 +436,7 @@ static Status take_step(Solver *me, double until, double *end) {
         const bool finite = good(status) && error <= DBL_MAX;
         me->memory.step = size *= finite ? fmin(SAFETY, factor_after(me, error)) : SHRINKAGE;
         if (size < resolution(me, until)) {
-            return fail(me, "the solver %s needs steps below %.3g s at t = %.17g s", method->name,
+            return solver_fail(me, "the solver %s needs steps below %.3g s at t = %.17g s", method->name,
                         size, me->memory.time);
         }
     }
@@ -453,7 +469,7 @@ static Status complete(Solver *me, bool *event) {
 
     if (me->solving->completes) {
         status = me->model->complete(me->library, me->component, event, &terminate);
-        restore_floats(me);
+        solver_restore_floats(me);
     }
     me->memory.terminated |= terminate;
     return status;
@@ -496,6 +512,27 @@ static Status take_whole_step(Solver *me, double until, double *end, bool *event
     return *event ? locate(me, end) : status;
 }
 
+/* Lets the FMU step to this time, or until it wants an event or returns early. */
+static Status step_by_fmu(Solver *me, double until) {
+    const double time = me->memory.time;
+    double reached = until;
+    bool event = false, terminate = false;
+    const Status status = me->model->step(me->library, me->component, time, until - time, &reached,
+                                          &event, &terminate);
+
+    solver_restore_floats(me);
+    if (!good(status)) {
+        return status;
+    }
+    if (!(reached > time || event || terminate) || reached > until + resolution(me, until)) {
+        return solver_fail(me, "the FMU returned from a step from t = %.17g s to %.17g s at %.17g s",
+                           time, until, reached);
+    }
+    me->memory.time = fmin(fmax(time, reached), until);
+    me->memory.terminated |= terminate;
+    return event && !terminate ? handle_event(me) : status;
+}
+
 /* Takes one step, to this time or the first event. */
 static Status step_to(Solver *me, double until) {
     bool state_event = false, step_event = false;
@@ -525,13 +562,16 @@ static bool is_due(const Solver *me, double until) {
 
 static Status handle_time_event(Solver *me) {
     me->memory.time = fmax(me->memory.time, me->memory.next_event);
-    const Status status = place(me, me->memory.time, me->x);
+    const bool is_there = me->model->step != NULL; /* the FMU itself keeps its time */
+    const Status status = is_there ? STATUS_OK : place(me, me->memory.time, me->x);
     return good(status) ? handle_event(me) : status;
 }
 
 Status solver_advance(Solver *me, double until) {
     Memory *memory = &me->memory;
     Status status = STATUS_OK;
+
+    Status (*step)(Solver *, double) = me->model->step != NULL ? step_by_fmu : step_to;
 
     me->events = 0;
     if (memory->mode == IN_EVENTS && !memory->terminated) {
@@ -543,7 +583,7 @@ Status solver_advance(Solver *me, double until) {
         if (is_due(me, until)) {
             status = handle_time_event(me);
         } else if (memory->time < until - resolution(me, until)) {
-            status = step_to(me, fmin(until, memory->next_event));
+            status = step(me, fmin(until, memory->next_event));
         } else {
             memory->time = fmax(memory->time, until);
             break;

@@ -1,4 +1,5 @@
-/* Model exchange: the pool integrates the FMU's equations and handles its events.
+/* Model exchange: the pool integrates the FMU's equations and handles its events. In co-simulation
+ * with event mode the FMU does its steps, and the pool handles the events between them.
  *
  * Everything above sees an instance that can do steps, as in co-simulation: solved.h. */
 
@@ -38,6 +39,11 @@ typedef struct Model {
     /* The derivatives of all rates by one state; NULL in FMI 1.0. */
     Status (*differentiate)(const Library *library, void *component, const uint32_t *rates,
                             size_t count, uint32_t state, double *column);
+    size_t clocks; /* where the functions for clocks are in that table; 0 before FMI 3.0 */
+    /* Lets the FMU step; NULL in model exchange. The FMU may return early, and may want an event
+     * or to stop. */
+    Status (*step)(const Library *library, void *component, double time, double size,
+                   double *reached, bool *event, bool *terminate);
 } Model;
 
 typedef enum { BEFORE_EVENTS, IN_EVENTS, IN_CONTINUOUS_TIME } Mode;
@@ -55,6 +61,9 @@ typedef struct {
 typedef struct Solver {
     const Model *model;
     const Equations *equations;
+    const ClockFunctions *clock_functions; /* NULL before FMI 3.0 */
+    /* Sets the inputs that may be set while this clock ticks. */
+    Status (*set_clocked)(struct Solver *me, size_t clock);
     const Library *library;
     void *component;
     const Solving *solving;
@@ -77,6 +86,8 @@ typedef struct Solver {
     double *stages;     /* n for each stage of the method */
     double *jacobian, *matrix, *slope; /* for methods that need them */
     uint32_t *pivots;
+    Ticks *ticks; /* one for each clock */
+    bool *active; /* whether each clock ticks in this event, or is to tick in the next one */
 } Solver;
 
 /* Allocates the arrays. Returns whether there was enough memory. */
@@ -89,6 +100,10 @@ Status solver_settle(Solver *me);
 Status solver_enter_events(Solver *me);
 /* Integrates to this time, and handles all events until then and at it. */
 Status solver_advance(Solver *me, double until);
+
+/* For clocks.c. The first logs a message like one of the FMU, and returns an Error. */
+Status solver_fail(const Solver *me, const char *format, ...);
+void solver_restore_floats(const Solver *me);
 
 /* For the methods: the rates at a time and state. */
 Status solver_rates(Solver *me, double time, const double *x, double *rates);

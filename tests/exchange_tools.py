@@ -16,6 +16,7 @@ STATES = {
     "tank": ["x"],
     "prothero": ["x"],
     "relay": ["x"],
+    "sun": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -30,12 +31,14 @@ OTHERS = {
     "tank": ["u", "discards"],
     "prothero": ["k"],
     "relay": ["turns", "last", "speed"],
+    "sun": ["now", "sine", "seconds", "u"],
 }
 """The other variables in the order of their value references."""
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
 OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns"}
+OUTPUTS |= {"now", "sine", "seconds"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},
     "ball": {"h": 1, "v": 0, "g": -9.81, "e": 0.7, "v_min": 0.1},
@@ -46,6 +49,7 @@ START = {
     "tank": {"x": 0.01, "u": 0},
     "prothero": {"x": 1, "k": 1},
     "relay": {"x": 0, "last": 1e9, "speed": 1},
+    "sun": {"x": 0, "u": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}
@@ -58,7 +62,7 @@ def names(model):
     return [*states, *(f"der({name})" for name in states), *OTHERS[model]]
 
 
-def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags=""):
+def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags="", options=()):
     """Write an FMU.
 
     Args:
@@ -67,21 +71,24 @@ def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags=""
         version: Of FMI.
         interfaces: The elements of those that it offers.
         flags: More attributes of each.
+        options: More arguments of the compiler.
     """
     files = {
         "modelDescription.xml": describe(model, version, interfaces, flags),
-        fmu_tools.library_name(version, "Model"): library(model, version),
+        fmu_tools.library_name(version, "Model"): library(model, version, options),
     }
     return fmu_tools.write_fmu(Path(path), files)
 
 
-def library(model, version):
+def library(model, version, options=()):
     """The compiled library of a model for a version of FMI."""
     shim = f"exchange/fmi{version}.c"
     prefix = "Model_fmi" if version == 1 else f"fmi{version}"
     stubs = fmu_tools.stubs(version, prefix, building.HERE / shim)
     sources = [f"exchange/{name}.c" for name in ("core", "usual", model)]
-    return building.library(*sources, shim, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
+    return building.library(
+        *sources, shim, flags=(f"-DFMI_VERSION={version}", *options), stubs=stubs
+    )
 
 
 def describe(model, version, interfaces=("ModelExchange",), flags=""):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import fmugym
 from fmugym.tools.cli import main
@@ -308,3 +309,85 @@ class TestDamagedAgents:
         assert (code, out) == (1, "")
         assert "another task" in err
         assert err.count("\n") == 1
+
+
+def recorded(path):
+    """The rows of a recording without the numbers of episodes."""
+    rows = csv.DictReader(path.read_text().splitlines())
+    return [{k: v for k, v in row.items() if k != "episode"} for row in rows]
+
+
+class TestRecord:
+    COMMON = ("--envs", "3", "--steps", "288", "--episodes", "2", *ON_POLICY)
+    RECORD = ("--record", "q*", "--record", "tau", "--record-env", "0", "--record-env", "2")
+
+    def test_recordings_are_of_the_training_and_change_nothing(self, task, tmp_path, capsys):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        plain, folder = tmp_path / "plain", tmp_path / "agent"
+        assert run(capsys, "train", task, "--output", plain, *self.COMMON)[0] == 0
+        code, *_ = run(capsys, "train", task, "--output", folder, *self.COMMON, *self.RECORD)
+        assert code == 0
+        assert parameters(folder) == parameters(plain)
+        assert (folder / "evaluations.csv").read_text() == (plain / "evaluations.csv").read_text()
+        rows = recorded(folder / "records" / "training.csv")
+        assert list(rows[0])[:5] == ["environment", "step", "time [s]", "tau [N.m]", "q [rad]"]
+        steps = [row for row in rows if row["step"] != "0"]
+        assert [row["environment"] for row in steps[:4]] == ["0", "2", "0", "2"]
+        assert len(steps) == 288 / 3 * 2
+        assert all(abs(float(row["reward"])) == abs(float(row["q [rad]"])) for row in steps)
+        for row in csv.DictReader((folder / "evaluations.csv").read_text().splitlines()):
+            path = folder / "records" / f"evaluation-{row['steps']}-held-out_seeds.csv"
+            rewards = [float(one["reward"]) for one in recorded(path)]
+            assert float(row["reward"]) == pytest.approx(sum(rewards) / 2, rel=1e-12)
+        with Image.open(folder / "evaluations.png") as image:
+            assert min(image.size) > 200
+        page = (folder / "report.html").read_text(encoding="utf-8")
+        best = json.loads((folder / "agent.json").read_text())
+        assert f"<dd>{best['steps']}</dd>" in page
+        assert page.count("<figure>") == 2
+        assert "task.toml" in page
+        assert not (plain / "report.html").exists()
+
+    def test_a_training_that_is_resumed_goes_on_with_its_recordings(
+        self, task, tmp_path, capsys, monkeypatch
+    ):
+        import stable_baselines3
+
+        whole, parts = tmp_path / "whole", tmp_path / "parts"
+        rate = "--record-every", "0.1"
+        arguments = *self.COMMON, *self.RECORD, *rate
+        assert run(capsys, "train", task, "--output", whole, *arguments)[0] == 0
+        calls, original = iter(range(2)), stable_baselines3.PPO.train
+
+        def train(self, *args, **kwargs):
+            if next(calls, None) is None:
+                raise KeyboardInterrupt
+            return original(self, *args, **kwargs)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(stable_baselines3.PPO, "train", train)
+            assert run(capsys, "train", task, "--output", parts, *arguments)[0] == 130
+        begin = json.loads((parts / "checkpoint.json").read_text())["steps"]
+        assert run(capsys, "train", task, "--output", parts, "--resume")[0] == 0
+        again = recorded(parts / "records" / f"training_from_{begin}.csv")
+        assert len(again) > 30
+        assert again == recorded(whole / "records" / "training.csv")[-len(again) :]
+        for path in (whole / "records").glob("evaluation-*"):
+            assert (parts / "records" / path.name).read_text() == path.read_text()
+
+    @pytest.mark.parametrize(
+        ("options", "fact"),
+        [
+            (["--record", "qq"], "'qq'"),
+            (["--record", "q", "--record-env", "3"], "0 to 2"),
+            (["--record", "q", "--record-every", "0.01"], "0.05"),
+            (["--record", "q", "--record-format", "cvs"], "'csv'"),
+            (["--record-env", "1"], "--record "),
+        ],
+    )
+    def test_mistakes_are_told_before_the_training(self, options, fact, task, tmp_path, capsys):
+        folder = tmp_path / "agent"
+        code, out, err = run(capsys, "train", task, "--output", folder, *self.COMMON, *options)
+        assert (code, out) == (1, "")
+        assert fact in err
+        assert not folder.exists()

@@ -22,7 +22,8 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
-    {"envs", "tools"},
+    {"export"},
+    {"envs", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

@@ -228,15 +228,47 @@ def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode):
         rows = many.series.values[many.series["environment"] == index][:, 1:]
         expected = one.series.values.copy()
         assert one.series["truncated"].sum() >= 2
-        if mode == "same_step":  # the FMUs are in the next episode already
-            lost = (one.series["terminated"] + one.series["truncated"]) > 0
-            names = [column.name for column in one.series.columns]
-            gone = slice(names.index("time") + 1, names.index("observation.angle"))
-            expected[lost, gone] = np.nan
         assert np.array_equal(rows, expected, equal_nan=True)
         one.close()
     assert set(many.series["environment"]) == {0, 2}
     many.close()
+
+
+def driven(mode, begins):
+    """Everything that 30 steps of three environments return, and a recording from a step on."""
+    envs = FMUVectorEnv(make, 3, autoreset_mode=mode)
+    envs.action_space.seed(5)
+    used = RecordVectorSeries(envs) if begins == 0 else envs
+    used.reset(seed=9)
+    told = []
+    for number in range(30):
+        if number == begins > 0:
+            used = RecordVectorSeries(envs)
+        told += used.step(envs.action_space.sample())[:4]
+    used.close()
+    return np.concatenate(told, None), used.series
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_a_recorder_changes_nothing_and_may_begin_late(mode):
+    results, whole = driven(mode, 0)
+    assert whole["truncated"].sum() > 3
+    for begins in (1, 5):  # in the first episodes
+        same, late = driven(mode, begins)
+        assert np.array_equal(results, same)
+        missing = 3 * (begins + 1)  # the resets and the steps before
+        kept = [column.name != "episode" for column in whole.columns]
+        assert np.array_equal(whole.values[missing:, kept], late.values[:, kept], equal_nan=True)
+
+
+def test_a_recorder_of_one_environment_may_begin_late():
+    env = make()
+    env.reset(seed=3)
+    env.step(env.action_space.sample())
+    late = RecordSeries(env)
+    late.step(env.action_space.sample())
+    assert late.series["step"].tolist() == [2]
+    late.close()
 
 
 def test_steps_in_the_background_and_masked_resets():

@@ -31,6 +31,8 @@ MODULES: Final = {
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
+    "RLlib": "fmugym.rllib",
+    "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",
     "Pictures": "fmugym.rendering",

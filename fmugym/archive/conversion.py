@@ -11,6 +11,7 @@ from typing import Any, Final
 from fmpy.validation import validate_model_description
 
 from fmugym.archive.description import (
+    CLOCK_KINDS,
     INTERFACES,
     Capabilities,
     ModelDescription,
@@ -51,7 +52,10 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     interface, offer = _choose(source, interface)
     experiment = source.defaultExperiment
     _read_unsigned_limits(source, root)
-    variables = {v.name: _convert_variable(v) for v in source.modelVariables}
+    elements = {element.get("name"): element for element in root.find("ModelVariables")}
+    variables = {
+        v.name: _convert_variable(v, elements.get(v.name, {})) for v in source.modelVariables
+    }
     return ModelDescription(
         fmi_version=source.fmiVersion,
         model_name=source.modelName or "",
@@ -72,6 +76,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         error_categories=_error_categories(root),
         units=_units(root),
         interface=interface,
+        has_event_mode=_has_event_mode(root, interface),
         model_exchange=None if interface == "co_simulation" else _model_exchange(source, root),
     )
 
@@ -101,6 +106,12 @@ def _model_exchange(source: Any, root: Any) -> ModelExchange:
         tuple(int(state.valueReference) for state in states) if scalar else (),
         tuple(int(variable.valueReference) for variable in derivatives) if scalar else (),
     )
+
+
+def _has_event_mode(root: Any, interface: str) -> bool:
+    element = root.find("CoSimulation")
+    offered = element is not None and element.get("hasEventMode") in {"true", "1"}
+    return offered and interface == "co_simulation" and root.get("fmiVersion", "").startswith("3")
 
 
 def _count(source: Any, attribute: str) -> int:
@@ -212,16 +223,17 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         interface == "model_exchange" or offer.canHandleVariableCommunicationStepSize,
         offer.canGetAndSetFMUstate,
         offer.canSerializeFMUstate,
-        _provides_directional_derivatives(root, _ELEMENTS[interface]),
+        _provides(root, _ELEMENTS[interface], "Directional"),
         offer.canBeInstantiatedOnlyOncePerProcess,
         offer.needsExecutionTool,
+        _provides(root, _ELEMENTS[interface], "Adjoint"),
     )
 
 
-def _provides_directional_derivatives(root: Any, element: str) -> bool:
-    """Read the flag. FMI 3.0 spells it in the plural, which FMPy does not read."""
+def _provides(root: Any, element: str, kind: str) -> bool:
+    """Read a flag for derivatives. FMI 3.0 spells it in the plural, which FMPy does not read."""
     attributes = root.find(element).attrib
-    names = ("providesDirectionalDerivative", "providesDirectionalDerivatives")
+    names = (f"provides{kind}Derivative", f"provides{kind}Derivatives")
     return any(attributes.get(name) in {"true", "1"} for name in names)
 
 
@@ -250,8 +262,9 @@ def _read_unsigned_limits(source: Any, root: Any) -> None:
             variable.min, variable.max = element.get("min"), element.get("max")
 
 
-def _convert_variable(source: Any) -> Variable:
+def _convert_variable(source: Any, element: Any) -> Variable:
     _check_reference(source)
+    ticking = _ticking(source, element)
     return Variable(
         name=source.name,
         type=source.type,
@@ -267,7 +280,39 @@ def _convert_variable(source: Any) -> Variable:
         description=source.description or "",
         items=_items(source),
         shape=tuple(source.shape or ()),
+        clocks=tuple(map(int, (element.get("clocks") or "").split())),
+        ticking=ticking,
+        interval=_clock_time(element, "interval") if ticking else math.nan,
+        shift=_shift(element, ticking),
     )
+
+
+def _ticking(source: Any, element: Any) -> str:
+    if source.type != "Clock":
+        return ""
+    kind = element.get("intervalVariability")
+    if kind not in CLOCK_KINDS:
+        raise FMULoadError(
+            f"the clock {source.name!r} has intervalVariability={kind!r}, expected one of "
+            f"{', '.join(CLOCK_KINDS)}"
+        )
+    return str(kind)
+
+
+def _shift(element: Any, ticking: str) -> float:
+    """The time before the first tick. Only the FMU knows that of a calculated clock."""
+    shift = _clock_time(element, "shift")
+    return 0.0 if math.isnan(shift) and ticking != "calculated" else shift
+
+
+def _clock_time(element: Any, name: str) -> float:
+    """An interval or shift in seconds, given as a decimal or a fraction; NaN if it is not given."""
+    decimal, counter = element.get(f"{name}Decimal"), element.get(f"{name}Counter")
+    if decimal is not None:
+        return float(decimal)
+    if counter is None or element.get("resolution") is None:
+        return math.nan
+    return int(counter) / int(element.get("resolution"))
 
 
 def _check_reference(source: Any) -> None:

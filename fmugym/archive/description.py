@@ -7,15 +7,26 @@ from an FMU's XML.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
+from typing import Any, Final
 
 import fmpy
 
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["INTERFACES", "Capabilities", "ModelDescription", "ModelExchange", "Unit", "Variable"]
+__all__ = [
+    "CLOCK_KINDS",
+    "INTERFACES",
+    "Capabilities",
+    "ModelDescription",
+    "ModelExchange",
+    "Unit",
+    "Variable",
+]
 
 INTERFACES = ("co_simulation", "model_exchange")
 """The interfaces by which an FMU may be run, the preferred one first."""
@@ -29,9 +40,28 @@ _KINDS = {
     "Enumeration": "enumeration",
     "String": "string",
     "Binary": "binary",
-    "Clock": "clock",
+    "Clock": "boolean",
+    "StartTime": "real",  # no type of FMI; see ``fmugym.pool.spec.START_TIME``
 }
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
+
+
+MOST_ELEMENTS: Final = 100_000
+"""How many elements an array may have of which elements are named."""
+
+_ELEMENT: Final = re.compile(r"(.+)\[(\d{1,9}(?:, ?\d{1,9})*)\]")
+"""The name of an element: that of its array, and its indices."""
+
+CLOCK_KINDS = (
+    "constant",
+    "fixed",
+    "calculated",
+    "tunable",
+    "changing",
+    "countdown",
+    "triggered",
+)
+"""The interval variabilities of clocks. Those before the last one have ticks of their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +75,12 @@ class Variable:
         nominal: None where neither the variable nor its declared type gives a finite number.
         items: Names and values of an enumeration.
         shape: The shape of an array (FMI 3.0); () for a scalar.
+        array: Of an element of an array, the array; None for other variables.
+        place: Of an element, its place in the array, in row-major order.
+        clocks: The value references of the clocks that must tick whenever the value changes.
+        ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
+        interval, shift: Of a clock: the time between its ticks and that before the first one in
+            seconds; NaN where only the FMU knows.
     """
 
     name: str
@@ -61,21 +97,35 @@ class Variable:
     description: str = ""
     items: tuple[tuple[str, int], ...] = ()
     shape: tuple[int, ...] = ()
+    array: Variable | None = None
+    place: int = 0
+    clocks: tuple[int, ...] = ()
+    ticking: str = ""
+    interval: float = math.nan
+    shift: float = math.nan
 
     @property
     def kind(self) -> str:
-        """One of real, integer, boolean, enumeration, string, binary and clock."""
+        """One of real, integer, boolean, enumeration, string and binary.
+
+        A clock is a Boolean: whether it ticks.
+        """
         return _KINDS.get(self.type, "integer")
 
     @property
     def numeric(self) -> bool:
         """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration."""
-        return self.kind in {"real", "integer", "boolean", "enumeration"} and not self.shape
+        return self.is_number and not self.shape
+
+    @property
+    def is_number(self) -> bool:
+        """Whether float64 can hold its value, or those of its elements."""
+        return self.kind in {"real", "integer", "boolean", "enumeration"}
 
     @property
     def settable_at_start(self) -> bool:
         """Whether a value may be set between instantiation and initialization."""
-        if self.variability == "constant":
+        if self.variability == "constant" or self.ticking:
             return False
         return self.causality == "input" or self.initial in {"exact", "approx"}
 
@@ -83,25 +133,71 @@ class Variable:
     def settable_in_step(self) -> bool:
         """Whether a value may be set between two steps."""
         tunable = self.causality == "parameter" and self.variability == "tunable"
+        if self.ticking:
+            return self.causality == "input" and self.ticking == "triggered"
         return self.causality == "input" or tunable
 
     @property
+    def number(self) -> int:
+        """Of a clock: its kind as ``enum ClockKind`` of ``native/clocks.h``."""
+        is_output = self.ticking == "triggered" and self.causality != "input"
+        return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
+
+    @property
     def start_number(self) -> float:
-        """The start value of a numeric variable; 0 if the FMU gives none.
+        """The start value of a numeric scalar or element; 0 if the FMU gives none.
 
         Raises:
             ConfigError: If it is not a finite number.
         """
-        text = "0" if self.start is None else self.start
-        try:
-            number = float({"true": "1", "false": "0"}.get(text, text))
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
+        if self.array is not None:
+            return self.array.start_numbers[self.place]
+        return _number(self.name, "0" if self.start is None else self.start)
+
+    @cached_property
+    def start_numbers(self) -> tuple[float, ...]:
+        """The start values of the elements of a numeric array, in row-major order.
+
+        A single start value is that of all elements; without any they are 0.
+
+        Raises:
+            ConfigError: If their number is neither, or one is not a finite number.
+        """
+        texts = (self.start or "0").split()
+        if len(texts) == 1:
+            texts *= self.size
+        if len(texts) != self.size:
             raise ConfigError(
-                f"the start value of {self.name!r} is {text!r}, expected a finite number"
+                f"{self.name!r} is an array of {self.size} elements and has {len(texts)} start "
+                "values in the FMU"
             )
-        return number
+        return tuple(_number(self.name, text) for text in texts)
+
+    @property
+    def size(self) -> int:
+        """The number of values that FMI moves when it moves this variable; 1 for a scalar."""
+        return math.prod(self.shape if self.array is None else self.array.shape)
+
+    @cached_property
+    def elements(self) -> tuple[Variable, ...]:
+        """The elements of an array in row-major order: ``y[1,1]``, ``y[1,2]``, ...
+
+        A scalar is its own only element.
+
+        Raises:
+            ConfigError: If there are too many to name each.
+        """
+        if not self.shape:
+            return (self,)
+        if self.size > MOST_ELEMENTS:
+            raise ConfigError(
+                f"{self.name!r} is an array of {self.size} elements, at most {MOST_ELEMENTS} can "
+                "be used"
+            )
+        return tuple(
+            replace(self, name=f"{self.name}[{_index(place)}]", shape=(), array=self, place=number)
+            for number, place in enumerate(product(*map(range, self.shape)))
+        )
 
     @property
     def integer_limits(self) -> tuple[int, int]:
@@ -110,6 +206,33 @@ class Variable:
             return 0, 2 ** int(self.type[4:]) - 1
         bits = _INTEGER_BITS[self.type]
         return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        number = float({"true": "1", "false": "0"}.get(text, text))
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ConfigError(f"the start value of {name!r} is {text!r}, expected a finite number")
+    return number
+
+
+def _place(array: Variable, index: str) -> int | None:
+    """The place of an element in row-major order; None if the array has no such element."""
+    numbers = [int(number) - 1 for number in index.split(",")]
+    fits = len(numbers) == len(array.shape)
+    if not fits or not all(0 <= n < size for n, size in zip(numbers, array.shape, strict=True)):
+        return None
+    place = 0
+    for number, size in zip(numbers, array.shape, strict=True):
+        place = place * size + number
+    return place
+
+
+def _index(place: tuple[int, ...]) -> str:
+    """The index of an element as Modelica writes it: the first one is 1."""
+    return ",".join(str(number + 1) for number in place)
 
 
 @dataclass(frozen=True)
@@ -122,6 +245,12 @@ class Capabilities:
     provides_directional_derivatives: bool = False
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
+    provides_adjoint_derivatives: bool = False
+
+    @property
+    def provides_derivatives(self) -> bool:
+        """Whether the FMU differentiates itself, in one way or the other."""
+        return self.provides_directional_derivatives or self.provides_adjoint_derivatives
 
 
 @dataclass(frozen=True)
@@ -180,6 +309,7 @@ class ModelDescription:
         findings: Rules of the standard that the file breaks, as texts.
         error_categories: The declared log categories of errors and warnings.
         units: The units that the XML defines, by name.
+        has_event_mode: Whether the FMU offers event mode in co-simulation.
     """
 
     fmi_version: str
@@ -202,11 +332,39 @@ class ModelDescription:
     units: Mapping[str, Unit] = field(default_factory=dict)
     interface: str = "co_simulation"
     model_exchange: ModelExchange | None = None
+    has_event_mode: bool = False
 
     @cached_property
     def fmi_major_version(self) -> int:
         """1, 2 or 3."""
         return int(self.fmi_version.split(".")[0])
+
+    @cached_property
+    def uses_event_mode(self) -> bool:
+        """Whether the pool handles events between the FMU's steps, in co-simulation of FMI 3.0.
+
+        It does so where only this gives them their time: where the FMU has clocks or discrete
+        inputs. Other FMUs handle their events within their steps.
+        """
+        needed = any(
+            variable.ticking or (variable.causality, variable.variability) == ("input", "discrete")
+            for variable in self.variables.values()
+        )
+        return self.has_event_mode and needed
+
+    @cached_property
+    def clocks(self) -> tuple[Variable, ...]:
+        """The clocks that tick; none where neither the pool nor model exchange has events."""
+        if not self.uses_event_mode and self.model_exchange is None:
+            return ()
+        return tuple(v for v in self.variables.values() if v.ticking and not v.shape)
+
+    @cached_property
+    def clocked_inputs(self) -> tuple[Variable, ...]:
+        """The inputs that may be set only while one of their clocks ticks."""
+        known = {clock.value_reference for clock in self.clocks}
+        inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
+        return tuple(v for v in inputs if known.issuperset(v.clocks))
 
     @property
     def has_reset(self) -> bool:
@@ -219,7 +377,7 @@ class ModelDescription:
         return str(fmpy.platform_tuple if self.fmi_major_version == 3 else fmpy.platform)
 
     def variable(self, name: str) -> Variable:
-        """Look a variable up by its name.
+        """Look a variable, or an element of an array as ``y[2]`` or ``y[1,3]``, up by its name.
 
         Raises:
             ConfigError: If there is no such variable; the message suggests the nearest name.
@@ -227,6 +385,57 @@ class ModelDescription:
         try:
             return self.variables[name]
         except Exception:  # a KeyError; or something that is no key at all
-            raise unknown_name(
-                f"variable of {self.model_name}", name, list(self.variables)
-            ) from None
+            known = list(self.variables)
+        array, index = self._array_and_index(name)
+        if array is None:
+            raise unknown_name(f"variable of {self.model_name}", name, known)
+        place = _place(array, index)
+        if place is None:
+            raise ConfigError(
+                f"{name!r} is no element of {array.name!r}, an array of shape {array.shape}; its "
+                f"indices begin with 1"
+            )
+        return array.elements[place]
+
+    def _array_and_index(self, name: Any) -> tuple[Variable | None, str]:
+        """Take the name of an element apart; no array if it is not the name of one."""
+        match = _ELEMENT.fullmatch(name) if isinstance(name, str) else None
+        array = None if match is None else self.variables.get(match[1])
+        return (array, match[2]) if array and match and array.shape else (None, "")
+
+    def find(self, name: str) -> Variable | None:
+        """Do what ``variable`` does, but return None if there is no such variable."""
+        try:
+            return self.variable(name)
+        except ConfigError:
+            return None
+
+    def scalars(self, name: str) -> tuple[Variable, ...]:
+        """Look up the scalars that a name stands for.
+
+        The name of an array stands for its elements in row-major order. FMI 1.0 and 2.0 have no
+        arrays: there ``y`` stands for the variables ``y[1]``, ``y[2]``, ... unless a variable has
+        this name.
+
+        Raises:
+            ConfigError: If there is no such variable, or an array has too many elements.
+        """
+        if isinstance(name, str) and name not in self.variables:
+            named = self._named_arrays.get(name)
+            if named is not None:
+                return named
+        return self.variable(name).elements
+
+    @cached_property
+    def _named_arrays(self) -> Mapping[str, tuple[Variable, ...]]:
+        """The scalars that are elements of an array by their names only, by the array's name."""
+        found: dict[str, list[tuple[tuple[int, ...], Variable]]] = {}
+        for name, variable in self.variables.items():
+            match = _ELEMENT.fullmatch(name)
+            if match is not None and not variable.shape:
+                index = tuple(int(number) for number in match[2].split(","))
+                found.setdefault(match[1], []).append((index, variable))
+        return {
+            name: tuple(variable for _, variable in sorted(elements, key=lambda e: e[0]))
+            for name, elements in found.items()
+        }

@@ -12,6 +12,7 @@ from fmugym.baselines.base import Controller, FloatArray, Numbers, Signal, check
 from fmugym.errors import ConfigError
 from fmugym.lazy import scipy_module
 from fmugym.linearization import LinearModel
+from fmugym.vector.trajectories import discrete
 
 __all__ = ["LQR", "PID", "Hysteresis"]
 
@@ -150,7 +151,8 @@ class LQR(Controller):
     def _prepare(self) -> None:
         for name in self.of:
             self._check_signal("of", name)
-        a, b = _discrete(self.model, self.time_step)
+        slopes = np.concatenate([self.model.A, self.model.B], axis=1)
+        (a,), (b,) = discrete(slopes[np.newaxis], self.time_step)
         linalg = scipy_module("linalg")
         try:
             cost = linalg.solve_discrete_are(a, b, self._q, self._r)
@@ -173,12 +175,3 @@ def _weights(what: str, value: Any, size: int) -> FloatArray:
     if matrix.shape != (size, size):
         raise ConfigError(f"{what} must have {size} weights or shape ({size}, {size})")
     return matrix
-
-
-def _discrete(model: LinearModel, time_step: float) -> tuple[FloatArray, FloatArray]:
-    """The model over one step with constant inputs, by one matrix exponential (Van Loan 1978)."""
-    n, m = model.B.shape
-    joined = np.zeros((n + m, n + m))
-    joined[:n, :n], joined[:n, n:] = model.A, model.B
-    exponential = scipy_module("linalg").expm(joined * time_step)
-    return exponential[:n, :n], exponential[:n, n:]

@@ -3,17 +3,33 @@
 from __future__ import annotations
 
 import inspect
+import math
+import re
 import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.baselines.base import Controller
+import numpy as np
+
+from fmugym.baselines.base import Controller, FloatArray
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
+from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["controller_of"]
+__all__ = ["Search", "controller_of", "search_of"]
 
 _KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "pid": PID}
+
+_DECADE: Final = 10.0
+"""Ranges whose ends differ by this factor are searched on a logarithmic scale."""
+
+_DIGITS: Final = 5
+"""Significant digits of the numbers of a search, so that a text holds all of them."""
+
+_MARGIN: Final = 0.01
+"""A number is at an end of its range within this fraction of the range."""
 
 
 def controller_of(text: str) -> Controller:
@@ -26,15 +42,117 @@ def controller_of(text: str) -> Controller:
     Raises:
         ConfigError: If there is no such controller, or its arguments are wrong.
     """
+    kind, arguments = _parts(text)
+    if kind == "schedule":
+        return Schedule(arguments)
+    return _made(_KINDS[kind], arguments)
+
+
+def _parts(text: str) -> tuple[str, dict[str, Any]]:
+    """The kind of a controller and its arguments."""
     try:
         kind, *words = shlex.split(text)
     except ValueError:  # empty, or a quotation mark without its other half
         raise ConfigError(f"expected a controller and its arguments, got {shown(text)}") from None
-    if kind == "schedule":
-        return Schedule(dict(map(_argument, words)))
-    if kind not in _KINDS:
+    if kind not in (*_KINDS, "schedule"):
         raise unknown_name("controller", kind, [*_KINDS, "schedule"])
-    return _made(_KINDS[kind], dict(map(_argument, words)))
+    return kind, dict(map(_argument, words))
+
+
+@dataclass(frozen=True)
+class Search:
+    """A controller some of whose numbers are to be found.
+
+    Attributes:
+        kind: The name of its class in texts.
+        fixed: The arguments that are given.
+        ranges: The numbers to be found, each with the values to be tried.
+    """
+
+    kind: str
+    fixed: Mapping[str, Any]
+    ranges: Mapping[str, Uniform | LogUniform]
+
+    def make(self, **numbers: Any) -> Controller:
+        """Make the controller with some numbers, which are rounded as in ``text``."""
+        found = {name: _rounded(value) for name, value in numbers.items()}
+        return _made(_KINDS[self.kind], {**self.fixed, **found})
+
+    def text(self, numbers: Mapping[str, float]) -> str:
+        """The controller with some numbers, as ``controller_of`` reads it."""
+        found = self.numbers(numbers)
+        given = {name: found.get(name, value) for name, value in self._in_order().items()}
+        words = [f"{name}={str(value).removesuffix('.0')}" for name, value in given.items()]
+        return shlex.join([self.kind, *words])
+
+    def numbers(self, found: Mapping[str, float]) -> dict[str, float]:
+        """The numbers as ``text`` has them."""
+        return {name: _rounded(value) for name, value in found.items()}
+
+    def at_an_end(self, found: Mapping[str, float]) -> list[str]:
+        """The numbers that are within a hundredth of an end of their ranges."""
+        return [name for name, one in self.ranges.items() if _is_at_an_end(one, found[name])]
+
+    def _in_order(self) -> dict[str, Any]:
+        everything = {**self.fixed, **self.ranges}
+        order = list(inspect.signature(_KINDS[self.kind]).parameters)
+        return {name: everything[name] for name in order if name in everything}
+
+
+def search_of(text: str) -> Search:
+    """Read a controller of which some numbers are ranges.
+
+    Args:
+        text: As for ``controller_of``, with ``LOW..HIGH`` in the place of numbers that are to be
+            found: ``"pid of=T setpoint=20..22 kp=0.05..5 ti=1800..400000"``. A range whose ends
+            are positive and differ by a factor of ten or more is searched on a logarithmic scale.
+
+    Raises:
+        ConfigError: If there is no such controller, nothing is to be found, or an argument is
+            wrong.
+    """
+    kind, arguments = _parts(text)
+    if kind == "schedule":
+        raise ConfigError(f"a schedule cannot be tuned; known are: {', '.join(_KINDS)}")
+    found = {name: _range(name, value) for name, value in arguments.items()}
+    ranges = {name: one for name, one in found.items() if one is not None}
+    fixed = {name: value for name, value in arguments.items() if name not in ranges}
+    search = Search(kind, fixed, ranges)
+    search.make(**{name: one.low for name, one in ranges.items()})  # raises for wrong arguments
+    search.make(**{name: one.high for name, one in ranges.items()})
+    if not ranges:
+        raise ConfigError(
+            f"nothing in {shown(text)} is to be found; give a range in the place of a number, "
+            "such as kp=0.05..5"
+        )
+    return search
+
+
+def _range(name: str, value: Any) -> Uniform | LogUniform | None:
+    """The range that a text gives; None if it gives none."""
+    parts = re.split(r"\.\.(?=[^.])", value) if isinstance(value, str) else []
+    if len(parts) != 2:
+        return None
+    try:
+        low, high = map(float, parts)
+    except ValueError:
+        raise ConfigError(f"expected a range such as {name}=0.05..5, got {shown(value)}") from None
+    is_wide = low > 0 and high >= _DECADE * low
+    return LogUniform(low, high) if is_wide else Uniform(low, high)
+
+
+def _is_at_an_end(given: Uniform | LogUniform, value: float) -> bool:
+    low, high = given.low, given.high
+    if isinstance(given, LogUniform):
+        low, high, value = math.log(low), math.log(high), math.log(value)
+    return min(value - low, high - value) <= _MARGIN * (high - low)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        rounded: FloatArray = np.array([_rounded(one) for one in value.tolist()])
+        return rounded
+    return float(f"{value:.{_DIGITS}g}")
 
 
 def _argument(word: str) -> tuple[str, Any]:

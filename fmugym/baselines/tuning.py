@@ -50,6 +50,7 @@ def tune(
     rounds: int = 20,
     most_steps: int = 10_000,
     seed: int = 0,
+    watch: Callable[[Tuning], None] | None = None,
 ) -> Tuning:
     """Find the numbers with which a controller gets the largest rewards.
 
@@ -69,6 +70,7 @@ def tune(
         rounds: The number of rounds.
         most_steps: Steps after which an episode is stopped.
         seed: Of the candidates and of the episodes.
+        watch: Gets the best candidate until now after each round.
 
     Returns:
         The best of all candidates, and how the search went.
@@ -83,7 +85,7 @@ def tune(
     _check_names(make_controller, axes)
     seed = check_seed(seed) or 0
     with closing(FMUVectorEnv(make_env, candidates * episodes)) as envs:
-        trials = _Trials(make_controller, envs, axes, episodes, most_steps, seed)
+        trials = _Trials(make_controller, envs, axes, episodes, most_steps, seed, watch)
         _search(trials, candidates, rounds, seed)
     return trials.result()
 
@@ -149,7 +151,9 @@ class _Trials:
         episodes: int,
         most_steps: int,
         seed: int,
+        watch: Callable[[Tuning], None] | None,
     ) -> None:
+        self._watch = watch
         self._make_controller, self._envs, self.axes = make_controller, envs, axes
         self._episodes, self._most_steps = episodes, most_steps
         self._seeds = [*range(seed, seed + episodes)] * (envs.num_envs // episodes)
@@ -177,6 +181,8 @@ class _Trials:
         self._returns.append(float(returns[leader]))
         if returns[leader] > self._most:
             self._best, self._most = places[leader].copy(), float(returns[leader])
+        if self._watch is not None:
+            self._watch(self.result())
         return returns
 
     def _play(self, controller: Controller) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from fmugym.checks import check_integer, check_mapping, check_path
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
+from fmugym.declared.warming import period_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -127,6 +128,9 @@ class Task:
     def in_scenario(self, name: str) -> Task:
         """Return the task in one of its scenarios: its beginning and its length are given.
 
+        In a task with a start time and no clock, the FMU begins so early that the scenario follows
+        the warm-up.
+
         Raises:
             ConfigError: If there is no such scenario.
         """
@@ -134,6 +138,9 @@ class Task:
         with section.placing():
             scenario = scenario_of(read_scenarios(section), name)
         times = {"clock": scenario.start, "episode_length": scenario.length}
+        if "start_time" in self.document and "clock" not in self.document:
+            times["start_time"] = scenario.start_after(period_of(self.root.child("warm_up")))
+            del times["clock"]
         return Task({**self.document, **times}, self.sources)
 
     @property
@@ -141,6 +148,15 @@ class Task:
         """The name of the file; ``"task"`` for a dict."""
         path = self.sources[0].path
         return "task" if path is None else path.name
+
+    def with_paths(self, path_of: Callable[[str], str]) -> dict[str, Any]:
+        """Return what the task declares, with other paths of its files.
+
+        Args:
+            path_of: Takes the absolute path of the FMU or of a file of data, and returns the new
+                one.
+        """
+        return _mapped_paths(dict(self.document), path_of)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the task to a new TOML file. Reading the file gives an equal task.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,21 +13,37 @@ from fmpy.fmi1 import FMU1Model, fmi1EventInfo
 from fmpy.fmi2 import FMU2Model, fmi2EventInfo
 from fmpy.fmi3 import FMU3Model
 
+from fmugym.archive.description import Variable
+from fmugym.fmi.clocks import CallError, Qualifier
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
 from fmugym.fmi.log import MessageLog, fmi1_callbacks, fmi3_log_message
 from fmugym.fmi.methods import State
-from fmugym.fmi.solver import CallError, Equations, Events, Memory, Mode, Solver, Solving
+from fmugym.fmi.solver import Equations, Events, Memory, Mode, Solver, Solving
 from fmugym.fmi.status import Status, sane
 
 __all__ = [
     "ExchangeInstance",
     "FMI1ExchangeInstance",
     "FMI2ExchangeInstance",
+    "FMI3Events",
     "FMI3ExchangeInstance",
 ]
+
+
+class _LastSet(NamedTuple):
+    """The values that were last set of one C type: inputs that stay the same need no event."""
+
+    access: object
+    references: npt.NDArray[np.uint32]
+    values: npt.NDArray[Any]
+
+    def is_that(self, other: _LastSet | None) -> bool:
+        """Whether the same access set the same values, to the last bit."""
+        same = other is not None and other.access is self.access
+        return same and other.values.tobytes() == self.values.tobytes()  # type: ignore[union-attr]
 
 
 class ExchangeInstance(Instance):
@@ -41,6 +57,7 @@ class ExchangeInstance(Instance):
         solver = self._own_solver()
 
         def step(time: float, step_size: float) -> int:
+            solver.begin_step(time)
             status = solver.advance(time + step_size)
             return status if status == 0 else self.judge_step(status)
 
@@ -50,7 +67,9 @@ class ExchangeInstance(Instance):
         if self._solver is None:
             equations = self.equations_class(self)
             self._solver = Solver(equations, self._solving or Solving(), self._complain)
-            self._last: dict[str, tuple[object, bytes]] = {}
+            inputs = self._description.clocked_inputs
+            self._clocked = {v.value_reference: v.clocks for v in inputs}
+            self._last: dict[str, _LastSet] = {}
         return self._solver
 
     def _complain(self, text: str) -> None:
@@ -70,35 +89,87 @@ class ExchangeInstance(Instance):
             self._forget(Memory(time=span.start_time))
             initialize(span, set_start_values)
             solver.forget(Memory(time=span.start_time, mode=Mode.IN_EVENTS))
-            try:
-                solver.settle()
-            except CallError as failure:
-                self.check("the initial event", failure.status)
+            self._check_call("the initial event", solver.settle)
 
         return run
+
+    def _in_initialization(self, span: Span) -> None:
+        timetable = self._own_solver().timetable
+        self._check_call("preparing the clocks", lambda: timetable.prepare(span.start_time))
+
+    def _check_call(self, doing: str, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except CallError as failure:
+            if failure.reason:
+                self._complain(failure.reason)
+            self.check(doing, failure.status)
 
     def prepare_access(
         self, c_type: str, references: npt.NDArray[np.uint32], buffer: npt.NDArray[Any]
     ) -> tuple[Any, Any, tuple[Any, ...]]:
         """See ``Instance.prepare_access``. New values are an event, for they may jump."""
-        get, set_, arguments = super().prepare_access(c_type, references, buffer)
         solver, access = self._own_solver(), object()
+        if c_type == "Clock":
+            return self._prepare_clocks(references.tolist(), buffer)
+        get, set_, arguments = super().prepare_access(c_type, references, buffer)
 
         def set_with_event(*arguments: Any) -> int:
             mode = solver.memory.mode
             if mode is not Mode.BEFORE_EVENTS:
-                given = access, buffer.tobytes()
-                if self._last.get(c_type) == given:
+                given = _LastSet(access, references, buffer.copy())
+                if given.is_that(self._last.get(c_type)):
                     return Status.OK
                 self._last[c_type] = given
             try:
                 if mode is Mode.IN_CONTINUOUS_TIME:
                     solver.enter_events()
+                if mode is not Mode.BEFORE_EVENTS and self._clocked:
+                    self._set_some(c_type, lambda r: r not in self._clocked)
+                    return Status.OK
             except CallError as failure:
+                self._last.pop(c_type, None)
                 return failure.status
             return int(set_(*arguments))
 
         return get, set_with_event, arguments
+
+    def _prepare_clocks(
+        self, references: list[int], buffer: npt.NDArray[Any]
+    ) -> tuple[Any, Any, tuple[Any, ...]]:
+        solver = self._own_solver()
+
+        def get() -> int:
+            buffer[:] = solver.timetable.tell(references)
+            return Status.OK
+
+        def set_() -> int:
+            solver.timetable.ask(references, buffer.tolist())
+            try:
+                if buffer.any() and solver.memory.mode is Mode.IN_CONTINUOUS_TIME:
+                    solver.enter_events()
+            except CallError as failure:
+                return failure.status
+            return Status.OK
+
+        return get, set_, ()
+
+    def set_clocked(self, clock: Variable) -> None:
+        """Set the inputs that may be set while this clock ticks to the values given last."""
+        due = {r for r, clocks in self._clocked.items() if clock.value_reference in clocks}
+        for c_type in self._last if due else ():
+            self._set_some(c_type, due.__contains__)
+
+    def _set_some(self, c_type: str, wanted: Callable[[int], bool]) -> None:
+        """Set those of the values that were last set whose references are wanted."""
+        _, references, values = self._last[c_type]
+        for i, reference in enumerate(references.tolist()):
+            if wanted(reference):
+                one = slice(i, i + 1)
+                _, set_, arguments = super().prepare_access(c_type, references[one], values[one])
+                status = sane(set_(*arguments))
+                if status > Status.WARNING:
+                    raise CallError(status)
 
     def reset(self) -> None:
         """See ``Instance.reset``."""
@@ -108,7 +179,7 @@ class ExchangeInstance(Instance):
     def save_state(self) -> SavedState:
         """See ``Instance.save_state``; the state has the solver's memory, too."""
         saved = super().save_state()
-        saved.memory = self._own_solver().memory
+        saved.memory = self._own_solver().saved_memory
         return saved
 
     def restore_state(self, state: SavedState) -> None:
@@ -123,11 +194,11 @@ class ExchangeInstance(Instance):
 
     def deserialize(self, data: bytes) -> SavedState:
         """See ``Instance.deserialize``."""
-        if len(data) < Memory.SIZE:
+        size = Memory.size(len(self._description.clocks))
+        if len(data) < size:
             self.check("deserializing a state", Status.ERROR)
-        memory, rest = Memory.split(data)
-        saved = super().deserialize(rest)
-        saved.memory = memory
+        saved = super().deserialize(data[size:])
+        saved.memory = Memory.from_bytes(data[:size])
         return saved
 
 
@@ -142,7 +213,7 @@ class FMUEquations(Equations):
         description = instance._description
         model = description.model_exchange
         assert model is not None
-        self._instance = instance
+        self._begin(instance)
         self.number_of_states = model.number_of_states
         self.number_of_indicators = model.number_of_event_indicators
         self.completes = model.needs_completed_integrator_step
@@ -151,6 +222,10 @@ class FMUEquations(Equations):
         self._rate_references = model.derivative_references
         self._numbers = (ctypes.c_double * max(1, self.number_of_states))()
         self._indicators = (ctypes.c_double * max(1, self.number_of_indicators))()
+
+    def _begin(self, instance: ExchangeInstance) -> None:
+        self._instance = instance
+        self.clocks = instance._description.clocks
         self._functions: dict[str, Any] = {}
 
     def _call(self, name: str, *arguments: Any) -> None:
@@ -217,6 +292,43 @@ class FMUEquations(Equations):
         )
         return list(self._numbers[:count])
 
+    # Clocks, which only FMI 3.0 has.
+
+    def is_active(self, clock: Variable) -> bool:
+        """See ``ClockCalls.is_active``."""
+        active = ctypes.c_bool(False)
+        self._call_for("GetClock", clock, active)
+        return active.value
+
+    def activate(self, clock: Variable) -> None:
+        """See ``ClockCalls.activate``."""
+        self._call_for("SetClock", clock, ctypes.c_bool(True))
+
+    def interval(self, clock: Variable, known: float) -> tuple[float, Qualifier]:
+        """See ``ClockCalls.interval``."""
+        interval, qualifier = ctypes.c_double(known), ctypes.c_int(Qualifier.NOT_YET_KNOWN)
+        self._call_for("GetIntervalDecimal", clock, interval, qualifier)
+        return interval.value, Qualifier(qualifier.value)
+
+    def shift(self, clock: Variable) -> float:
+        """See ``ClockCalls.shift``."""
+        shift = ctypes.c_double()
+        self._call_for("GetShiftDecimal", clock, shift)
+        return shift.value
+
+    def set_interval(self, clock: Variable) -> None:
+        """See ``ClockCalls.set_interval``."""
+        self._call_for("SetIntervalDecimal", clock, ctypes.c_double(clock.interval))
+
+    def set_inputs(self, clock: Variable) -> None:
+        """See ``ClockCalls.set_inputs``."""
+        self._instance.set_clocked(clock)
+
+    def _call_for(self, name: str, clock: Variable, *values: Any) -> None:
+        reference = ctypes.c_uint32(clock.value_reference)
+        places = [ctypes.byref(value) for value in values]
+        self._call(name, ctypes.byref(reference), ctypes.c_size_t(1), *places)
+
 
 class _FMI1Equations(FMUEquations):
     """FMI 1.0 has no modes and no directional derivatives."""
@@ -263,16 +375,21 @@ class _FMI2Equations(FMUEquations):
         return bool(event.value), bool(terminate.value)
 
 
-class _FMI3Equations(FMUEquations):
-    def get_rates(self) -> State:
-        return self._get("GetContinuousStateDerivatives", self._numbers, self.number_of_states)
+class FMI3Events(FMUEquations):
+    """The functions for events that both interfaces of FMI 3.0 have."""
 
     def update(self) -> Events:
+        """See ``Equations.update``."""
         flags, next_event = (ctypes.c_bool * 5)(), ctypes.c_double()
         first = ctypes.addressof(flags)
         places = [ctypes.c_void_p(first + i) for i in range(5)]
         self._call("UpdateDiscreteStates", *places, ctypes.byref(next_event))
         return events(flags[0], flags[1], flags[4], next_event.value)
+
+
+class _FMI3Equations(FMI3Events):
+    def get_rates(self) -> State:
+        return self._get("GetContinuousStateDerivatives", self._numbers, self.number_of_states)
 
     def complete(self) -> tuple[bool, bool]:
         event, terminate = ctypes.c_bool(False), ctypes.c_bool(False)

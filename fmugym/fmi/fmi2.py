@@ -11,7 +11,7 @@ from fmpy.fmi2 import FMU2Slave
 
 from fmugym.fmi.instance import Initialize, Instance, Span
 from fmugym.fmi.log import MessageLog, fmi2_callbacks
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import Status, sane
 
 __all__ = ["FMI2Instance"]
 
@@ -26,8 +26,9 @@ class FMI2Instance(Instance):
         "Boolean": np.int32,
     }
 
+    _LAST_SUCCESSFUL_TIME: ClassVar = 2
     _TERMINATED: ClassVar = 3
-    """``fmi2Terminated`` of ``fmi2StatusKind``."""
+    """Of ``fmi2StatusKind``."""
 
     def _instantiate(self, log: MessageLog, logging: bool) -> None:
         self._slave.instantiate(callbacks=fmi2_callbacks, loggingOn=logging)
@@ -48,10 +49,38 @@ class FMI2Instance(Instance):
         def step(time: float, step_size: float) -> int:
             status: int = do_step(component, time, step_size, no_return)
             if status == Status.DISCARD:
-                status = self._judge_discard()
+                end = time + step_size
+                status = self._go_on(
+                    lambda now: do_step(component, now, end - now, no_return), time, end
+                )
             return status if status == 0 else self.judge_step(status)
 
         return step
+
+    def _go_on(self, step_from: Callable[[float], int], time: float, end: float) -> int:
+        """Do the rest of a discarded step, from where the FMU returned.
+
+        An FMU that has done nothing of it, or refuses to go on, has discarded it.
+        """
+        status = self._judge_discard()
+        while status == Status.DISCARD:
+            reached = self._last_successful_time(time)
+            if not time < reached < end:
+                return Status.DISCARD
+            time = reached
+            status = sane(step_from(time))
+            if status == Status.ERROR:
+                return Status.DISCARD
+            if status == Status.DISCARD:
+                status = self._judge_discard()
+        return status
+
+    def _last_successful_time(self, time: float) -> float:
+        """The time at which a discarded step ended; the FMU need not tell it."""
+        last = ctypes.c_double(time)
+        get_status = self._function("GetRealStatus")
+        status = get_status(self._component, self._LAST_SUCCESSFUL_TIME, ctypes.byref(last))
+        return last.value if sane(status) <= Status.WARNING else time
 
     def _judge_discard(self) -> int:
         """Find out why a step was discarded. If the FMU cannot tell, it counts as Discard."""

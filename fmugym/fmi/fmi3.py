@@ -17,8 +17,18 @@ from fmugym.fmi.status import Status
 __all__ = ["FMI3Instance"]
 
 
+@fmi3IntermediateUpdateCallback  # type: ignore[untyped-decorator]  # ctypes has no types for this
+def _ignore_intermediate_update(*arguments: Any) -> None:
+    """Want no early return. FMUs may call this without asking whether it is there."""
+    time, requested, early_return_time = arguments[1], arguments[6], arguments[7]
+    if requested:
+        requested[0] = False
+    if early_return_time:
+        early_return_time[0] = time
+
+
 class FMI3Instance(Instance):
-    """FMI 3.0 co-simulation without event mode, early return and intermediate update."""
+    """FMI 3.0 co-simulation: the FMU handles its events within its steps."""
 
     slave_class = FMU3Slave
     dtypes: ClassVar[dict[str, Any]] = {
@@ -33,8 +43,10 @@ class FMI3Instance(Instance):
         "UInt32": np.uint32,
         "UInt64": np.uint64,
         "Boolean": np.uint8,
+        "Clock": np.uint8,
     }
     enumeration_type = "Int64"
+    _event_mode: ClassVar = False
 
     def _instantiate(self, log: MessageLog, logging: bool) -> None:
         resources = os.path.join(self._slave.unzipDirectory, "resources", "")
@@ -44,13 +56,13 @@ class FMI3Instance(Instance):
             resources.encode(),
             False,  # visible
             logging,
-            False,  # event mode used
-            False,  # early return allowed
+            self._event_mode,
+            self._event_mode,  # early return allowed
             None,
             0,
             log.environment,
             fmi3_log_message,
-            fmi3IntermediateUpdateCallback(),
+            _ignore_intermediate_update,
         )
 
     def _function_name(self, name: str) -> str:
@@ -71,16 +83,30 @@ class FMI3Instance(Instance):
         component, self._step_results = self._component, (flags, last_successful_time)
         no_return = not self._may_return
 
-        def step(time: float, step_size: float) -> int:
+        def step_once(time: float, step_size: float) -> int:
             flags[1] = flags[2] = False  # an FMU may leave them unwritten
-            status: int = do_step(component, time, step_size, no_return, *results)
+            last_successful_time.value = time
+            return int(do_step(component, time, step_size, no_return, *results))
+
+        def step(time: float, step_size: float) -> int:
+            status, end = step_once(time, step_size), time + step_size
+            while status <= Status.WARNING and flags[2] and not flags[1]:
+                reached = last_successful_time.value  # early, although that was not allowed
+                if reached >= end:
+                    break
+                if not reached > time:
+                    status = Status.DISCARD
+                    break
+                time = reached
+                status = step_once(time, end - time)
             if status <= Status.WARNING and flags[1]:
                 status = Status.TERMINATED
-            elif status <= Status.WARNING and flags[2]:  # early return was not allowed
-                status = Status.DISCARD
             return status if status == 0 else self.judge_step(status)
 
         return step
+
+    def _in_initialization(self, span: Span) -> None:
+        """Do what is due in initialization mode: nothing."""
 
     def _prepare_initialization(self) -> Initialize:
         boolean, double = ctypes.c_bool, ctypes.c_double
@@ -93,6 +119,7 @@ class FMI3Instance(Instance):
         def run(span: Span, set_start_values: Callable[[], None]) -> None:
             set_start_values()
             check("entering initialization", enter(component, *span.tolerances, *span.times))
+            self._in_initialization(span)
             check("initialization", leave(component))
 
         return run

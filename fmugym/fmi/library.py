@@ -12,6 +12,7 @@ import fmpy
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.events import FMI3EventsInstance
 from fmugym.fmi.exchange import (
     FMI1ExchangeInstance,
     FMI2ExchangeInstance,
@@ -53,9 +54,11 @@ class Library:
         self, fmu: LoadableFMU, target: logging.Logger, solving: Solving | None = None
     ) -> None:
         description = fmu.description
-        self._instance_class = _INSTANCE_CLASSES[
-            description.fmi_major_version, description.interface
-        ]
+        self._instance_class = (
+            FMI3EventsInstance
+            if description.uses_event_mode
+            else _INSTANCE_CLASSES[description.fmi_major_version, description.interface]
+        )
         self._solving = solving
         self._fmu = fmu
         self._target = target

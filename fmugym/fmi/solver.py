@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
+from fmugym.archive.description import Variable
+from fmugym.fmi.clocks import TICKS_SIZE, CallError, ClockCalls, Ticks, Timetable
 from fmugym.fmi.methods import METHODS, State
 from fmugym.fmi.status import Status
 
@@ -48,14 +50,6 @@ class Solving:
     max_step: float = math.inf
 
 
-class CallError(Exception):
-    """A call of the FMU returned a status worse than a warning, or the solver gives up."""
-
-    def __init__(self, status: int) -> None:
-        super().__init__(status)
-        self.status = status
-
-
 _MEMORY: Final = struct.Struct("=dddqq")
 
 
@@ -77,6 +71,7 @@ class Memory:
         step: The step size that an adaptive method tries next; 0 for none yet.
         mode: Of the FMU.
         terminated: Whether the FMU has asked to stop.
+        ticks: What is kept of the clocks.
     """
 
     time: float = 0.0
@@ -84,19 +79,25 @@ class Memory:
     step: float = 0.0
     mode: Mode = Mode.BEFORE_EVENTS
     terminated: bool = False
+    ticks: tuple[Ticks, ...] = ()
 
-    SIZE: ClassVar[int] = _MEMORY.size
-    """Bytes of a serialized memory."""
+    @staticmethod
+    def size(clocks: int) -> int:
+        """Bytes of a serialized memory."""
+        return _MEMORY.size + clocks * TICKS_SIZE
 
     def to_bytes(self) -> bytes:
         """Serialize it as the native pool does."""
-        return _MEMORY.pack(self.time, self.next_event, self.step, self.mode, self.terminated)
+        own = _MEMORY.pack(self.time, self.next_event, self.step, self.mode, self.terminated)
+        return own + b"".join(ticks.to_bytes() for ticks in self.ticks)
 
     @classmethod
-    def split(cls, data: bytes) -> tuple[Memory, bytes]:
-        """Read a memory; return it and the bytes after it."""
+    def from_bytes(cls, data: bytes) -> Memory:
+        """Read what ``to_bytes`` made."""
         time, next_event, step, mode, terminated = _MEMORY.unpack(data[: _MEMORY.size])
-        return cls(time, next_event, step, Mode(mode), bool(terminated)), data[_MEMORY.size :]
+        places = range(_MEMORY.size, len(data), TICKS_SIZE)
+        ticks = tuple(Ticks.from_bytes(data[i : i + TICKS_SIZE]) for i in places)
+        return cls(time, next_event, step, Mode(mode), bool(terminated), ticks)
 
 
 class Events(NamedTuple):
@@ -107,9 +108,12 @@ class Events(NamedTuple):
     next_event: float
 
 
-class Equations(ABC):
+class Equations(ClockCalls):
     """The functions of model exchange of one instance. All raise ``CallError`` for a bad status."""
 
+    steps_by_itself: bool = False
+    """Whether the FMU does its steps, as in co-simulation with event mode."""
+    clocks: Sequence[Variable] = ()
     number_of_states: int
     number_of_indicators: int
     completes: bool
@@ -155,6 +159,14 @@ class Equations(ABC):
     def complete(self) -> tuple[bool, bool]:
         """Tell that a step is complete; return whether the FMU wants an event, and to stop."""
 
+    def step(self, time: float, size: float) -> tuple[float, bool, bool]:
+        """Let the FMU step.
+
+        Returns:
+            The time that it reached, whether it wants an event, and whether it wants to stop.
+        """
+        raise NotImplementedError
+
     @abstractmethod
     def differentiate_by(self, state: int) -> State | None:
         """The derivatives of all rates by one state; None if the FMU does not provide them."""
@@ -180,6 +192,7 @@ class Solver:
         self._fmu, self._solving, self._complain = equations, solving, complain
         self._method = METHODS[solving.solver]()
         self._n = equations.number_of_states
+        self.timetable = Timetable(equations.clocks, equations)
         self.x: State = []
         self.rates: State = []
         self.forget(Memory())
@@ -192,9 +205,16 @@ class Solver:
     def forget(self, memory: Memory) -> None:
         """Take over a memory, and read everything else from the FMU when it is needed."""
         self.memory = memory
+        if memory.ticks:
+            self.timetable.ticks = list(memory.ticks)
         self._stale = True
         self._knows_rates = self._knows_indicators = False
         self._jacobian: list[State] | None = None
+
+    @property
+    def saved_memory(self) -> Memory:
+        """The memory with that of the clocks."""
+        return replace(self.memory, ticks=tuple(self.timetable.ticks))
 
     def _remember(self, **changes: object) -> None:
         self.memory = replace(self.memory, **changes)  # type: ignore[arg-type]  # names of its fields
@@ -244,7 +264,9 @@ class Solver:
 
     def settle(self) -> None:
         """Go from event mode to continuous time, unless the FMU asks to stop."""
+        self.timetable.activate(self.time)
         for _ in range(_MOST_UPDATES):
+            self.timetable.watch()
             events = self._fmu.update()
             if not events.again or events.terminate:
                 break
@@ -253,9 +275,10 @@ class Solver:
                 f"the discrete states at t = {self.time:g} s do not settle in "
                 f"{_MOST_UPDATES} updates"
             )
-        terminated = self.memory.terminated or events.terminate
-        self._remember(next_event=events.next_event, terminated=terminated)
+        self._remember(terminated=self.memory.terminated or events.terminate)
         if not events.terminate:
+            self.timetable.plan(self.time)
+            self._remember(next_event=min(events.next_event, self.timetable.next))
             self._fmu.enter_continuous()
             self._remember(mode=Mode.IN_CONTINUOUS_TIME)
             self._read_states()
@@ -440,17 +463,42 @@ class Solver:
 
     def _handle_time_event(self) -> None:
         self._remember(time=max(self.time, self.memory.next_event))
-        self._place(self.time, self.x)
+        if not self._fmu.steps_by_itself:
+            self._place(self.time, self.x)
         self._handle_event()
+
+    def _step_by_fmu(self, until: float) -> None:
+        """Let the FMU step to this time, or until it wants an event or returns early."""
+        time = self.time
+        reached, event, terminate = self._fmu.step(time, until - time)
+        progress = reached > time or event or terminate
+        if not progress or reached > until + self._resolution(until):
+            raise self._fail(
+                f"the FMU returned from a step from t = {time:.17g} s to {until:.17g} s at "
+                f"{reached:.17g} s"
+            )
+        terminated = self.memory.terminated or terminate
+        self._remember(time=min(max(time, reached), until), terminated=terminated)
+        if event and not terminate:
+            self._handle_event()
+
+    def begin_step(self, time: float) -> None:
+        """Begin a communication step."""
+        if self._fmu.steps_by_itself:  # the end of the last step may differ by its rounding
+            self._remember(time=time)
+        self.timetable.begin_step()
 
     def advance(self, until: float) -> int:
         """Integrate to this time, and handle all events until then and at it; return the status."""
         try:
             return self._advance(until)
         except CallError as failure:
+            if failure.reason:
+                self._complain(failure.reason)
             return failure.status
 
     def _advance(self, until: float) -> int:
+        step_to = self._step_by_fmu if self._fmu.steps_by_itself else self._step_to
         self._events = 0
         if self.memory.mode is Mode.IN_EVENTS and not self.memory.terminated:
             self.settle()
@@ -461,7 +509,7 @@ class Solver:
             if self.memory.next_event <= self.time + resolution:
                 self._handle_time_event()
             elif self.time < until - resolution:
-                self._step_to(min(until, self.memory.next_event))
+                step_to(min(until, self.memory.next_event))
             else:
                 self._remember(time=max(self.time, until))
                 return Status.OK

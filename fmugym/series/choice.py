@@ -37,26 +37,34 @@ class Choice(NamedTuple):
     variables: tuple[Variable, ...]
     observed: tuple[int, ...]
 
-    def values(
-        self, present: FloatArray, pool: Pool, observations: FloatArray, indices: Any
-    ) -> FloatArray:
-        """Put the values of M environments together.
+    def present(self, values: FloatArray, pool: Pool, indices: Any) -> FloatArray:
+        """What M environments have at this moment, all but the observations.
 
         Args:
-            present: All of the task's quantities, shape (k, M).
+            values: All of the task's quantities, shape (k, M).
             pool: Reads variables of the FMU.
-            observations: Those of all environments, shape (N, m).
             indices: The M environments.
 
         Returns:
             One row for each environment, one column for each quantity.
         """
-        rows = [present[list(self.places)]]
+        rows = [values[list(self.places)]]
         if self.variables:
             rows.append(pool.read(self.variables)[:, indices])
-        if self.observed:
-            rows.append(observations[indices].T[list(self.observed)])
         return np.concatenate(rows).T
+
+    def seen(self, observations: FloatArray, indices: Any) -> FloatArray:
+        """What M environments observe.
+
+        Args:
+            observations: Those of all environments, shape (N, m).
+            indices: The M environments.
+
+        Returns:
+            One row for each environment, one column for each element.
+        """
+        chosen: FloatArray = observations[indices][:, list(self.observed)]
+        return chosen
 
 
 def matches(pattern: str, name: str) -> bool:
@@ -103,12 +111,20 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
 
 
 def _found(pattern: str, known: Sequence[str], others: Iterable[str]) -> list[str]:
-    """The names that a glob finds; constants and parameters must be named in full."""
-    found = [name for name in known if matches(pattern, name)]
-    found += [name for name in others if name == pattern and name not in found]
+    """The names that a glob finds; constants and parameters must be named in full.
+
+    The name of an array stands for its elements.
+    """
+    found = [name for name in known if matches(pattern, name) or _array_of(name) == pattern]
+    found += [n for n in others if pattern in {n, _array_of(n)} and n not in found]
     if not found:
         raise unknown_name("variable to record", pattern, [*known, *others])
     return found
+
+
+def _array_of(name: str) -> str:
+    """The name of the array of which this is an element; "" if it is none."""
+    return name.rpartition("[")[0] if name.endswith("]") else ""
 
 
 def _varies(variable: Variable) -> bool:
@@ -122,10 +138,10 @@ def quantities_of(env: FMUEnv) -> Quantities:
 
 
 def _of_config(env: FMUEnv) -> Quantities:
-    config, find = env.config, env.fmu.variable
-    inputs, outputs = config.model_input_names, tuple(env.out)
-    episode = [n for n, value in config.episode_variables.items() if np.ndim(value) == 0]
-    parameters = tuple(config.model_parameters)
+    find, interface = env.fmu.variable, env._interface
+    inputs, outputs = interface.input_names, tuple(env.out)
+    episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
+    parameters = tuple(interface.parameters)
 
     def read(env: Any) -> Sequence[Any]:
         drawn, variables = env.parameters, env.variables
@@ -150,11 +166,10 @@ def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
     """The numeric variables of the FMU for which the task has no name of its own."""
-    config = env.config
-    known = {*config.model_input_names, *env.out, *(one.name for one in quantities)}
+    known = {*env._interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
-        if variable.numeric and variable.name not in known:
-            yield variable
+        if variable.is_number:
+            yield from (one for one in variable.elements if one.name not in known)
 
 
 def _observation_names(env: FMUEnv) -> Sequence[str]:

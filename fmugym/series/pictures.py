@@ -6,6 +6,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from io import StringIO
 from itertools import pairwise
@@ -19,9 +20,9 @@ from fmugym.series.store import imported
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 
-__all__ = ["as_svg", "plot"]
+__all__ = ["COLOURS", "as_svg", "drawing_style", "plot", "svg_of"]
 
-_COLOURS: Final = (
+COLOURS: Final = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#882255"),
 )
 """Colours that people with colour blindness can tell apart: Okabe and Ito, 2008, and two more."""
@@ -108,18 +109,32 @@ def plot(series: TimeSeries, path: str | os.PathLike[str] | None = None, title: 
 
 def as_svg(series: TimeSeries, title: str = "") -> str:
     """Draw an episode as the text of an SVG element, whose letters are text."""
-    figure, text = _figure(series, title), StringIO()
-    with imported("matplotlib", "plot").rc_context(_STYLE):
+    return svg_of(_figure(series, title))
+
+
+def drawing_style() -> AbstractContextManager[None]:
+    """The style of all pictures, as a context.
+
+    Raises:
+        ConfigError: If Matplotlib is missing.
+    """
+    context: AbstractContextManager[None] = imported("matplotlib", "plot").rc_context(_STYLE)
+    return context
+
+
+def svg_of(figure: Any) -> str:
+    """A figure of Matplotlib as the text of an SVG element, whose letters are text."""
+    text = StringIO()
+    with drawing_style():
         figure.savefig(text, format="svg", metadata=dict.fromkeys(_METADATA))
     svg = text.getvalue()
     return _PATH.sub(lambda path: _DIGITS.sub(r"\1", path[0]), svg[svg.index("<svg") :])
 
 
 def _figure(series: TimeSeries, title: str) -> Any:
-    matplotlib: Any = imported("matplotlib", "plot")
     figures: Any = imported("matplotlib.figure", "plot")
     panels = _panels(series)
-    with matplotlib.rc_context(_STYLE):
+    with drawing_style():
         heights = [1.0 if panel.summed or len(panel.columns) == 1 else 1.4 for panel in panels]
         figure = figures.Figure(figsize=(9, 0.7 + 1.4 * sum(heights)), layout="constrained")
         ratios = {"height_ratios": heights}
@@ -183,7 +198,7 @@ def _panel(unit: str, group: Sequence[Quantity], setpoints: Sequence[Quantity] =
 
 
 def _draw(axis: Any, panel: _Panel, series: TimeSeries, times: Any) -> None:
-    for colour, column in zip(_COLOURS, panel.columns, strict=False):
+    for colour, column in zip(COLOURS, panel.columns, strict=False):
         values = series[column.name]
         values = np.nancumsum(values) if panel.summed else values
         label = column.name.rpartition(".")[2] if panel.summed else column.name

@@ -17,7 +17,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.series.choice import choose
-from fmugym.series.rows import Episodes, Infos, Outcome, Rows
+from fmugym.series.rows import Episodes, Infos, Outcome, Rows, present
 from fmugym.series.store import Block, Memory, Store, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
@@ -53,17 +53,27 @@ class _Recorder:
         self._most_rows = check_count("most_rows", most_rows)
         self._memory: Memory | None = None
         self._file: Store | None = None
+        self.has_begun = False
+        self._steps: Any = None
 
     def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> None:
         """Write down that episodes have begun."""
-        if self._memory is None:
-            self._open(infos)
+        self._open(infos)
         self._add(self._rows.begin(mask, infos, observations))
 
+    def go_on(self, steps: Any) -> None:
+        """Begin in the middle of episodes that have had so many steps, shape (N,)."""
+        self.has_begun, self._steps = True, steps
+
     def _open(self, infos: Infos) -> None:
+        if self._memory is not None:
+            return
+        self.has_begun = True
         self._rows = Rows(
             self.episodes, self._choice, self._indices, self._every, self._is_vector, infos
         )
+        if self._steps is not None:
+            self._rows.go_on(self._steps)
         if self._path is not None:
             self._file = open_store(self._path, self._rows.columns)
             weakref.finalize(self, self._file.close)
@@ -71,7 +81,12 @@ class _Recorder:
 
     def add(self, outcome: Outcome, idle: MaskArray) -> None:
         """Write down a step."""
+        self._open(outcome.infos)
         self._add(self._rows.add(outcome, idle))
+
+    def present(self) -> FloatArray:
+        """What the environments have at this moment; see ``Rows.present``."""
+        return present(self.episodes, self._choice, self._indices)
 
     def _add(self, block: Block) -> None:
         if not len(block):
@@ -199,6 +214,8 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
         infos, seen = Infos([info], 1), _batch(observation)
+        if not self._recorder.has_begun:
+            self._recorder.go_on(self._recorder.episodes.prototype.step_count - 1)
         self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)
         return observation, reward, terminated, truncated, info
 
@@ -228,14 +245,14 @@ class _Many:
 
     @property
     def pool(self) -> Pool:
-        return self._envs._open_pool("a recorder")
+        return self._envs._pool  # also within a step in the background
 
 
 class RecordVectorSeries(VectorWrapper):
     """Writes down what the environments of a vector environment do; see ``RecordSeries``.
 
     In the mode ``SAME_STEP``, an FMU is in its next episode when the step returns. The last row of
-    an episode then has rewards, costs and ``observation.NAME``, but no other variables (NaN).
+    an episode has the values at its end nevertheless: the recorder reads them within the step.
 
     Args:
         env: An ``FMUVectorEnv``.
@@ -265,6 +282,14 @@ class RecordVectorSeries(VectorWrapper):
         self._recorder = _Recorder(
             self._envs, variables, environments, every, path, most_rows, True
         )
+        self._at_end: FloatArray | None = None
+        if self._mode is AutoresetMode.SAME_STEP:
+            env._look_at_ends(self._look)
+
+    def _look(self, actions: Any) -> None:
+        """Read what environments have before the next episodes begin."""
+        self._envs.actions = np.array(actions)
+        self._at_end = self._recorder.present()
 
     @property
     def series(self) -> TimeSeries:
@@ -292,10 +317,19 @@ class RecordVectorSeries(VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all environments, and write their rows; see ``FMUVectorEnv.step``."""
+        self._go_on()
         return self._noted(actions, self.env.step(actions))
+
+    def _go_on(self) -> None:
+        """Begin in the middle of episodes, if there was no reset."""
+        envs: Any = self.env
+        if not self._recorder.has_begun and envs._started:
+            counts = self._envs.evaluate(lambda env: (env.step_count,), np.arange(self.num_envs))
+            self._recorder.go_on(counts[0])
 
     def step_async(self, actions: Any) -> None:
         """Begin a step; see ``FMUVectorEnv.step_async``."""
+        self._go_on()
         self._pending = np.array(actions)
         self.env.step_async(actions)  # type: ignore[attr-defined]  # it is an FMUVectorEnv
 
@@ -309,12 +343,12 @@ class RecordVectorSeries(VectorWrapper):
         self._envs.actions = np.array(actions)
         ended, none = terminated | truncated, np.zeros(self.num_envs, np.bool_)
         same_step = self._mode is AutoresetMode.SAME_STEP and ended.any()
-        lost = ended if same_step else none
         idle = self._ended
         last, seen = Infos(infos, self.num_envs), observations
         if same_step:
             last, seen = self._last(infos, observations, ended)
-        self._recorder.add(Outcome(rewards, terminated, truncated, last, seen, lost), idle)
+        at_end = self._at_end if same_step else None
+        self._recorder.add(Outcome(rewards, terminated, truncated, last, seen, ended, at_end), idle)
         begun = ended if same_step else idle
         self._ended = none if same_step else ended
         if begun.any():

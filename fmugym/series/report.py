@@ -79,6 +79,7 @@ def write_report(
     description: str = "",
     facts: Mapping[str, str] | None = None,
     text: str = "",
+    charts: Mapping[str, str] | None = None,
     most_pictures: int = 6,
 ) -> None:
     """Write a report of episodes.
@@ -90,6 +91,8 @@ def write_report(
         description: What the task is about.
         facts: More to know, by name: the FMU, versions.
         text: The task, as its file has it.
+        charts: More pictures, by their headings: SVG elements, as ``Figure.savefig`` of Matplotlib
+            writes them.
         most_pictures: The episodes of each run that are drawn.
 
     Raises:
@@ -97,7 +100,9 @@ def write_report(
         FileExistsError: If the file exists.
     """
     file = check_path("the path of a report", path)
-    body = "\n".join(_body(runs, title, description, facts or {}, text, most_pictures))
+    body = "\n".join(
+        _body(runs, title, description, facts or {}, text, charts or {}, most_pictures)
+    )
     page = _PAGE.format(title=escape(title), style=_STYLE, body=body)
     with file.open("x", encoding="utf-8", newline="\n") as stream:
         stream.write(page)
@@ -109,6 +114,7 @@ def _body(
     description: str,
     facts: Mapping[str, str],
     text: str,
+    charts: Mapping[str, str],
     most: int,
 ) -> Iterator[str]:
     found = {name: summaries(series) for name, series in runs.items()}
@@ -120,6 +126,9 @@ def _body(
     yield f"<dl>{pairs}</dl></header>"
     yield "<h2>Results</h2>"
     yield from _results(found, runs)
+    for number, (heading, chart) in enumerate(charts.items()):
+        svg = _inline(chart[max(0, chart.find("<svg")) :], f"c{number}")
+        yield f"<h2>{escape(heading)}</h2><figure>{svg}</figure>"
     for number, (name, series) in enumerate(runs.items()):
         yield f"<h2>{escape(name)}</h2>"
         yield from _episodes(series, most, f"r{number}")

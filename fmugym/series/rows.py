@@ -14,7 +14,7 @@ from fmugym.series.choice import Choice, flat
 from fmugym.series.store import Block
 from fmugym.task.quantity import Quantity
 
-__all__ = ["Episodes", "Infos", "Outcome", "Rows"]
+__all__ = ["Episodes", "Infos", "Outcome", "Rows", "present"]
 
 _GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
 
@@ -31,6 +31,11 @@ class Episodes(Protocol):
     @property
     def pool(self) -> Pool:
         """Reads variables of the FMUs."""
+
+
+def present(episodes: Episodes, choice: Choice, indices: Any) -> FloatArray:
+    """What environments have at this moment, a row for each: all but what they observe."""
+    return choice.present(episodes.evaluate(choice.read, indices), episodes.pool, indices)
 
 
 class Infos(NamedTuple):
@@ -109,7 +114,9 @@ class Outcome(NamedTuple):
         rewards, terminated, truncated: Shape (N,).
         infos: The infos of the steps, those of steps that ended an episode included.
         observations: Likewise.
-        lost: The environments whose FMU is in the next episode already.
+        ended: The environments whose FMU is in the next episode already.
+        last: What those had before, a row for each environment that is written down, as
+            ``present`` gives it; None if there are no such environments.
     """
 
     rewards: FloatArray
@@ -117,7 +124,8 @@ class Outcome(NamedTuple):
     truncated: MaskArray
     infos: Infos
     observations: Any
-    lost: MaskArray
+    ended: MaskArray
+    last: FloatArray | None = None
 
 
 class Rows:
@@ -150,6 +158,7 @@ class Rows:
         self._sums = np.zeros((count, 1 + len(self._summed)))
         self._steps = np.zeros(count, np.int64)
         self._number = np.full(count, -1, np.int64)
+        self._starts: Any = np.zeros(count)
         self.columns = tuple(self._columns())
 
     def _columns(self) -> Iterator[Quantity]:
@@ -165,10 +174,17 @@ class Rows:
         yield from (Quantity(f"kpis.{name}", "kpi") for name in self._kpis)
         yield from (Quantity("terminated", "flag"), Quantity("truncated", "flag"))
 
+    def go_on(self, steps: Any) -> None:
+        """Begin in the middle of episodes that have had so many steps: these have the number 0."""
+        self._steps[:] = steps
+        self._number[:] = 0
+
     def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> Block:
         """Make the first rows of episodes."""
         self._number[mask] += 1
         self._steps[mask] = 0
+        begun = np.flatnonzero(mask)
+        self._starts[begun] = self._episodes.evaluate(lambda env: (env._start_time,), begun)[0]
         self._sums[mask] = 0.0
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations), (no, no), infos)
@@ -185,9 +201,9 @@ class Rows:
         self._steps += ~idle
         ended = (outcome.terminated | outcome.truncated) & ~idle
         values = self._values(outcome.observations)
-        values[
-            outcome.lost[self._indices], : len(self._choice.places) + len(self._choice.variables)
-        ] = np.nan
+        if outcome.last is not None:
+            begun = outcome.ended[self._indices]
+            values[begun, : outcome.last.shape[1]] = outcome.last[begun]
         due = ~idle & (ended | (self._steps % self._every == 0))
         flags = outcome.terminated, outcome.truncated
         block = self._block(due, values, flags, outcome.infos)
@@ -195,11 +211,10 @@ class Rows:
         return block
 
     def _values(self, observations: Any) -> FloatArray:
-        """The values of the environments to write down, one row for each."""
-        episodes, indices = self._episodes, self._indices
-        present = episodes.evaluate(self._choice.read, indices)
-        seen = flat(observations, episodes.count)
-        return self._choice.values(present, episodes.pool, seen, indices)
+        """What they have, and what they observe."""
+        seen = self._choice.seen(flat(observations, self._episodes.count), self._indices)
+        now = present(self._episodes, self._choice, self._indices)
+        return np.concatenate([now, seen], axis=1)
 
     def _block(
         self,
@@ -216,7 +231,7 @@ class Rows:
             *([which] if self._is_vector else []),
             *(self._number[which], self._steps[which]),
             *(
-                spec.communication_point(passed),
+                spec.communication_point(passed, self._starts[which]),
                 *values[is_due].T,
                 *self._sums[which].T,
             ),

@@ -18,7 +18,15 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.tools.simulation import Policy
 
-__all__ = ["FACTS", "agent_policy", "algorithm_of", "imported_for_training", "policy_with", "save"]
+__all__ = [
+    "FACTS",
+    "agent_policy",
+    "algorithm_of",
+    "imported_for_training",
+    "load_agent",
+    "policy_with",
+    "save",
+]
 
 _LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
 _MODEL, _NORMALIZATION = "model.zip", "normalization.pkl"
@@ -83,22 +91,44 @@ def agent_policy(folder: Path) -> Callable[[FMUEnv], Policy]:
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
+    model, normalization = load_agent(folder)
+    return lambda env: _checked_policy(folder, model, normalization, env)
+
+
+def load_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
+    """Load the model of an agent.
+
+    Only load agents from sources that you trust: the files hold pickles, which can run code.
+
+    Args:
+        path: The folder of a training, or the file of a model.
+        algorithm: The name of the algorithm of a file; a folder knows its own.
+
+    Returns:
+        The model, and its ``VecNormalize``, or None. That of a file is ``normalization.pkl`` beside
+        it, if there is one.
+
+    Raises:
+        ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
+    """
+    file = path if path.is_file() else path / _MODEL
+    kind = algorithm_of(algorithm if path.is_file() else _algorithm_in(path))
     try:
-        facts = json.loads((folder / FACTS).read_text(encoding="utf-8"))
-        name = str(facts["algorithm"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
-    algorithm = algorithm_of(name)
-    try:
-        model = algorithm.load(folder / _MODEL, device="cpu")
-        normalization = _normalization_in(folder)
+        return kind.load(file, device="cpu"), _normalization_in(file.parent)
     except ConfigError:
         raise
     except Exception as error:  # a damaged file may raise anything
         raise ConfigError(
-            f"the agent in {shown(str(folder))} cannot be read: {reason(error)}"
+            f"the agent in {shown(str(path))} cannot be read: {reason(error)}"
         ) from error
-    return lambda env: _checked_policy(folder, model, normalization, env)
+
+
+def _algorithm_in(folder: Path) -> str:
+    try:
+        facts = json.loads((folder / FACTS).read_text(encoding="utf-8"))
+        return str(facts["algorithm"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
 
 
 def _normalization_in(folder: Path) -> Any:

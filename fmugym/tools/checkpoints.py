@@ -22,7 +22,7 @@ import numpy as np
 from fmugym.errors import ConfigError, FMUGymError, reason, shown
 from fmugym.tools.agents import algorithm_of
 
-__all__ = ["CHECKPOINT", "load_checkpoint", "save_checkpoint"]
+__all__ = ["CHECKPOINT", "latest_checkpoint", "load_checkpoint", "save_checkpoint"]
 
 CHECKPOINT: Final = "checkpoint.json"
 _OF_NORMALIZATION: Final = ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward")
@@ -89,6 +89,19 @@ def _random_states(venv: Any) -> dict[str, Any]:
     }
 
 
+def latest_checkpoint(folder: Path) -> tuple[Path, int]:
+    """The folder of the latest checkpoint of a training, and its steps.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    try:
+        facts = json.loads((folder / CHECKPOINT).read_text(encoding="utf-8"))
+        return folder / str(facts["folder"]), int(facts["steps"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
+
+
 def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[str, Any], bool]:
     """Load the latest checkpoint.
 
@@ -105,11 +118,7 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
     Raises:
         ConfigError: If there is none, its files are damaged, or it is of another task.
     """
-    try:
-        facts = json.loads((folder / CHECKPOINT).read_text(encoding="utf-8"))
-        place = folder / str(facts["folder"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
+    place, _ = latest_checkpoint(folder)
     try:
         return _loaded(place, algorithm, venv)
     except FMUGymError:

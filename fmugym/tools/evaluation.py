@@ -24,6 +24,9 @@ _Z: Final = 1.959963984540054
 
 _LONGEST_LABEL: Final = 48
 
+Wrap = Callable[[FMUEnv], Any]
+"""Puts wrappers around an environment."""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -111,6 +114,7 @@ def evaluate(
     most_steps: int,
     scenario: str | None = None,
     advance: Advance = no_progress,
+    wrap: Wrap = lambda env: env,
 ) -> list[Score]:
     """Let controllers play the same episodes.
 
@@ -121,11 +125,12 @@ def evaluate(
         most_steps: The steps after which an episode is stopped.
         scenario: The scenario that the environment plays, for the scores.
         advance: Is told of each step.
+        wrap: Puts wrappers around the environment, such as a recorder.
 
     Returns:
         A score for each controller, in their order.
     """
-    return list(each_score(make_env, policies, seeds, most_steps, scenario, advance))
+    return list(each_score(make_env, policies, seeds, most_steps, scenario, advance, wrap))
 
 
 def each_score(
@@ -135,16 +140,19 @@ def each_score(
     most_steps: int,
     scenario: str | None = None,
     advance: Advance = no_progress,
+    wrap: Wrap = lambda env: env,
 ) -> Iterator[Score]:
     """Yield each score of ``evaluate`` as soon as it is known."""
     seeds, env = list(seeds), make_env()
+    played: Any = env
     try:
+        played = wrap(env)
         for name, make_policy in policies.items():
             policy, begin = make_policy(env), perf_counter()
-            episodes = [simulate(env, policy, seed, most_steps, advance) for seed in seeds]
+            episodes = [simulate(played, policy, seed, most_steps, advance) for seed in seeds]
             yield _score(name, episodes, perf_counter() - begin, scenario)
     finally:
-        env.close()
+        played.close()
 
 
 def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | None) -> Score:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from fmugym.errors import ConfigError
 from fmugym.tools.agents import FACTS
+from fmugym.tools.diary import Diary
 from fmugym.tools.evaluation import Score, table
 from fmugym.tools.options import (
     Commands,
@@ -21,7 +22,9 @@ from fmugym.tools.options import (
     say_json,
     tell,
 )
+from fmugym.tools.outcome import write_outcome
 from fmugym.tools.progress import progress
+from fmugym.tools.records import title_of
 from fmugym.tools.targets import maker_of, scenarios_of
 from fmugym.tools.tracking import TRACKERS, tracker_for
 from fmugym.tools.training import Plan, Watch, arguments_of, facts_of, train
@@ -70,6 +73,24 @@ def add_train(commands: Commands) -> None:
     command.add_argument(
         "--tune-steps", type=int, metavar="N", help="of each of these; default a tenth of --steps"
     )
+    command.add_argument(
+        "--record",
+        action="append",
+        metavar="GLOB",
+        help="record these variables in training and evaluations, and write a report",
+    )
+    command.add_argument(
+        "--record-env",
+        type=int,
+        action="append",
+        metavar="N",
+        help="the number of a recorded environment of the training; more than once for several; "
+        "default 0",
+    )
+    command.add_argument(
+        "--record-every", type=float, metavar="SECONDS", help="between rows; default each step"
+    )
+    command.add_argument("--record-format", help="csv (default) or parquet")
     command.add_argument("--track", choices=sorted(TRACKERS), help="log to this library, too")
     add_json(command)
 
@@ -87,7 +108,9 @@ def _train(arguments: argparse.Namespace) -> None:
             scores = train(plan, resume=arguments.resume, watch=watch)
         except KeyboardInterrupt:
             tell(f"{plan.folder} has the best agent until now; --resume goes on with the training")
+            write_outcome(plan, title_of(arguments.task), tell)
             raise
+    write_outcome(plan, title_of(arguments.task), tell)
     _show(plan, scores, arguments)
 
 
@@ -114,7 +137,19 @@ def _plan_of(arguments: argparse.Namespace) -> Plan:
         options.episodes,
         normalize=options.normalize,
         arguments=own,
+        diary=_diary_of(arguments, before.get("record")),
     )
+
+
+def _diary_of(arguments: argparse.Namespace, before: Any) -> Diary | None:
+    """What the options say to record; without any, what the training was begun with."""
+    own = (arguments.record_env, arguments.record_every, arguments.record_format)
+    if arguments.record is None:
+        if any(one is not None for one in own):
+            raise ConfigError("name the variables to record, too: --record '*'")
+        return Diary.of(before)
+    environments = tuple(arguments.record_env or (0,))
+    return Diary(tuple(arguments.record), environments, own[1], own[2] or "csv")
 
 
 def _tuned(plan: Plan, arguments: argparse.Namespace) -> Plan:
@@ -122,7 +157,7 @@ def _tuned(plan: Plan, arguments: argparse.Namespace) -> Plan:
         raise ConfigError("--tune is for a new training, which --resume is not")
     arguments.tune_steps = arguments.tune_steps or max(1, plan.steps // 10)
     check_numbers(arguments, "tune", "tune_steps")
-    with progress(arguments.tune, "tune") as advance:
+    with progress(arguments.tune, "tune", "trials") as advance:
 
         def noted(line: str) -> None:
             advance(1)

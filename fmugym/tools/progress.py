@@ -18,12 +18,13 @@ def no_progress(steps: int) -> None:
 
 
 @contextmanager
-def progress(total: int | None, what: str) -> Iterator[Advance]:
+def progress(total: int | None, what: str, unit: str = "steps") -> Iterator[Advance]:
     """Show a bar, if the error stream is a terminal and tqdm is installed (extra ``sb3``).
 
     Args:
         total: The number of steps; None if it is not known.
         what: A word for what is done.
+        unit: What is counted.
     """
     if not sys.stderr.isatty():
         yield no_progress
@@ -33,5 +34,5 @@ def progress(total: int | None, what: str) -> Iterator[Advance]:
     except ImportError:
         yield no_progress
         return
-    with tqdm(total=total, desc=what, unit=" steps", ascii=True, leave=False, delay=1) as bar:
+    with tqdm(total=total, desc=what, unit=f" {unit}", ascii=True, leave=False, delay=1) as bar:
         yield bar.update

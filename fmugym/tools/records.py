@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
@@ -13,7 +14,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.series import RecordSeries, TimeSeries, plot, write_report
 
-__all__ = ["Recording", "require_format", "title_of"]
+__all__ = ["About", "Recording", "require_format", "title_of"]
 
 _TABLES: Final = (".csv", ".parquet")
 _PICTURES: Final = (".png", ".svg", ".pdf")
@@ -42,6 +43,35 @@ def title_of(target: str) -> str:
     return path.name if path.is_file() else target
 
 
+@dataclass(frozen=True)
+class About:
+    """What a report tells of a task.
+
+    Attributes:
+        facts: By name: the FMU, versions.
+        description: What the task is about.
+        text: The task, as its file has it.
+    """
+
+    facts: Mapping[str, str]
+    description: str = ""
+    text: str = ""
+
+    @classmethod
+    def of(cls, env: FMUEnv) -> About:
+        """Look at an environment."""
+        facts = {
+            "FMU": f"{env.fmu.path.name} (FMI {env.fmu.description.fmi_version})",
+            "time step": f"{env.config.time_step:g} s",
+            "fmugym": version("fmugym-toolbox"),
+        }
+        task = getattr(env, "task", None)
+        if not isinstance(task, Task):
+            return cls(facts)
+        text = "\n".join(source.text for source in task.sources).strip()
+        return cls(facts, str(task.document.get("description", "")), text)
+
+
 class Recording:
     """The episodes of one controller after another, and the files about them.
 
@@ -56,8 +86,7 @@ class Recording:
         self._title = name if scenario is None else f"{name}, scenario {scenario}"
         self._paths = paths
         self._recorders: dict[str, RecordSeries] = {}
-        self._text = self._description = ""
-        self._facts: dict[str, str] = {}
+        self._about = About({})
 
     def begin(
         self, name: str, env: FMUEnv, variables: Sequence[str] | None, every: float | None
@@ -66,20 +95,8 @@ class Recording:
         tables = [path for path in self._paths if path.suffix.lower() in _TABLES]
         first = tables[0] if tables else None
         self._recorders[name] = RecordSeries(env, variables, every=every, path=first)
-        self._look_at(env)
+        self._about = About.of(env)
         return self._recorders[name]
-
-    def _look_at(self, env: FMUEnv) -> None:
-        """Keep what a report tells of the task."""
-        task = getattr(env, "task", None)
-        if isinstance(task, Task):
-            self._text = "\n".join(source.text for source in task.sources).strip()
-            self._description = str(task.document.get("description", ""))
-        self._facts = {
-            "FMU": f"{env.fmu.path.name} (FMI {env.fmu.description.fmi_version})",
-            "time step": f"{env.config.time_step:g} s",
-            "fmugym": version("fmugym-toolbox"),
-        }
 
     def finish(self, seed: int) -> None:
         """Write all files with what was recorded until now."""
@@ -100,14 +117,14 @@ class Recording:
                 _draw(path, runs, self._title)
 
     def _write_report(self, path: Path, runs: dict[str, TimeSeries], seed: int) -> None:
-        facts = self._facts | {"first seed": str(seed)}
+        about = self._about
         write_report(
             path,
             runs,
             title=self._title,
-            description=self._description,
-            facts=facts,
-            text=self._text,
+            description=about.description,
+            facts={**about.facts, "first seed": str(seed)},
+            text=about.text,
         )
 
 

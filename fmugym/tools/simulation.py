@@ -11,8 +11,9 @@ import numpy as np
 
 from fmugym.baselines import controller_of
 from fmugym.checks import number_of
+from fmugym.declared import Task
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.tools.progress import Advance, no_progress
 
 __all__ = ["Policy", "Summary", "action_of", "policy_of", "simulate"]
@@ -99,13 +100,26 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
 
     Args:
         env: The environment.
-        text: See ``fmugym.baselines.controller_of``.
+        text: The name of a controller of the task file, or as ``fmugym.baselines.controller_of``
+            takes it.
 
     Raises:
         ConfigError: If it names no controller, or the controller does not fit the environment.
     """
-    controller = controller_of(text).bind(env)
+    named = _named_controllers(env)
+    if named and text not in named and text.isidentifier():
+        raise unknown_name("controller of the task", text, named)
+    given = named.get(text, text)
+    if not isinstance(given, str):
+        return action_of(env, str(given))
+    controller = controller_of(given).bind(env)
     return Policy(controller.act, controller.reset)
+
+
+def _named_controllers(env: FMUEnv) -> Mapping[str, Any]:
+    """The controllers that a task file declares, by name."""
+    task = getattr(env, "task", None)
+    return dict(task.document.get("controllers", {})) if isinstance(task, Task) else {}
 
 
 def simulate(

@@ -20,12 +20,15 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.tools.agents import algorithm_of, imported_for_training, policy_with, save
-from fmugym.tools.checkpoints import load_checkpoint, save_checkpoint
-from fmugym.tools.evaluation import Score, evaluate
+from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
+from fmugym.tools.evaluation import Score, Wrap, evaluate
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.tracking import Tracker
+from fmugym.vector import FMUVectorEnv
 
 __all__ = [
+    "HELD_OUT_SEED",
     "TRAINING",
     "TRIALS",
     "Plan",
@@ -39,11 +42,10 @@ __all__ = [
 TRAINING: Final = "training.json"
 TRIALS: Final = "trials"
 _EVALUATIONS: Final = 10
-_HELD_OUT_SEED: Final = 1_000_000
+HELD_OUT_SEED: Final = 1_000_000
 """Episodes of evaluations have seeds from here on, which no training uses."""
 
 _SECONDS_BETWEEN_CHECKPOINTS: Final = 30.0
-_CSV: Final = "evaluations.csv"
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Plan:
         most_steps: The steps after which an episode of an evaluation is stopped.
         normalize: Whether observations and rewards are normalized by running statistics.
         arguments: Arguments of the algorithm.
+        diary: What to record; None for nothing.
     """
 
     make_env: Callable[[], FMUEnv]
@@ -75,6 +78,7 @@ class Plan:
     most_steps: int = 10_000
     normalize: bool = True
     arguments: Mapping[str, Any] | None = None
+    diary: Diary | None = None
 
     def facts(self) -> dict[str, Any]:
         """What a training that is resumed must have in common with its beginning."""
@@ -160,7 +164,8 @@ def train(
         _require_same(plan)
     else:
         require_new(plan.folder)
-    venv = make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed)
+    wrap = _recorder(plan, resume)
+    venv = make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed, wrap=wrap)
     try:
         if plan.normalize and isinstance(venv.observation_space, spaces.Box):
             venv = import_module("stable_baselines3.common.vec_env").VecNormalize(venv)
@@ -169,6 +174,14 @@ def train(
         return training.scores
     finally:
         venv.close()
+
+
+def _recorder(plan: Plan, resume: bool) -> Callable[[FMUVectorEnv], Any]:
+    """What wraps the environments of a training."""
+    if plan.diary is None:
+        return lambda envs: envs
+    begin = latest_checkpoint(plan.folder)[1] if resume else 0
+    return plan.diary.of_training(plan.folder, begin)
 
 
 def require_new(folder: Path) -> None:
@@ -239,7 +252,10 @@ class _Training:
         else:
             self._model = _new_model(plan, venv)
             plan.folder.mkdir(parents=True, exist_ok=True)
-        facts = {"schema": 1, "steps": plan.steps, **plan.facts()}
+        facts: dict[str, Any] = {"schema": 1, "steps": plan.steps, **plan.facts()}
+        if plan.diary is not None:
+            (plan.folder / RECORDS).mkdir(exist_ok=True)
+            facts["record"] = plan.diary.facts()
         (plan.folder / TRAINING).write_text(json.dumps(facts), encoding="utf-8")
         self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
         self._begin = self._told = self._steps
@@ -249,7 +265,7 @@ class _Training:
         plan = self._plan
         self._model, more, is_exact = load_checkpoint(plan.folder, plan.algorithm, self._venv)
         self._due, self._progress = more["due"], more["progress"]
-        _drop_rows(plan.folder / _CSV, self._steps)
+        _drop_rows(plan.folder / EVALUATIONS, self._steps)
         how = "" if is_exact else "; the FMUs cannot, so that their episodes begin anew"
         self._watch.tell(f"goes on after {self._steps} steps{how}")
 
@@ -325,10 +341,12 @@ class _Training:
         is_new = steps != self._progress["last"]
         self._progress["last"] = steps
         make_policy = partial(policy_with, self._model, self._normalization())
-        seeds = range(_HELD_OUT_SEED, _HELD_OUT_SEED + plan.episodes)
+        seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
         self.scores = []
         for name, make_env in plan.held_out.items():
-            self.scores += evaluate(make_env, {name: make_policy}, seeds, plan.most_steps)
+            self.scores += evaluate(
+                make_env, {name: make_policy}, seeds, plan.most_steps, wrap=self._wrap(name)
+            )
         mean = sum(score.mean for score in self.scores) / len(self.scores)
         self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")
         if is_new:
@@ -336,12 +354,19 @@ class _Training:
             self._keep_if_best(steps, mean)
             self._watch.evaluated(steps, mean)
 
+    def _wrap(self, name: str) -> Wrap:
+        """What wraps the environment of an evaluation."""
+        plan = self._plan
+        if plan.diary is None:
+            return lambda env: env
+        return plan.diary.of_evaluation(plan.folder, self._steps, name)
+
     def _normalization(self) -> Any:
         return self._venv if hasattr(self._venv, "normalize_obs") else None
 
     def _note(self, steps: int, mean: float) -> None:
         names = [score.name for score in self.scores]
-        path = self._plan.folder / _CSV
+        path = self._plan.folder / EVALUATIONS
         is_new = not path.exists()
         with path.open("a", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")

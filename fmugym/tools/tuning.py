@@ -93,7 +93,9 @@ class _Objective:
                 raise self._pruned
 
         folder = self._plan.folder / TRIALS / f"{trial.number:03}"
-        plan = replace(self._plan, folder=folder, steps=self._steps, arguments=arguments)
+        plan = replace(
+            self._plan, folder=folder, steps=self._steps, arguments=arguments, diary=None
+        )
         train(plan, watch=Watch(evaluated=evaluated))
         return max(rewards)
 

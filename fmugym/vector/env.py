@@ -158,6 +158,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._background = Background()
         self._engine = self._make_engine(hooks, max_episode_steps)
         self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
+        self._at_ends: list[Callable[[Any], None]] = []
         self._pool.forget_health()  # that of the hook check
 
     def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:
@@ -311,11 +312,21 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
             if engine.any_ended and self.autoreset_mode is _SAME_STEP:
+                for look in self._at_ends:
+                    look(actions)
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment
             self._interrupt()
             raise
         return result
+
+    def _look_at_ends(self, look: Callable[[Any], None]) -> None:
+        """Call a function of the actions where episodes have ended and the next have not begun.
+
+        That moment is within a step in the mode ``SAME_STEP``.
+        """
+        self._engine.leave_starts()
+        self._at_ends.append(look)
 
     def _interrupt(self) -> None:
         """After an exception, end the episodes whose FMUs have stepped without a result."""

@@ -65,7 +65,7 @@ static PyObject *tape_as_tuple(const Tape *t) {
     const Py_ssize_t number = sizeof(double);
 
     return Py_BuildValue("y#y#y#y#y#y#y#", (const char *)t->start_types, starts,
-                         (const char *)t->start_references, starts * (Py_ssize_t)sizeof(uint32_t),
+                         (const char *)t->start_variables, starts * (Py_ssize_t)sizeof(Element),
                          (const char *)t->starts, starts * number, (const char *)t->first_outputs,
                          out * number, (const char *)t->inputs, rows * in * number,
                          (const char *)t->outputs, rows * out * number, (const char *)t->statuses,
@@ -199,7 +199,7 @@ typedef struct {
     PyObject *paths, *categories, *mark, *solving, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads, start_outputs_size;
-    int version, private_libraries, logging, can_save;
+    int version, manner, private_libraries, logging, can_save;
     int restores, rebuilds, reloads, one_initialization;
     long long substeps, warm_up_steps, retries;
     const char *sampling;
@@ -220,11 +220,11 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 }
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
-    static char *names[] = {"version", "model",   "token",  "resources",  "paths",
+    static char *names[] = {"version", "manner",  "model",  "token",      "resources", "paths",
                             "private", "logging", "states", "categories", "mark", "solving", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iyyyO!pppO!OO:library", names, &a->version, &s->model, &s->token,
-                       &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
+    return parse_group(group, "$iiyyyO!pppO!OO:library", names, &a->version, &a->manner, &s->model,
+                       &s->token, &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
                        &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving);
 }
 
@@ -295,7 +295,7 @@ static bool check_start_outputs(const PyPool *self, const Arguments *a) {
 }
 
 static bool check_accesses(const Arguments *a) {
-    const Fmi *fmi = fmi_of(a->version, a->solving != Py_None);
+    const Fmi *fmi = fmi_of(a->version, a->manner);
 
     if (fmi == NULL) {
         return false;
@@ -383,16 +383,17 @@ static bool take_method(const char *name, Solving *solving) {
 
 /* Takes the tuple that fmugym/pool/settings.py makes. The references stay in the pool's arguments. */
 static bool take_solving(PyObject *tuple, Solving *solving) {
-    const char *method, *states, *rates;
-    Py_ssize_t count, indicators, states_size, rates_size;
+    const char *method, *states, *rates, *clocks, *clocked;
+    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size;
     int completes;
 
     if (tuple == Py_None) {
         return true;
     }
-    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#", &method, &solving->tolerance, &solving->max_step,
-                          &count, &indicators, &completes, &states, &states_size, &rates,
-                          &rates_size)) {
+    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#", &method, &solving->tolerance,
+                          &solving->max_step, &count, &indicators, &completes, &states,
+                          &states_size, &rates, &rates_size, &clocks, &clocks_size, &clocked,
+                          &clocked_size)) {
         return false;
     }
     const Py_ssize_t wanted = count * (Py_ssize_t)sizeof(uint32_t);
@@ -406,6 +407,10 @@ static bool take_solving(PyObject *tuple, Solving *solving) {
     solving->completes = completes;
     solving->state_references = (const uint32_t *)(const void *)states;
     solving->rate_references = (const uint32_t *)(const void *)rates;
+    solving->clocks = (const Clock *)(const void *)clocks;
+    solving->number_of_clocks = (size_t)clocks_size / sizeof(Clock);
+    solving->clocked = (const Clocked *)(const void *)clocked;
+    solving->number_of_clocked = (size_t)clocked_size / sizeof(Clocked);
     return take_method(method, solving);
 }
 
@@ -431,7 +436,7 @@ static bool take_arrays(PyPool *self, const Arguments *a) {
 static bool settle(PyPool *self, const Arguments *a) {
     Settings *s = &self->pool.settings;
 
-    s->fmi = fmi_of(a->version, a->solving != Py_None);
+    s->fmi = fmi_of(a->version, a->manner);
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;
     s->can_save = a->can_save && s->fmi->get_state != NULL;

@@ -54,7 +54,7 @@ extern PyObject *closed_error; /* raised by calls of a closed pool */
 extern PyType_Spec access_spec, draws_spec, mark_spec, snapshot_spec, pool_spec;
 
 /* The table of an FMI version; NULL with an exception if there is none. */
-const Fmi *fmi_of(int version, bool exchange);
+const Fmi *fmi_of(int version, int manner);
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
 

@@ -8,15 +8,15 @@
 #include "worker.h"
 
 bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
-    size_t count, size;
+    size_t count, size, size_of_rest;
     const char *types = read_block(reader, &count);
-    const char *references = read_block(reader, &size);
-    bool sound = reader->sound && size == count * sizeof(uint32_t);
+    const char *elements = read_block(reader, &size);
+    const char *rest = read_block(reader, &size_of_rest);
+    Listing listing;
 
-    for (size_t i = 0; sound && i < count; i++) {
-        sound = (uint8_t)types[i] < NUMBER_OF_TYPES;
-    }
-    return sound && access_open(access, fmi, (const uint8_t *)types, references, count);
+    return reader->sound &&
+           listing_take(&listing, types, count, elements, size, rest, size_of_rest) == NULL &&
+           access_open(access, fmi, &listing);
 }
 
 /* Shared memory */
@@ -116,6 +116,21 @@ static const uint32_t *read_references(Reader *reader, size_t states) {
     return memcpy(references, bytes, size);
 }
 
+/* Copies a block of elements of this size; NULL if it is empty. */
+static const void *read_copy(Reader *reader, size_t size, size_t *count) {
+    size_t total;
+    const char *bytes = read_block(reader, &total);
+    void *copy = malloc(total + 1);
+
+    reader->sound = reader->sound && copy != NULL && total % size == 0;
+    *count = reader->sound ? total / size : 0;
+    if (*count == 0) {
+        free(copy);
+        return NULL;
+    }
+    return memcpy(copy, bytes, total);
+}
+
 static void read_solving(Reader *reader, Solving *solving) {
     solving->method = method_of(read_text(reader));
     solving->tolerance = read_number(reader);
@@ -125,16 +140,18 @@ static void read_solving(Reader *reader, Solving *solving) {
     solving->completes = read_flag(reader);
     solving->state_references = read_references(reader, solving->states);
     solving->rate_references = read_references(reader, solving->states);
+    solving->clocks = read_copy(reader, sizeof(Clock), &solving->number_of_clocks);
+    solving->clocked = read_copy(reader, sizeof(Clocked), &solving->number_of_clocked);
     reader->sound = reader->sound && solving->method != NULL;
 }
 
 static void read_library(Reader *reader, Settings *s) {
     size_t paths;
     const int64_t version = read_integer(reader);
-    const bool exchange = read_flag(reader);
+    const int64_t manner = read_integer(reader);
 
-    s->fmi = fmi_table(version, exchange);
-    if (exchange) {
+    s->fmi = fmi_table(version, manner);
+    if (read_flag(reader)) {
         read_solving(reader, &s->solving);
     }
     s->model = read_text(reader);

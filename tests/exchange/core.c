@@ -168,11 +168,14 @@ static bool step_once(Model *me, double until) {
     return me->time >= me->stop - 1e-12;
 }
 
+/* Does no more of a step than EARLY seconds. */
 int core_do_step(Model *me, double time, double step) {
-    REQUIRE(me->mode == STEPPING);
+    const double until = time + fmin(step, EARLY);
+
+    REQUIRE(me->mode == STEPPING && fabs(time - me->time) < 1e-9);
     me->time = time;
-    while (me->time < time + step - 1e-12) {
-        if (step_once(me, time + step)) {
+    while (me->time < until - 1e-12) {
+        if (step_once(me, until)) {
             me->stops = true;
             return DISCARD;
         }

@@ -4,6 +4,8 @@
    the other files. Its variables are numbered by their value references: first the states, then
    their derivatives. */
 
+#pragma once
+
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -11,6 +13,10 @@
 enum { OK, WARNING, DISCARD, ERROR };
 enum { INSTANTIATED, INITIALIZING, EVENT, CONTINUOUS, STEPPING, TERMINATED };
 enum { MOST = 32 };
+
+#ifndef EARLY
+#define EARLY INFINITY
+#endif
 
 typedef struct {
     double v[MOST]; /* the variables */

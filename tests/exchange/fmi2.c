@@ -54,7 +54,14 @@ int fmi2SetReal(Model *me, const unsigned *references, size_t count, const doubl
 }
 
 int fmi2DoStep(Model *me, double time, double step, int no_set_state) {
-    return core_do_step(me, time, step);
+    const int status = core_do_step(me, time, step);
+
+    return status == OK && me->time < time + step - 1e-9 ? DISCARD : status;
+}
+
+int fmi2GetRealStatus(Model *me, int kind, double *value) {
+    *value = me->time;
+    return kind == 2 ? OK : DISCARD;
 }
 
 int fmi2GetBooleanStatus(Model *me, int kind, int *value) {

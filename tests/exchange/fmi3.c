@@ -52,7 +52,8 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
                bool *terminate, bool *early, double *last) {
     const int status = core_do_step(me, time, step);
 
-    *event = *early = false;
+    *event = false;
+    *early = !me->stops && me->time < time + step - 1e-9;
     *terminate = me->stops;
     *last = me->time;
     return status == DISCARD ? OK : status;
@@ -116,6 +117,18 @@ int fmi3GetDirectionalDerivative(Model *me, const unsigned *unknowns, size_t cou
                                  const double *seed, size_t number_of_seeds, double *result,
                                  size_t number_of_results) {
     return core_differentiate(me, unknowns, count, knowns, number_of_knowns, seed, result);
+}
+
+int fmi3GetAdjointDerivative(Model *me, const unsigned *unknowns, size_t count,
+                             const unsigned *knowns, size_t number_of_knowns, const double *seed,
+                             size_t number_of_seeds, double *result, size_t number_of_results) {
+    for (size_t j = 0; j < number_of_knowns; j++) {
+        result[j] = 0.0;
+        for (size_t i = 0; i < count; i++) {
+            result[j] += seed[i] * model_partial(me, unknowns[i], knowns[j]);
+        }
+    }
+    return number_of_seeds == count && number_of_results == number_of_knowns ? OK : ERROR;
 }
 
 int fmi3GetFMUState(Model *me, void **state) {

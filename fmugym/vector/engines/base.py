@@ -50,6 +50,10 @@ class Engine(ABC):
         np.logical_or(terminated, truncated, out=self.ended)
         self.any_ended = bool(np.count_nonzero(self.ended))
 
+    def leave_starts(self) -> None:
+        """Leave the start of episodes to ``reset`` from now on, also in the mode ``SAME_STEP``."""
+        self.starts_at_ends = False
+
     def note_starts(self, mask: MaskArray) -> None:
         """Note which episodes have started."""
         self.ended[mask] = False

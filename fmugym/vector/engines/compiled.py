@@ -326,6 +326,11 @@ class CompiledEngine(BatchEngine):
         self._spare = np.empty(self._drawn_shape), last, started
         return self._spare
 
+    def leave_starts(self) -> None:
+        """See ``Engine.leave_starts``."""
+        super().leave_starts()
+        self._spare = None
+
     @contextmanager
     def single(self, index: int) -> Iterator[FMUEnv]:
         """See ``Engine.single``."""

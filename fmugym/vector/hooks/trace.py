@@ -21,7 +21,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Graph
@@ -41,6 +41,7 @@ from fmugym.vector.hooks.tables import Table, is_table, tables_in
 __all__ = [
     "SeenArray",
     "TracedTask",
+    "Tracer",
     "in_hook",
     "require_unchanged",
     "tables_of",
@@ -110,10 +111,10 @@ def trace_hooks(
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
     with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
-        return _Tracer(env, attributes).task()
+        return Tracer(env, attributes).task()
 
 
-class _Tracer:
+class Tracer:
     """Calls the hooks of one environment with symbols.
 
     Args:
@@ -472,7 +473,7 @@ def symbolic_readings(
         done=loaded(graph, "missing", missing, np.bool_),
         after_end=lift(graph, np.zeros(LANES, np.bool_)),
         parameters=MappingProxyType(
-            {name: rows((), "parameter", name) for name in env._interface.parameters}
+            ParameterValues((n, rows((), "parameter", n)) for n in env._interface.parameters)
         ),
         variables=names,
     )

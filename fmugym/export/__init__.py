@@ -1,0 +1,22 @@
+"""Agents outside of Python: C99, FMUs and ONNX, with everything around the network.
+
+``agent_of`` puts an agent together from its environment and its model. ``write_c``, ``write_fmu``
+and ``write_onnx`` write it. See ``docs/deploy.md``.
+"""
+
+from fmugym.export.agent import Agent, agent_of
+from fmugym.export.fmus import write_fmu
+from fmugym.export.network import Activation, Layer, Network, Scaling, network_of
+from fmugym.export.writing import write_c
+
+__all__ = [
+    "Activation",
+    "Agent",
+    "Layer",
+    "Network",
+    "Scaling",
+    "agent_of",
+    "network_of",
+    "write_c",
+    "write_fmu",
+]

@@ -1,0 +1,94 @@
+"""An agent with everything around its network, ready to be written in some form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+from fmugym.archive.description import Unit
+from fmugym.checks import check_text
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown
+from fmugym.export.devices import without_imperfections
+from fmugym.export.logic import Logic, logic_of
+from fmugym.export.network import Network
+from fmugym.export.policies import network_of_model
+
+__all__ = ["Agent", "agent_of"]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """An agent of a task.
+
+    Attributes:
+        name: What functions and files are called by.
+        logic: What surrounds the network.
+        network: The network.
+        notes: Lines that tell a reader what it is.
+        units: The units of the plant by name.
+    """
+
+    name: str
+    logic: Logic
+    network: Network
+    notes: tuple[str, ...] = ()
+    units: Mapping[str, Unit] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.logic.observation)
+        if self.network.width != count:
+            raise ConfigError(
+                f"the agent is for another task: its network takes {self.network.width} values, "
+                f"the task gives {count}"
+            )
+        if self.network.space != self.logic.action_space:
+            raise ConfigError(
+                f"the agent is for another task: its actions are {self.network.space}, those of "
+                f"the task are {self.logic.action_space}"
+            )
+
+    @property
+    def version(self) -> str:
+        """The version of fmugym."""
+        return version("fmugym-toolbox")
+
+
+def agent_of(
+    env: FMUEnv,
+    model: Any,
+    normalization: Any = None,
+    *,
+    name: str = "agent",
+    all_inputs: bool = False,
+) -> Agent:
+    """Put an agent together from its task and its policy.
+
+    Args:
+        env: The environment that the agent was trained in, without wrappers.
+        model: A model of Stable-Baselines3 or sb3-contrib, or a ``Network``.
+        normalization: The ``VecNormalize`` of the training; None if there was none.
+        name: What functions and files are called by: letters, digits and _.
+        all_inputs: Whether the agent also writes inputs that no action changes, such as the
+            weather that the task feeds to the plant.
+
+    Raises:
+        ConfigError: If the policy or the task cannot be exported; the text names what cannot.
+    """
+    if not check_text("name", name).isidentifier() or not name.isascii():
+        raise ConfigError(f"the name must have letters, digits and _ only, got {shown(name)}")
+    network = model if isinstance(model, Network) else network_of_model(model, normalization)
+    with without_imperfections(env) as ideal:
+        logic = logic_of(ideal, all_inputs=all_inputs)
+    return Agent(name, logic, network, _notes(env, model), env.fmu.description.units)
+
+
+def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:
+    spec = getattr(env, "spec", None)
+    task = type(env).__name__ if spec is None else str(spec.id)
+    return (
+        f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {type(model).__name__}.",
+        "Compile it with -ffp-contract=off for the same numbers on every processor.",
+    )

@@ -1,0 +1,334 @@
+"""Agents as C99 without dependencies: a header and a source file."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.archive.description import Variable
+from fmugym.errors import ConfigError
+from fmugym.export.agent import Agent
+from fmugym.export.layers import array, bare, c_type, network_lines
+from fmugym.export.names import identifiers
+from fmugym.export.operations import HELPERS, TYPES, constant, expression
+from fmugym.vector.hooks.graph import Node
+
+__all__ = ["field_names", "header", "source"]
+
+_LONGEST_INLINE: Final = 56
+
+
+def header(agent: Agent) -> str:
+    """The header of an agent."""
+    name, upper = agent.name, agent.name.upper()
+    logic = agent.logic
+    return "\n".join(
+        [
+            *_comment(agent),
+            f"#ifndef {upper}_H",
+            f"#define {upper}_H",
+            "",
+            "#include <stdint.h>",
+            "",
+            "#ifdef __cplusplus",
+            'extern "C" {',
+            "#endif",
+            "",
+            "/* Seconds from one sample to the next. */",
+            f"#define {upper}_SAMPLE_TIME {constant(logic.time_step, 'd')}",
+            "",
+            "/* The places of the measurements. */",
+            *_enumeration(f"{upper}_MEASUREMENT", logic.measurements),
+            "",
+            "/* The places of the actions. */",
+            *_enumeration(f"{upper}_ACTION", logic.inputs),
+            "",
+            "/* What the agent keeps from one sample to the next. */",
+            "typedef struct {",
+            "    int64_t count; /* of the samples until now */",
+            *_fields(agent),
+            f"}} {name}_state;",
+            "",
+            "/* Begin an episode. */",
+            f"void {name}_init({name}_state *state);",
+            "",
+            "/* Take a sample: from the measurements to the actions.",
+            " *",
+            " * Returns 0. If a measurement is not finite, or a value is looked up outside of its",
+            " * table, it returns 1, and changes neither the state nor the actions. */",
+            f"int {name}_step({name}_state *state, const double *measurements, double *actions);",
+            "",
+            "#ifdef __cplusplus",
+            "}",
+            "#endif",
+            "",
+            "#endif",
+            "",
+        ]
+    )
+
+
+def _comment(agent: Agent) -> list[str]:
+    lines = [f"The agent {agent.name!r}, exported by fmugym {agent.version}.", *agent.notes]
+    safe = [re.sub(r"\*/|/\*|[^ -~]", "?", line) for line in lines]
+    return [f"/* {safe[0]}", *(f" * {line}".rstrip() for line in safe[1:]), " */"]
+
+
+def _enumeration(prefix: str, variables: Sequence[Variable]) -> list[str]:
+    names = identifiers(variable.name for variable in variables)
+    lines = [
+        f"    {prefix}_{name},{_unit(variable)}"
+        for name, variable in zip(names, variables, strict=True)
+    ]
+    return ["enum {", *lines, f"    {prefix}S", "};"]
+
+
+def _unit(variable: Variable) -> str:
+    told = ", ".join(filter(None, [variable.unit, variable.description]))
+    return f" /* {re.sub(r'[*]/|/[*]|[^ -~]', '?', told)} */" if told else ""
+
+
+def field_names(agent: Agent) -> list[str]:
+    """The names of the fields of the state after ``count``."""
+    return identifiers(kept.name for kept in agent.logic.kept)
+
+
+def _fields(agent: Agent) -> Iterator[str]:
+    for name, kept in zip(field_names(agent), agent.logic.kept, strict=True):
+        yield f"    {c_type(kept.dtype)} {name}[{len(kept.starts)}];"
+
+
+def source(agent: Agent) -> str:
+    """The source of an agent."""
+    return _Source(agent).text()
+
+
+class _Source:
+    """Writes the source file of an agent."""
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent, self._logic, self._name = agent, agent.logic, agent.name
+        self._graph = agent.logic.graph
+        self._helpers: dict[tuple[str, str], str] = {}
+        self._tables: dict[Any, str] = {}
+        self._texts: dict[int, str] = {}
+        self._uses = self._counted_uses()
+        self._fields = field_names(agent)
+
+    def text(self) -> str:
+        """The whole file."""
+        step, network = self._step(), self._network()
+        return "\n".join(
+            [
+                f"/* See {self._name}.h. */",
+                "",
+                f'#include "{self._name}.h"',
+                "",
+                "#include <math.h>",
+                "#include <stdbool.h>",
+                "",
+                *self._table_lines(),
+                *self._helper_lines(),
+                *network,
+                *self._init(),
+                "",
+                *step,
+                "",
+            ]
+        )
+
+    # The numbers of the graph.
+
+    def _counted_uses(self) -> Counter[int]:
+        uses: Counter[int] = Counter()
+        for number in self._logic.needed:
+            uses.update(self._graph.nodes[number].operands)
+        uses.update(self._logic.observation)
+        uses.update(self._logic.input_nodes)
+        uses.update(node for kept in self._logic.kept for node in kept.updates)
+        return uses
+
+    def _use(self, helper: str, letter: str) -> str:
+        suffix = "" if letter == "d" else f"_{letter}"
+        return self._helpers.setdefault((helper, letter), f"{self._name}_{helper}{suffix}")
+
+    def _evaluated(self, numbers: Iterable[int]) -> Iterator[str]:
+        """The lines that compute some nodes, and those that they need."""
+        closure = self._closure(numbers)
+        for number in sorted(closure):
+            node = self._graph.nodes[number]
+            letter = node.dtype.char
+            if node.kind == "constant":
+                value = self._value(node)
+                self._texts[number] = constant(value, letter)
+                continue
+            if node.kind in {"take"}:
+                yield from self._checked_place(node)
+            text = self._expression(number, node)
+            is_short = len(text) <= _LONGEST_INLINE and self._uses[number] < 2
+            if is_short or (number in self._logic.loads and "state->" not in text):
+                self._texts[number] = text
+                continue
+            self._texts[number] = f"t{number}"
+            yield f"    const {c_type(node.dtype)} t{number} = {bare(text)};"
+
+    def _closure(self, numbers: Iterable[int]) -> set[int]:
+        found: set[int] = set()
+        waiting = list(numbers)
+        while waiting:
+            number = waiting.pop()
+            if number not in found and number not in self._texts:
+                found.add(number)
+                waiting.extend(self._graph.nodes[number].operands)
+        return found
+
+    def _value(self, node: Node) -> Any:
+        bits: Any = node.what
+        return np.frombuffer(bits, node.dtype)[0]
+
+    def _expression(self, number: int, node: Node) -> str:
+        if number in self._logic.loads:
+            return self._loaded(number, node)
+        operands = [self._texts[operand] for operand in node.operands]
+        letters = "".join(self._graph.nodes[operand].dtype.char for operand in node.operands)
+        match node.kind:
+            case "ufunc":
+                return expression(node.what, operands, letters, self._use)
+            case "cast":
+                return self._cast(node, operands[0])
+            case "where":
+                return f"({operands[0]} ? {operands[1]} : {operands[2]})"
+            case "take":
+                table, place = self._table(node.what), operands[0]
+                count = len(self._graph.tables[node.what])
+                return f"{table}[{place} < 0 ? {place} + {count} : {place}]"
+            case "interpolate":
+                return self._interpolation(node, operands[0])
+            case "part" if node.what[0] is np.divmod:  # type: ignore[index]  # a tuple
+                which = np.remainder if node.what[1] else np.floor_divide  # type: ignore[index]
+                return expression(which, operands, letters, self._use)
+        name = getattr(node.what[0] if node.kind == "part" else node.what, "__name__", node.kind)  # type: ignore[index]
+        raise ConfigError(f"numpy.{name} cannot be exported to C")
+
+    def _loaded(self, number: int, node: Node) -> str:
+        load = self._logic.loads[number]
+        match load[0]:
+            case "measurement":
+                return f"measurements[{load[1]}]"
+            case "kept":
+                return self._kept_value(load[1], load[2])
+            case "count":
+                return "count"
+            case "active":
+                return "(count > 0)"
+            case "chosen":
+                return f"chosen[{load[1]}]"
+        return constant(load[1], node.dtype.char)
+
+    def _kept_value(self, field: int, element: int) -> str:
+        text = f"state->{self._fields[field]}[{element}]"
+        if self._logic.kept[field].name == "previous":
+            return f"(count == 0 ? measurements[{element}] : {text})"
+        return text
+
+    def _cast(self, node: Node, operand: str) -> str:
+        if node.dtype == np.bool_:
+            return f"({operand} != 0)"
+        return f"({c_type(node.dtype)}){operand}"
+
+    def _checked_place(self, node: Node) -> Iterator[str]:
+        """Look at an index before it is used, which must therefore have a name."""
+        (operand,) = node.operands
+        count, text = len(self._graph.tables[node.what]), self._texts[operand]
+        if not re.fullmatch(r"t\d+", text):
+            self._texts[operand] = f"t{operand}"
+            yield f"    const {c_type(self._graph.nodes[operand].dtype)} t{operand} = {bare(text)};"
+        place = self._texts[operand]
+        yield f"    if ({place} < -{count} || {place} >= {count}) {{"
+        yield "        return 1;"
+        yield "    }"
+
+    def _table(self, key: Any) -> str:
+        return self._tables.setdefault(key, f"{self._name}_table_{len(self._tables)}")
+
+    def _interpolation(self, node: Node, operand: str) -> str:
+        table, count = self._table(node.what), len(self._graph.tables[node.what]) // 2 - 1
+        name = self._use("interpolate", "d")
+        return f"{name}({bare(operand)}, {table}, {table} + {count}, {count})"
+
+    # The parts of the file.
+
+    def _table_lines(self) -> Iterator[str]:
+        for key, name in self._tables.items():
+            yield from array(name, self._graph.tables[key])
+            yield ""
+
+    def _helper_lines(self) -> Iterator[str]:
+        for (helper, letter), name in self._helpers.items():
+            suffix = "f" if letter == "f" else ""
+            yield "static " + HELPERS[helper].format(T=TYPES[letter], name=name, f=suffix)
+            yield ""
+
+    def _init(self) -> Iterator[str]:
+        yield f"void {self._name}_init({self._name}_state *state) {{"
+        yield "    state->count = 0;"
+        for field, kept in zip(self._fields, self._logic.kept, strict=True):
+            for element, start in enumerate(kept.starts):
+                yield f"    state->{field}[{element}] = {bare(constant(start, kept.dtype.char))};"
+        yield "}"
+
+    def _step(self) -> list[str]:
+        logic, name = self._logic, self._name
+        updates = [node for kept in logic.kept for node in kept.updates]
+        return [
+            f"int {name}_step({name}_state *state, const double *measurements, double *actions) {{",
+            "    const int64_t count = state->count;",
+            f"    {self._agent.network.c_type} observation[{len(logic.observation)}];",
+            f"    {self._chosen_type} chosen[{len(self._agent.network.parts)}];",
+            "",
+            *self._check_of_measurements(),
+            *self._evaluated(logic.observation),
+            *self._stored("observation", logic.observation, self._agent.network.c_type),
+            f"    {name}_network(observation, chosen);",
+            *self._evaluated([*logic.input_nodes, *updates]),
+            *self._stored("actions", logic.input_nodes, "double"),
+            *self._stored_state(),
+            "    state->count = count + 1;",
+            "    return 0;",
+            "}",
+        ]
+
+    def _check_of_measurements(self) -> Iterator[str]:
+        count = len(self._logic.measurements)
+        if not count:
+            yield "    (void)measurements;"
+            return
+        yield f"    for (int i = 0; i < {count}; i++) {{"
+        yield "        if (!isfinite(measurements[i])) {"
+        yield "            return 1;"
+        yield "        }"
+        yield "    }"
+
+    @property
+    def _chosen_type(self) -> str:
+        return c_type(np.dtype(self._logic.action_space.dtype))
+
+    def _stored(self, array: str, nodes: Sequence[int], kind: str) -> Iterator[str]:
+        for index, node in enumerate(nodes):
+            is_same = c_type(self._graph.nodes[node].dtype) == kind
+            text = self._texts[node]
+            yield f"    {array}[{index}] = {bare(text) if is_same else f'({kind}){text}'};"
+
+    def _stored_state(self) -> Iterator[str]:
+        for field, kept in zip(self._fields, self._logic.kept, strict=True):
+            if kept.updates:
+                yield from self._stored(f"state->{field}", kept.updates, c_type(kept.dtype))
+
+    # The network.
+
+    def _network(self) -> Iterator[str]:
+        return network_lines(self._name, self._agent.network, self._chosen_type)

@@ -1,0 +1,74 @@
+"""What of sensors and actuators belongs to the plant, and not to its controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from typing import Any, Final
+
+from fmugym.declared import Task, TaskEnv
+from fmugym.declared.devices import DEVICE_KEYS
+from fmugym.env import FMUEnv
+
+__all__ = ["without_imperfections"]
+
+_OF_ACTUATORS: Final = ("delay", "bias", "noise", "drop_out")
+"""An actuator has these itself. Its limits, steps and rates are the controller's to keep, too."""
+
+
+@contextmanager
+def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
+    """Give an environment whose sensors are ideal: their readings are what a controller is given.
+
+    The delay, bias, noise and drop-outs of actuators, errors of forecasts and warm-ups are left
+    out, too: they happen to the controller, and are not its doing.
+
+    Args:
+        env: The environment of a task.
+
+    Yields:
+        The same environment if there is nothing to leave out; otherwise another one, which is
+        closed in the end.
+    """
+    document = _ideal(env.task.document) if isinstance(env, TaskEnv) else None
+    if document is None or document == env.task.document:  # type: ignore[attr-defined]  # a TaskEnv
+        yield env
+        return
+    task: Any = Task(document, env.task.sources)  # type: ignore[attr-defined]  # as above
+    other: Any = object.__new__(type(env))
+    TaskEnv.__init__(other, task)
+    for name, value in vars(env).items():  # those that the class's own constructor has set
+        if not name.startswith("_"):
+            vars(other).setdefault(name, value)
+    with closing(other):
+        yield other
+
+
+def _ideal(document: Mapping[str, Any]) -> dict[str, Any]:
+    ideal = dict(document)
+    ideal.pop("warm_up", None)
+    agent = document.get("agent", {})
+    actions = agent.get("actions", ())
+    actions = [actions] if isinstance(actions, str) else actions
+    variables = document.get("variables", {})
+    ideal["variables"] = {
+        name: _without(one, _OF_ACTUATORS if name in actions else DEVICE_KEYS)
+        for name, one in variables.items()
+    }
+    if "forecast" in agent:
+        ideal["agent"] = {**agent, "forecast": _exact(agent["forecast"])}
+    return (
+        ideal if "variables" in document else {k: v for k, v in ideal.items() if k != "variables"}
+    )
+
+
+def _exact(forecast: Any) -> Any:
+    if isinstance(forecast, Mapping):
+        return _without(forecast, ("error",))
+    return [_without(one, ("error",)) for one in forecast]
+
+
+def _without(table: Any, keys: tuple[str, ...]) -> Any:
+    if not isinstance(table, Mapping):
+        return table
+    return {key: value for key, value in table.items() if key not in keys}

@@ -1,0 +1,392 @@
+"""What surrounds the network of an agent: from measurements to its observation, and to inputs.
+
+The hooks of the task are traced as those of vector environments are. Between two samples a
+controller knows its measurements and what it has kept: earlier measurements, actions and inputs,
+and the episode variables that ``_update`` writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.archive.description import Variable
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.task.readings import Readings, reading
+from fmugym.vector.contents import Contents, borrowed
+from fmugym.vector.hooks.functions import exclusive
+from fmugym.vector.hooks.graph import Graph, Node
+from fmugym.vector.hooks.lowering import Store
+from fmugym.vector.hooks.program import UntraceableError
+from fmugym.vector.hooks.symbols import loaded
+from fmugym.vector.hooks.tables import tables_in
+from fmugym.vector.hooks.trace import SeenArray, Tracer
+
+__all__ = ["Kept", "Logic", "Parameter", "logic_of"]
+
+Load = tuple[Any, ...]
+"""Where a value comes from: ``("measurement", i)``, ``("kept", field, i)``, ``("count",)``,
+``("active",)``, ``("chosen", i)`` or ``("constant", value)``."""
+
+_CHOSEN: Final = "chosen"
+_SEED: Final = 0
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Values that the controller keeps from one sample to the next.
+
+    Attributes:
+        name: What they are.
+        dtype: Their type.
+        starts: What they are before the first sample; for ``previous`` that sample counts.
+        updates: For each the node of its next value; empty if they stay.
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    starts: tuple[Any, ...]
+    updates: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that was drawn in each episode, and that the user of the controller sets.
+
+    Attributes:
+        name: Its name in the task.
+        field: The number of the ``Kept`` that holds it.
+        element: Its place there.
+        start: The value if nothing else is set.
+        variable: The plant's variable; None for an episode variable.
+    """
+
+    name: str
+    field: int
+    element: int
+    start: float
+    variable: Variable | None
+
+
+@dataclass(frozen=True)
+class Logic:
+    """The program around the network.
+
+    Attributes:
+        graph: The operations.
+        loads: Where the values that it loads come from, by node.
+        measurements: The plant's outputs that it reads.
+        inputs: The plant's inputs that it writes.
+        input_nodes: The node of each.
+        observation: The nodes of the elements of the observation, in the order in which networks
+            take them.
+        kept: What it keeps.
+        parameters: What was drawn in each episode.
+        time_step: From one sample to the next, in seconds.
+        observation_space, action_space: Those of the environment.
+    """
+
+    graph: Graph
+    loads: Mapping[int, Load]
+    measurements: tuple[Variable, ...]
+    inputs: tuple[Variable, ...]
+    input_nodes: tuple[int, ...]
+    observation: tuple[int, ...]
+    kept: tuple[Kept, ...]
+    parameters: tuple[Parameter, ...]
+    time_step: float
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
+    @property
+    def needed(self) -> frozenset[int]:
+        """The nodes that one sample computes."""
+        updates = (node for kept in self.kept for node in kept.updates)
+        return _closure(self.graph, [*self.observation, *self.input_nodes, *updates])
+
+
+def logic_of(env: FMUEnv, *, all_inputs: bool = False) -> Logic:
+    """Trace what a task does between measurements and observation, and from action to inputs.
+
+    Args:
+        env: The environment. It is not stepped.
+        all_inputs: Whether the controller also writes inputs that no action changes, such as the
+            weather that the task feeds to the plant.
+
+    Raises:
+        ConfigError: If a hook does what cannot be translated, or reads what a controller does not
+            have. The text names the hook or the value.
+    """
+    if env._own.step or env._own.reset:
+        name = "step" if env._own.step else "reset"
+        raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
+    if not isinstance(env.action_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete):
+        raise ConfigError(
+            "an agent with a Box, Discrete or MultiDiscrete of actions can be exported, got "
+            f"{env.action_space}"
+        )
+    try:
+        with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+            traced = _ControllerTracer(env, {}).traced()
+        return _Assembly(env, traced, all_inputs).logic()
+    except UntraceableError as error:
+        raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
+
+
+@dataclass(frozen=True)
+class _Traced:
+    graph: Graph
+    observation: tuple[int, ...]
+    inputs: tuple[int, ...]
+    updates: Mapping[str, tuple[int, ...]]
+    types: Mapping[str, np.dtype[Any]]
+
+
+class _ControllerTracer(Tracer):
+    """Traces one sample of a controller in a single graph."""
+
+    def traced(self) -> _Traced:
+        """Trace the hooks, again if ``_update`` gives variables other types."""
+        for _ in range(3):
+            before = dict(self._variables)
+            self._begin(judging=True)
+            stores, updated = self._trace_update()
+            if self._variables == before:
+                return self._rest(stores, updated)
+        raise UntraceableError("_update gives a variable another type in each step")
+
+    def _rest(self, stores: list[Store], updated: tuple[str, ...]) -> _Traced:
+        nodes: dict[str, list[int]] = {name: [] for name in updated}
+        for store in stores:
+            row: Any = store.row
+            nodes[row[1]].append(store.node)
+        seen: list[SeenArray] = []
+        observed: list[Store] = []
+        self._contents = Contents(self._env)
+        self._call("_get_observation", lambda v: self._see_observation(v, seen, observed))
+        self._decide()
+        inputs = self._call("_get_inputs", self._input_nodes)
+        updates = {name: tuple(numbers) for name, numbers in nodes.items()}
+        observation = tuple(store.node for store in observed)
+        return _Traced(self._graph, observation, tuple(inputs), updates, dict(self._variables))
+
+    def _decide(self) -> None:
+        """Let hooks read the action that the network has chosen now."""
+        env: Any = self._env
+        names = np.empty(env.action_space.shape or (), object)
+        for index, place in enumerate(np.ndindex(names.shape)):
+            names[place] = (_CHOSEN, index)
+        env.previous_action, env.previous_state = env.action, env.state
+        env.action = loaded(self._graph, "row", names, env.action_space.dtype)
+        self._contents = Contents(env)
+
+
+class _Assembly:
+    """Makes a ``Logic`` of what was traced: only what the actions depend on is kept."""
+
+    def __init__(self, env: FMUEnv, traced: _Traced, all_inputs: bool) -> None:
+        self._env, self._traced, self._graph = env, traced, traced.graph
+        rng = np.random.default_rng(_SEED)
+        self._episode = env._plan.draw(rng)
+        self._drawn = set(env._plan.drawn_names)
+        self._inputs = [
+            (variable, node)
+            for variable, node in zip(env._interface.inputs, traced.inputs, strict=True)
+            if all_inputs or self._is_chosen(node)
+        ]
+        if not self._inputs:
+            raise ConfigError(f"the actions of {type(env).__name__} change no input of the FMU")
+        self._kept: list[Kept] = []
+        self._fields: dict[str, int] = {}
+        self._parameters: list[Parameter] = []
+
+    def _is_chosen(self, node: int) -> bool:
+        nodes = (self._graph.nodes[number] for number in _closure(self._graph, [node]))
+        return any(_is_row(one, _CHOSEN) for one in nodes)
+
+    def logic(self) -> Logic:
+        """Find all that the observation and the inputs depend on, from sample to sample."""
+        roots = [*self._traced.observation, *(node for _, node in self._inputs)]
+        needed = _closure(self._graph, roots)
+        while True:
+            found = [*roots, *self._next_values(needed)]
+            longer = _closure(self._graph, found)
+            if longer == needed:
+                break
+            needed = longer
+        places = self._measured(needed)
+        self._add_fields(needed, places)
+        updates = (node for kept in self._kept for node in kept.updates)
+        numbers = sorted(needed.union(updates))
+        loads = {n: load for n in numbers if (load := self._load(n, places)) is not None}
+        env, outputs = self._env, self._env._interface.outputs + self._env._interface.monitors
+        return Logic(
+            self._graph,
+            loads,
+            tuple(outputs[place] for place in places),
+            tuple(variable for variable, _ in self._inputs),
+            tuple(node for _, node in self._inputs),
+            self._traced.observation,
+            tuple(self._kept),
+            tuple(self._parameters),
+            env._interface.time_step,
+            env.observation_space,
+            env.action_space,
+        )
+
+    def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:
+        return (self._graph.nodes[number] for number in sorted(needed))
+
+    def _next_values(self, needed: Iterable[int]) -> Iterator[int]:
+        """The nodes of what is kept for the next sample."""
+        for name in self._variables_in(needed):
+            yield from self._traced.updates.get(name, ())
+        if any(_is_row(node, "input") for node in self._nodes(needed)):
+            yield from self._traced.inputs
+
+    def _variables_in(self, needed: Iterable[int]) -> list[str]:
+        rows = [node.what for node in self._nodes(needed) if _is_row(node, "before")]
+        return list(dict.fromkeys(row[1] for row in rows))  # type: ignore[index]  # rows are tuples
+
+    def _measured(self, needed: Iterable[int]) -> list[int]:
+        """The places of the values that are measured now, or were at the sample before."""
+        rows: set[Any] = {
+            node.what
+            for node in self._nodes(needed)
+            if _is_row(node, "output") or _is_row(node, "kept")
+        }
+        places = sorted({row[1] for row in rows})
+        interface = self._env._interface
+        for place in places:
+            variable = (interface.outputs + interface.monitors)[place]
+            if variable.causality != "output":
+                raise UntraceableError(
+                    f"it needs {variable.name!r}, which is no output of the FMU (its causality is "
+                    f"{variable.causality!r}), so that no controller can measure it"
+                )
+        return places
+
+    # What is kept.
+
+    def _add_fields(self, needed: frozenset[int], places: list[int]) -> None:
+        nodes = list(self._nodes(needed))
+        if any(_is_row(node, "kept") for node in nodes):
+            outputs = [self._output_node(place) for place in places]
+            self._add("previous", np.dtype(np.float64), [0.0] * len(places), outputs)
+        if any(_is_row(node, "input") for node in nodes):
+            self._add("inputs", np.dtype(np.float64), self._first_inputs(), self._traced.inputs)
+        self._add_actions(nodes)
+        for name in self._variables_in(needed):
+            self._add_variable(name)
+        for node in nodes:
+            what: Any = node.what
+            if _is_row(node, "parameter") and what[1] in self._drawn:
+                self._add_parameter(what[1])
+
+    def _output_node(self, place: int) -> int:
+        """The node of a measurement, which the graph gets if it has none yet."""
+        return self._graph.load("row", ("output", place), np.float64, 0).node
+
+    def _first_inputs(self) -> list[float]:
+        given = self._episode.parameters
+        for name, _ in self._env._start_inputs:
+            if name in self._drawn:
+                raise UntraceableError(f"it reads the input {name!r}, whose first value is drawn")
+        return [float(given.get(name, start)) for name, start in self._env._start_inputs]
+
+    def _add_actions(self, nodes: list[Node]) -> None:
+        space: Any = self._env.action_space
+        dtype, first = np.dtype(space.dtype), np.ravel(self._env._no_action)
+        has_older = any(node.kind == "previous_action" for node in nodes)
+        if has_older or any(node.kind == "action" for node in nodes):
+            rows = [("row", (_CHOSEN, index)) for index in range(len(first))]
+            chosen = [self._graph.load(*row, dtype, 0).node for row in rows]
+            self._add("action", dtype, first.tolist(), chosen)
+        if has_older:
+            last = [self._graph.load("action", i, dtype, 0).node for i in range(len(first))]
+            self._add("previous_action", dtype, first.tolist(), last)
+
+    def _add_variable(self, name: str) -> None:
+        dtype, value = self._traced.types[name], np.ravel(self._episode.variables[name])
+        updates = self._traced.updates.get(name, ())
+        self._add(name, dtype, value.astype(dtype).tolist(), updates)
+        if name in self._drawn:
+            self._note_parameters(name, value, None)
+
+    def _add_parameter(self, name: str) -> None:
+        if name not in self._fields:
+            value = np.ravel(self._episode.parameters[name])
+            self._add(name, np.dtype(np.float64), value.tolist(), ())
+            self._note_parameters(name, value, self._env.fmu.variable(name))
+
+    def _note_parameters(
+        self, name: str, values: npt.NDArray[Any], variable: Variable | None
+    ) -> None:
+        field = self._fields[name]
+        for element, value in enumerate(values):
+            own = name if len(values) == 1 else f"{name}[{element}]"
+            self._parameters.append(Parameter(own, field, element, float(value), variable))
+
+    def _add(self, name: str, dtype: np.dtype[Any], starts: Any, updates: Iterable[int]) -> None:
+        self._fields[name] = len(self._kept)
+        self._kept.append(Kept(name, dtype, tuple(starts), tuple(int(node) for node in updates)))
+
+    # Where values come from.
+
+    def _load(self, number: int, places: list[int]) -> Load | None:
+        """Where a node's value comes from; None if it is computed, or a constant."""
+        node = self._graph.nodes[number]
+        what: Any = node.what
+        match node.kind:
+            case "missing" | "stopped":
+                raise UntraceableError(f"{what or 'it reads whether the FMU has stopped'}")
+            case "active":
+                return ("active",)
+            case "action" | "previous_action":
+                return "kept", self._fields[node.kind], what
+            case "row":
+                return self._row(what, places)
+        return None
+
+    def _row(self, row: Any, places: list[int]) -> Load | None:
+        match row[0]:
+            case "output":
+                return "measurement", places.index(row[1])
+            case "kept":
+                return "kept", self._fields["previous"], places.index(row[1])
+            case "input":
+                return "kept", self._fields["inputs"], row[1]
+            case "step_count":
+                return ("count",)
+            case "chosen":
+                return _CHOSEN, row[1]
+            case "before":
+                return "kept", self._fields[row[1]], row[2]
+            case "parameter" if row[1] in self._drawn:
+                return "kept", self._fields[row[1]], 0
+            case "parameter":
+                return "constant", float(self._episode.parameters[row[1]])
+        raise UntraceableError(f"it reads {row[0]!r}, which a controller does not have")
+
+
+def _is_row(node: Node, kind: str) -> bool:
+    what: Any = node.what
+    return node.kind == "row" and what[0] == kind
+
+
+def _closure(graph: Graph, roots: Iterable[int]) -> frozenset[int]:
+    """Some nodes, and all that they are computed from."""
+    found: set[int] = set()
+    waiting = list(roots)
+    while waiting:
+        number = waiting.pop()
+        if number not in found:
+            found.add(number)
+            waiting.extend(graph.nodes[number].operands)
+    return frozenset(found)

@@ -1,0 +1,38 @@
+"""Names of C for the names of variables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Final
+
+__all__ = ["identifier", "identifiers"]
+
+_WORDS: Final = """
+alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl
+const constexpr const_cast continue count decltype default delete do double dynamic_cast
+else enum explicit export extern false float for friend goto if inline int int64_t long
+main mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected
+public register reinterpret_cast requires restrict return short signed sizeof static
+static_assert static_cast struct switch template this thread_local throw true try typedef
+typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq
+"""
+"""Words that name no field: those of C and C++, and those that the files use."""
+
+
+def identifier(text: str) -> str:
+    """A name of C for a text, such as the name of a variable."""
+    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_") or "x"
+    name = f"n{name}" if name[0].isdigit() else name
+    return f"{name}_" if name in _WORDS.split() else name
+
+
+def identifiers(texts: Iterable[str]) -> list[str]:
+    """Names of C for some texts, each another one."""
+    found: list[str] = []
+    for text in texts:
+        name, number = identifier(text), 2
+        while name in found:
+            name, number = f"{identifier(text)}_{number}", number + 1
+        found.append(name)
+    return found

@@ -1,0 +1,240 @@
+"""Networks as data: layers of weights, what leads into them, and how they choose an action."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.errors import ConfigError, shown
+
+__all__ = ["ACTIVATIONS", "Activation", "Layer", "Network", "Scaling", "network_of"]
+
+FloatArray = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Activation:
+    """A function that is applied to each value of a layer.
+
+    Attributes:
+        name: One of ``ACTIVATIONS``.
+        arguments: Its constants.
+    """
+
+    name: str
+    arguments: tuple[float, ...] = ()
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Apply the function."""
+        result: FloatArray = ACTIVATIONS[self.name](values, *self.arguments)
+        return result.astype(values.dtype)
+
+
+def _softplus(x: FloatArray, beta: float, threshold: float) -> FloatArray:
+    scaled = x * beta
+    return np.where(scaled > threshold, x, np.log1p(np.exp(np.minimum(scaled, threshold))) / beta)
+
+
+ACTIVATIONS: Final[dict[str, Callable[..., Any]]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0),
+    "leaky_relu": lambda x, slope: np.where(x > 0, x, x * slope),
+    "elu": lambda x, alpha: np.where(x > 0, x, alpha * np.expm1(np.minimum(x, 0))),
+    "sigmoid": lambda x: 1 / (1 + np.exp(-x)),
+    "silu": lambda x: x / (1 + np.exp(-x)),
+    "softplus": _softplus,
+    "clamp": lambda x, low, high: np.clip(x, low, high),
+}
+"""The functions by name; their constants are those of PyTorch's modules."""
+
+_MODULES: Final[dict[str, Callable[[Any], Activation]]] = {
+    "Tanh": lambda m: Activation("tanh"),
+    "ReLU": lambda m: Activation("relu"),
+    "LeakyReLU": lambda m: Activation("leaky_relu", (float(m.negative_slope),)),
+    "ELU": lambda m: Activation("elu", (float(m.alpha),)),
+    "Sigmoid": lambda m: Activation("sigmoid"),
+    "SiLU": lambda m: Activation("silu"),
+    "Softplus": lambda m: Activation("softplus", (float(m.beta), float(m.threshold))),
+    "Hardtanh": lambda m: Activation("clamp", (float(m.min_val), float(m.max_val))),
+    "ReLU6": lambda m: Activation("clamp", (0.0, 6.0)),
+}
+
+_WITHOUT_EFFECT: Final = ("Flatten", "Identity", "Dropout")
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A matrix of weights, a bias, and functions of each value.
+
+    Attributes:
+        weights: Shape (outputs, inputs).
+        bias: Shape (outputs,).
+        activations: Applied in this order.
+    """
+
+    weights: FloatArray
+    bias: FloatArray
+    activations: tuple[Activation, ...] = ()
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """A normalization of observations: the mean is taken away, then it is divided and clipped.
+
+    Attributes:
+        mean, divisor: For each element of the observation.
+        limit: The largest magnitude of each element afterwards; infinite for none.
+    """
+
+    mean: FloatArray
+    divisor: FloatArray
+    limit: FloatArray
+
+    def __call__(self, observation: FloatArray) -> FloatArray:
+        """Normalize an observation; it is computed with float64."""
+        scaled = (observation.astype(np.float64) - self.mean) / self.divisor
+        return np.clip(scaled, -self.limit, self.limit)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A deterministic policy.
+
+    Attributes:
+        layers: From the observation to the last values.
+        space: The action space.
+        scaling: The normalization of observations; None for none.
+        squashed: Whether values from -1 to 1 become actions from the lowest to the highest one.
+            If not, they are clipped to these limits.
+    """
+
+    layers: tuple[Layer, ...]
+    space: spaces.Space[Any]
+    scaling: Scaling | None = None
+    squashed: bool = False
+    dtype: np.dtype[Any] = field(default=np.dtype(np.float32))
+
+    def __post_init__(self) -> None:
+        widths = [layer.weights.shape for layer in self.layers]
+        for (before, _), (_, after) in itertools.pairwise(widths):
+            if before != after:
+                raise ConfigError(f"a layer gives {before} values, the next one takes {after}")
+        if widths[-1][0] != sum(self.parts):
+            raise ConfigError(
+                f"the network gives {widths[-1][0]} values, expected {sum(self.parts)} for "
+                f"{self.space}"
+            )
+
+    @property
+    def c_type(self) -> str:
+        """The type of its numbers in C."""
+        return "float" if self.dtype == np.float32 else "double"
+
+    @property
+    def width(self) -> int:
+        """How many values it takes."""
+        return int(self.layers[0].weights.shape[1])
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """How many of the last values decide on each element of the action."""
+        space: Any = self.space
+        if isinstance(space, spaces.Discrete):
+            return (int(space.n),)
+        if isinstance(space, spaces.MultiDiscrete):
+            return tuple(int(n) for n in space.nvec.ravel())
+        return (1,) * int(np.prod(space.shape))
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """The lowest value of each discrete element; empty if actions are continuous."""
+        space: Any = self.space
+        if isinstance(space, spaces.Box):
+            return ()
+        return tuple(int(start) for start in np.ravel(space.start))
+
+    def values(self, observation: FloatArray) -> FloatArray:
+        """The last values for an observation of shape (k,)."""
+        values = observation if self.scaling is None else self.scaling(observation)
+        values = values.astype(self.dtype)
+        for layer in self.layers:
+            values = layer.weights @ values + layer.bias
+            for activation in layer.activations:
+                values = activation(values)
+        return values
+
+    def action(self, observation: FloatArray) -> FloatArray:
+        """The action for an observation of shape (k,), flat."""
+        values, space = self.values(observation), self.space
+        if isinstance(space, spaces.Box):
+            low, high = np.ravel(space.low), np.ravel(space.high)
+            if self.squashed:
+                values = low + 0.5 * (values + 1) * (high - low)
+            else:
+                values = np.clip(values, low, high)
+            return values.astype(space.dtype)
+        ends = np.cumsum(self.parts)[:-1]
+        best = [int(np.argmax(part)) for part in np.split(values, ends)]
+        return np.array(best, np.int64) + np.array(self.starts, np.int64)
+
+
+def network_of(modules: Any, space: spaces.Space[Any], **more: Any) -> Network:
+    """Read a network of PyTorch.
+
+    Args:
+        modules: A module, such as a ``Sequential``, or several that follow each other: linear
+            layers and the functions in ``ACTIVATIONS``.
+        space: The action space.
+        more: ``scaling`` and ``squashed`` of ``Network``.
+
+    Raises:
+        ConfigError: If a module is of another kind; the text names it.
+    """
+    layers: list[Layer] = []
+    for module in _flat(modules if isinstance(modules, Sequence) else [modules]):
+        kind = type(module).__name__
+        if kind == "Linear":
+            layers.append(_linear(module))
+        elif kind in _MODULES and layers:
+            last = layers[-1]
+            activations = (*last.activations, _MODULES[kind](module))
+            layers[-1] = Layer(last.weights, last.bias, activations)
+        elif kind not in _WITHOUT_EFFECT:
+            raise ConfigError(
+                f"a network with {shown(kind)} cannot be exported; linear layers can, and "
+                f"{', '.join(_MODULES)} behind them"
+            )
+    if not layers:
+        raise ConfigError("a network without a linear layer cannot be exported")
+    return Network(tuple(layers), space, dtype=layers[0].weights.dtype, **more)
+
+
+def _flat(modules: Any) -> list[Any]:
+    """The modules in the order in which they are applied."""
+    flat: list[Any] = []
+    for module in modules:
+        is_container = type(module).__name__ == "Sequential"
+        flat.extend(_flat(module) if is_container else [module])
+    return flat
+
+
+def _linear(module: Any) -> Layer:
+    weights = _numbers(module.weight)
+    bias = np.zeros(len(weights), weights.dtype) if module.bias is None else _numbers(module.bias)
+    return Layer(weights, bias)
+
+
+def _numbers(tensor: Any) -> FloatArray:
+    array: FloatArray = tensor.detach().cpu().numpy().copy()
+    if array.dtype not in (np.float32, np.float64) or not np.isfinite(array).all():
+        raise ConfigError(
+            f"the weights of a network must be finite numbers of type float32 or float64, got "
+            f"{array.dtype}"
+        )
+    return array

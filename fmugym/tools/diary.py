@@ -1,0 +1,139 @@
+"""What a training writes down beside the agent: recordings, the learning curve, a report."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from fmugym.checks import check_option, number_of
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.series import RecordSeries, RecordVectorSeries
+from fmugym.series.pictures import COLOURS, drawing_style
+from fmugym.series.store import imported
+from fmugym.vector import FMUVectorEnv
+
+__all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve"]
+
+EVALUATIONS: Final = "evaluations.csv"
+CURVE: Final = "evaluations.png"
+RECORDS: Final = "records"
+REPORT: Final = "report.html"
+_FORMATS: Final = ("csv", "parquet")
+
+
+@dataclass(frozen=True)
+class Diary:
+    """What to write down of a training.
+
+    Attributes:
+        variables: Globs, as of ``RecordSeries``.
+        environments: The numbers of the environments of the training that are recorded.
+        every: Seconds from one row to the next; None for each step.
+        format: ``"csv"`` or ``"parquet"``.
+
+    Raises:
+        ConfigError: If there is no such format, or its library is missing.
+    """
+
+    variables: tuple[str, ...]
+    environments: tuple[int, ...] = (0,)
+    every: float | None = None
+    format: str = "csv"
+
+    def __post_init__(self) -> None:
+        check_option("format of recordings", self.format, _FORMATS)
+        if self.format == "parquet":
+            imported("pyarrow", "parquet")
+
+    @classmethod
+    def of(cls, facts: Any) -> Diary | None:
+        """That of a training that is resumed, from its facts; None if it had none.
+
+        Raises:
+            ConfigError: If the facts are damaged.
+        """
+        if facts is None:
+            return None
+        try:
+            variables = tuple(map(str, facts["variables"]))
+            environments = tuple(map(int, facts["environments"]))
+            every = None if facts["every"] is None else number_of("every", facts["every"])
+            return cls(variables, environments, every, str(facts["format"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(f"the facts of the recording are damaged: {error}") from None
+
+    def facts(self) -> dict[str, Any]:
+        """What ``of`` needs."""
+        return asdict(self)
+
+    def of_training(self, folder: Path, begin: int) -> Callable[[FMUVectorEnv], Any]:
+        """What wraps the environments of the training.
+
+        Args:
+            folder: That of the training. The file is made in the first step.
+            begin: The steps that were done before.
+        """
+        name = f"training_from_{begin}" if begin else "training"
+        path = folder / RECORDS / f"{name}.{self.format}"
+
+        def wrap(envs: FMUVectorEnv) -> RecordVectorSeries:
+            path.unlink(missing_ok=True)  # of a training that was interrupted and is resumed again
+            arguments: Any = {"every": self.every, "path": path, "most_rows": 1}
+            return RecordVectorSeries(
+                envs, self.variables, environments=self.environments, **arguments
+            )
+
+        return wrap
+
+    def of_evaluation(self, folder: Path, steps: int, name: str) -> Callable[[FMUEnv], Any]:
+        """What wraps the environment of an evaluation after some steps; a file is replaced."""
+        safe = re.sub(r"[^\w.-]+", "_", name)
+        path = folder / RECORDS / f"evaluation-{steps}-{safe}.{self.format}"
+
+        def wrap(env: FMUEnv) -> RecordSeries:
+            path.unlink(missing_ok=True)
+            return RecordSeries(env, self.variables, every=self.every, path=path, most_rows=1)
+
+        return wrap
+
+
+def curve_of(folder: Path) -> Mapping[str, list[float]]:
+    """The columns of ``evaluations.csv``: steps, mean reward, and that of each scenario."""
+    with (folder / EVALUATIONS).open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [float(row[name]) for row in rows] for name in rows[0]}
+
+
+def draw_curve(columns: Mapping[str, list[float]], title: str) -> Any:
+    """Draw the rewards of all evaluations of a training.
+
+    Args:
+        columns: As ``curve_of`` returns them.
+        title: A line of text above.
+
+    Returns:
+        The figure of Matplotlib.
+
+    Raises:
+        ConfigError: If Matplotlib is missing.
+    """
+    figures: Any = imported("matplotlib.figure", "plot")
+    steps, mean, *_ = columns.values()
+    each = {name: values for name, values in list(columns.items())[2:] if values != mean}
+    with drawing_style():
+        figure = figures.Figure(figsize=(9, 3.4), layout="constrained")
+        axes = figure.subplots()
+        for colour, (name, values) in zip(COLOURS[1:] * len(each), each.items(), strict=False):
+            axes.plot(steps, values, "o-", markersize=3, color=colour, linewidth=1, label=name)
+        axes.plot(steps, mean, "o-", markersize=4, color=COLOURS[0], linewidth=2, label="mean")
+        best = max(range(len(mean)), key=mean.__getitem__)
+        axes.plot(steps[best], mean[best], "*", markersize=13, color=COLOURS[0], label="best agent")
+        axes.set(xlabel="steps of training", ylabel="reward in evaluation", title="")
+        axes.legend(frameon=False, loc="lower right")
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    return figure

@@ -1,0 +1,108 @@
+"""The command that exports agents: export."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from fmugym.archive.description import Variable
+from fmugym.errors import ConfigError, shown
+from fmugym.export import Agent, agent_of, write_c, write_fmu
+from fmugym.export.building import PLATFORMS
+from fmugym.export.fmus import FMI_VERSIONS
+from fmugym.tools.agents import load_agent
+from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say, say_json
+from fmugym.tools.targets import maker_of
+
+__all__ = ["add_export"]
+
+
+def add_export(commands: Commands) -> None:
+    """Add ``export``."""
+    text = "write a trained agent as C or as an FMU, with everything around its network"
+    command = add_command(commands, "export", _export, text)
+    command.add_argument(
+        "agent", type=Path, metavar="AGENT", help="a folder of train, or a zip file of a model"
+    )
+    command.add_argument("--task", required=True, metavar="TASK", help=HELP_OF_TASK)
+    command.add_argument(
+        "--output", type=Path, required=True, metavar="FILE", help="a new file: agent.c, agent.fmu"
+    )
+    command.add_argument(
+        "--algorithm", default="PPO", help="of a zip file: PPO (default), A2C, SAC, TD3, DQN ..."
+    )
+    command.add_argument(
+        "--all-inputs",
+        action="store_true",
+        help="also write inputs that no action changes, such as weather from data",
+    )
+    command.add_argument(
+        "--fmi", choices=FMI_VERSIONS, default="2.0", help="version of an FMU; default 2.0"
+    )
+    command.add_argument(
+        "--platform",
+        action="append",
+        choices=[*PLATFORMS, "all"],
+        help="that an FMU is built for; default this one",
+    )
+    add_json(command)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    output: Path = arguments.output
+    if output.suffix not in _WRITERS:
+        raise ConfigError(
+            f"expected a file that ends in {', '.join(_WRITERS)}, got {shown(str(output))}"
+        )
+    if not output.parent.is_dir():
+        raise ConfigError(f"{shown(str(output.parent))} is no folder")
+    model, normalization = load_agent(arguments.agent, arguments.algorithm)
+    with closing(maker_of(arguments.task)()) as env:
+        agent = agent_of(
+            env, model, normalization, name=output.stem, all_inputs=arguments.all_inputs
+        )
+    files = _WRITERS[output.suffix](agent, output, arguments)
+    _show(agent, files, arguments)
+
+
+def _as_c(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+    return write_c(agent, output.parent)
+
+
+def _as_fmu(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+    platforms = arguments.platform
+    if platforms is not None and "all" in platforms:
+        is_new = arguments.fmi != "2.0"
+        platforms = [name for name, one in PLATFORMS.items() if is_new or one.folder]
+    return [write_fmu(agent, output, fmi_version=arguments.fmi, platforms=platforms)]
+
+
+_WRITERS: Final[dict[str, Callable[[Agent, Path, argparse.Namespace], list[Path]]]] = {
+    ".c": _as_c,
+    ".fmu": _as_fmu,
+}
+
+
+def _show(agent: Agent, files: list[Path], arguments: argparse.Namespace) -> None:
+    logic = agent.logic
+    parts = {
+        "measurements": [_facts(one) for one in logic.measurements],
+        "actions": [_facts(one) for one in logic.inputs],
+        "parameters": [{"name": one.name, "start": one.start} for one in logic.parameters],
+    }
+    if arguments.json:
+        names = {"task": arguments.task, "files": list(map(str, files))}
+        say_json({**names, "name": agent.name, "sample_time": logic.time_step, **parts})
+        return
+    say(f"{', '.join(map(str, files))}: a sample every {logic.time_step:g} s")
+    for title, rows in parts.items():
+        for row in rows:
+            more = f" = {row['start']:g}" if "start" in row else f" {row['unit'] or ''}".rstrip()
+            say(f"  {title.removesuffix('s')} {row['name']}{more}")
+
+
+def _facts(variable: Variable) -> dict[str, Any]:
+    return {"name": variable.name, "unit": variable.unit}

@@ -1,0 +1,137 @@
+"""The command that finds the numbers of a controller: tune."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from fmugym.baselines import Tuning, tune
+from fmugym.baselines.parsing import Search, search_of
+from fmugym.declared.writing import as_toml
+from fmugym.errors import ConfigError, shown
+from fmugym.series.store import imported
+from fmugym.tools.options import (
+    Commands,
+    add_command,
+    add_episodes,
+    add_json,
+    add_task,
+    check_numbers,
+    note,
+    say,
+    say_json,
+    tell,
+)
+from fmugym.tools.progress import progress
+from fmugym.tools.targets import maker_of
+
+__all__ = ["add_tune"]
+
+_HELP_OF_CONTROLLER: Final = (
+    "a controller with ranges in the place of the numbers that are to be found: "
+    "'pid of=T setpoint=20..22 kp=0.05..5 ti=1800..400000'"
+)
+
+
+def add_tune(commands: Commands) -> None:
+    """Add ``tune``."""
+    text = "find the numbers with which a controller gets the largest rewards"
+    command = add_command(commands, "tune", _tune, text)
+    add_task(command)
+    command.add_argument("controller", metavar="CONTROLLER", help=_HELP_OF_CONTROLLER)
+    command.add_argument("--scenario", help="a scenario of the task file, instead of its episodes")
+    command.add_argument("--rounds", type=int, default=20, help="default 20")
+    command.add_argument(
+        "--candidates", type=int, default=32, help="that play in each round; default 32"
+    )
+    add_episodes(command, 8, 0)
+    command.add_argument(
+        "--output", type=Path, metavar="FILE", help="a new task file that has the controller"
+    )
+    command.add_argument("--name", default="tuned", help="of the controller there; default tuned")
+    add_json(command)
+
+
+def _tune(arguments: argparse.Namespace) -> None:
+    check_numbers(arguments, "rounds", "candidates", "episodes", "steps")
+    imported("scipy", "identification")
+    search = search_of(arguments.controller)
+    output: Path | None = arguments.output
+    if output is not None:
+        _require_new(output, arguments.name)
+    found: list[Tuning] = []
+    try:
+        _search(search, arguments, found)
+    except KeyboardInterrupt:
+        if not found:
+            note("interrupted before the first round was over; nothing is found")
+            raise
+        _show(search, found[-1], arguments)
+        raise
+    _show(search, found[-1], arguments)
+
+
+def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
+    """Search, and keep the best of each round."""
+    make_env = maker_of(arguments.task, arguments.scenario)
+    with progress(arguments.rounds, "tune", "rounds") as advance:
+
+        def noted(best: Tuning) -> None:
+            found.append(best)
+            advance(1)
+            text = search.text(best.parameters)
+            tell(f"round {len(best.returns)}: reward {best.mean_return:.6g} by {text}")
+
+        tune(
+            search.make,
+            make_env,
+            search.ranges,
+            candidates=arguments.candidates,
+            episodes=arguments.episodes,
+            rounds=arguments.rounds,
+            most_steps=arguments.steps,
+            seed=arguments.seed,
+            watch=noted,
+        )
+
+
+def _show(search: Search, best: Tuning, arguments: argparse.Namespace) -> None:
+    text, output = search.text(best.parameters), arguments.output
+    if output is not None:
+        _write(output, arguments.task, {arguments.name: text})
+    for name in search.at_an_end(best.parameters):
+        note(f"the best {name} is at an end of its range; a wider one may have a better one")
+    if not arguments.json:
+        say(text)
+        return
+    facts = {"controller": text, "parameters": search.numbers(best.parameters)}
+    reward = {"mean_reward": best.mean_return, "rewards_of_rounds": best.returns}
+    say_json({"task": arguments.task, "output": output, **facts, **reward})
+
+
+def _require_new(path: Path, name: str) -> None:
+    """Refuse a file before anything is played for it.
+
+    Raises:
+        ConfigError: If it is no TOML file, or the name is none of a controller.
+        FileExistsError: If it exists.
+    """
+    if path.suffix.lower() != ".toml":
+        raise ConfigError(f"a task file ends with .toml, got {shown(str(path))}")
+    if not name.isidentifier() or not name.isascii():
+        raise ConfigError(f"a controller has a name such as 'tuned', got {shown(name)}")
+    if path.exists():
+        raise FileExistsError(f"{path} exists; name a new file")
+
+
+def _write(path: Path, target: str, controllers: Mapping[str, str]) -> None:
+    """Write a task file that extends the one that was tuned for; others have the table only."""
+    document: dict[str, Any] = {"controllers": dict(controllers)}
+    if Path(target).is_file():
+        base = os.path.relpath(Path(target).absolute(), path.absolute().parent)
+        document = {"extends": Path(base).as_posix(), **document}
+    with path.open("x", encoding="utf-8", newline="\n") as file:
+        file.write(as_toml(document))

@@ -1,0 +1,75 @@
+"""What is left of a training for people to look at: the learning curve, and a report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import closing
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.series import RecordSeries, TimeSeries, write_report
+from fmugym.series.pictures import svg_of
+from fmugym.tools.agents import FACTS, agent_policy
+from fmugym.tools.diary import CURVE, REPORT, Diary, curve_of, draw_curve
+from fmugym.tools.records import About
+from fmugym.tools.simulation import simulate
+from fmugym.tools.training import HELD_OUT_SEED, Plan
+
+__all__ = ["write_outcome"]
+
+
+def write_outcome(plan: Plan, title: str, tell: Callable[[str], None]) -> None:
+    """Draw the curve of a training, and write a report if the training was recorded.
+
+    Files that are there are replaced. Without Matplotlib there are none.
+
+    Args:
+        plan: What was trained.
+        title: What the task is called.
+        tell: Gets a line of text if Matplotlib is missing.
+    """
+    try:
+        figure = draw_curve(curve_of(plan.folder), f"{title}, trained with {plan.algorithm}")
+    except FileNotFoundError:  # an interruption came before the first evaluation
+        return
+    except ConfigError as error:
+        tell(f"there is no picture of the training: {error}")
+        return
+    figure.savefig(plan.folder / CURVE, dpi=100)
+    if plan.diary is not None:
+        _write_report(plan, plan.diary, title, {"Training": svg_of(figure)})
+
+
+def _write_report(plan: Plan, diary: Diary, title: str, charts: Mapping[str, str]) -> None:
+    """Let the best agent play once more, in the first episode of each evaluation."""
+    runs = {name: _played(plan, diary, make_env) for name, make_env in plan.held_out.items()}
+    with closing(plan.make_env()) as env:
+        about = About.of(env)
+    best = json.loads((plan.folder / FACTS).read_text(encoding="utf-8"))
+    facts = {
+        "algorithm": plan.algorithm,
+        "arguments": ", ".join(f"{k} = {v}" for k, v in (plan.arguments or {}).items()) or "none",
+        "seed": str(plan.seed),
+        "environments": str(plan.num_envs),
+        "steps of the best agent": str(best["steps"]),
+    }
+    path = plan.folder / REPORT
+    path.unlink(missing_ok=True)
+    write_report(
+        path,
+        runs,
+        title=f"{title}: the best agent of a training",
+        description=about.description,
+        facts={**about.facts, **facts},
+        text=about.text,
+        charts=charts,
+    )
+
+
+def _played(plan: Plan, diary: Diary, make_env: Callable[[], FMUEnv]) -> TimeSeries:
+    env = make_env()
+    with closing(RecordSeries(env, diary.variables, every=diary.every)) as recorder:
+        policy = agent_policy(plan.folder)(env)
+        simulate(recorder, policy, HELD_OUT_SEED, plan.most_steps)
+        return recorder.series

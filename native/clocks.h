@@ -1,0 +1,74 @@
+/* The clocks of an FMU of FMI 3.0: they tick in event mode, and some variables may be set only then.
+ *
+ * For the solver, which enters event mode when a clock is due: solver.h. */
+
+#ifndef FMUGYM_CLOCKS_H
+#define FMUGYM_CLOCKS_H
+
+#include "fmi.h"
+
+struct Solver;
+
+/* FMI's interval variabilities; the last one has two kinds here. fmugym/archive/description.py lists
+ * their names in this order. */
+typedef enum {
+    CLOCK_CONSTANT,
+    CLOCK_FIXED,
+    CLOCK_CALCULATED,
+    CLOCK_TUNABLE,
+    CLOCK_CHANGING,
+    CLOCK_COUNTDOWN,
+    CLOCK_TRIGGERED, /* an input: ticks when the pool's owner sets it */
+    CLOCK_OUTPUT     /* ticks when the FMU wants it to */
+} ClockKind;
+
+typedef struct Clock {
+    uint32_t reference, kind;
+    double interval, shift; /* in seconds; NaN if the FMU has to be asked */
+} Clock;
+
+/* An input that may be set only while a clock ticks. One with several clocks is there once for
+ * each. */
+typedef struct Clocked {
+    uint32_t reference, clock; /* the latter is an index */
+} Clocked;
+
+/* What is kept of a clock, and saved with the state. Its next tick is at origin + count * interval:
+ * a sum of intervals would drift. */
+typedef struct {
+    double origin, interval;
+    int64_t count;
+    int64_t ticked; /* whether it ticked in the last communication step, or at the start */
+} Ticks;
+
+/* The functions of FMI 3.0 for clocks. */
+typedef struct {
+    int (*get)(void *instance, const uint32_t *references, size_t count, bool *values);
+    int (*set)(void *instance, const uint32_t *references, size_t count, const bool *values);
+    int (*get_interval)(void *instance, const uint32_t *references, size_t count,
+                        double *intervals, int *qualifiers);
+    int (*get_shift)(void *instance, const uint32_t *references, size_t count, double *shifts);
+    int (*set_interval)(void *instance, const uint32_t *references, size_t count,
+                        const double *intervals);
+} ClockFunctions;
+
+/* To be called in initialization mode: sets or asks for intervals, and plans the first ticks. */
+Status clocks_prepare(struct Solver *me);
+/* Forgets what ticked in the last communication step. */
+void clocks_begin_step(struct Solver *me);
+/* The following three are for event mode: before the first update of the discrete states, before
+ * each, and after the last. The first lets the clocks tick that are due or asked for. */
+Status clocks_activate(struct Solver *me);
+Status clocks_watch(struct Solver *me);
+Status clocks_plan(struct Solver *me);
+/* The time of the next tick; infinite if there is none. */
+double clocks_next(const struct Solver *me);
+
+/* Lets an input clock tick in the next event; whether each clock of the references ticked. Clocks
+ * that are not known are never asked for, and never tick. */
+void clocks_ask(struct Solver *me, const uint32_t *references, size_t count, const bool *values);
+void clocks_tell(const struct Solver *me, const uint32_t *references, size_t count, bool *values);
+/* Whether the reference is that of an input with clocks. */
+bool clocks_own(const struct Solver *me, uint32_t reference);
+
+#endif

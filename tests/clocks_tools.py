@@ -1,0 +1,74 @@
+"""The FMU of ``exchange/clocks.c``, with clocks of all kinds."""
+
+from pathlib import Path
+
+import building
+import fmu_tools
+
+CLOCKS = {
+    "constant": 'intervalVariability="constant" intervalDecimal="0.1" shiftDecimal="0.05"',
+    "fixed": 'intervalVariability="fixed" intervalCounter="1" resolution="4"',
+    "calculated": 'intervalVariability="calculated"',
+    "tunable": 'intervalVariability="tunable"',
+    "changing": 'intervalVariability="changing"',
+    "countdown": 'intervalVariability="countdown"',
+    "strike": 'intervalVariability="triggered"',
+    "bell": 'intervalVariability="triggered"',
+}
+"""By name, in the order of the value references."""
+
+REALS = {
+    "x": (30, 'causality="output" variability="continuous" initial="exact" start="0"'),
+    "der(x)": (31, 'causality="local" variability="continuous" derivative="30"'),
+    "period": (32, 'causality="parameter" variability="fixed" start="0.2"'),
+    "pace": (33, 'causality="parameter" variability="tunable" start="0.5"'),
+    "command": (34, 'causality="input" variability="discrete" clocks="0" start="0"'),
+    "sample": (35, 'causality="output" variability="discrete" clocks="0"'),
+    "plain": (36, 'causality="input" variability="continuous" start="0"'),
+    "eager": (37, 'causality="parameter" variability="fixed" start="0"'),
+    "alarms": (38, 'causality="output" variability="discrete"'),
+}
+FLAGS = 'canGetAndSetFMUState="true" canSerializeFMUState="true"'
+
+
+def clocks_fmu(path, interface="CoSimulation", event_mode=True, flags=""):
+    """Write the FMU with one interface."""
+    files = {
+        "modelDescription.xml": _describe(interface, event_mode, flags),
+        fmu_tools.library_name(3, "Clocks"): _library(),
+    }
+    return fmu_tools.write_fmu(Path(path), files)
+
+
+def _library():
+    source = "exchange/clocks.c"
+    stubs = fmu_tools.stubs(3, "fmi3", building.HERE / source)
+    return building.library(source, stubs=stubs)
+
+
+def _describe(interface, event_mode, flags):
+    extra = ' canHandleVariableCommunicationStepSize="true"' if interface == "CoSimulation" else ""
+    extra += ' hasEventMode="true"' if event_mode and interface == "CoSimulation" else ""
+    clocks = "".join(
+        f'<Clock name="{name}" valueReference="{i}" variability="discrete" {kind} '
+        f'causality="{"output" if name == "bell" else "input"}"/>'
+        for i, (name, kind) in enumerate(CLOCKS.items())
+    )
+    reals = "".join(
+        f'<Float64 name="{name}" valueReference="{reference}" {kind}/>'
+        for name, (reference, kind) in (REALS | _counts()).items()
+    )
+    structure = '<ContinuousStateDerivative valueReference="31"/>'
+    return (
+        '<fmiModelDescription fmiVersion="3.0" modelName="Clocks" instantiationToken="{clocks}">'
+        f'<{interface} modelIdentifier="Clocks" {FLAGS}{extra} {flags}/>'
+        '<DefaultExperiment startTime="0" stepSize="0.1"/>'
+        f"<ModelVariables>{clocks}{reals}</ModelVariables>"
+        f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
+    )
+
+
+def _counts():
+    kind = 'causality="output" variability="discrete"'
+    counts = {f"count of {name}": (10 + i, kind) for i, name in enumerate(CLOCKS)}
+    return counts | {f"last {name}": (20 + i, kind) for i, name in enumerate(CLOCKS)}

@@ -1,0 +1,132 @@
+"""Tools of the tests of exported agents: networks made by hand, compiled agents, and plants."""
+
+import ctypes
+import itertools
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fmpy import extract, read_model_description
+from fmpy.fmi2 import FMU2Slave
+from gymnasium import spaces
+
+from fmugym.export import Activation, Layer, Network, Scaling, write_c
+
+FLAGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off")
+COMPILERS = {"C99": ["cc", "-std=c99"], "C++": ["c++", "-std=c++11", "-x", "c++"]}
+
+
+def network_for(env, hidden=(16, 16), scaled=True, squashed=False, seed=0, activation="tanh"):
+    """A network with random weights for the spaces of an environment."""
+    rng = np.random.default_rng(seed)
+    space = env.action_space
+    count = sum(
+        int(np.prod(s.shape))
+        for s in getattr(env.observation_space, "spaces", {"": env.observation_space}).values()
+    )
+    if isinstance(space, spaces.Box):
+        last = int(np.prod(space.shape))
+    else:
+        last = int(np.sum(getattr(space, "nvec", getattr(space, "n", 0))))
+    widths = [count, *hidden, last]
+    layers = [
+        Layer(
+            (rng.normal(size=(b, a)) / np.sqrt(a)).astype(np.float32),
+            (0.1 * rng.normal(size=b)).astype(np.float32),
+            (Activation(activation),) if index < len(hidden) else (Activation("tanh"),) * squashed,
+        )
+        for index, (a, b) in enumerate(itertools.pairwise(widths))
+    ]
+    scaling = None
+    if scaled:
+        scaling = Scaling(rng.normal(size=count), rng.uniform(0.5, 2, count), np.full(count, 10.0))
+    return Network(tuple(layers), space, scaling, squashed)
+
+
+def compiled(agent, folder, language="C99"):
+    """Write and compile an agent; the object takes samples."""
+    if sys.platform == "win32" or shutil.which(COMPILERS[language][0]) is None:
+        pytest.skip(f"needs a compiler of {language}: {COMPILERS[language][0]}")
+    write_c(agent, folder)
+    library = folder / f"{agent.name}-{language}.so"
+    command = [*COMPILERS[language], *FLAGS, "-shared", "-fPIC", "-o", str(library)]
+    done = subprocess.run(
+        [*command, str(folder / f"{agent.name}.c"), "-lm"], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return CompiledAgent(agent, ctypes.CDLL(str(library)))
+
+
+class CompiledAgent:
+    """An agent in C, called as a controller would call it."""
+
+    def __init__(self, agent, library):
+        self.agent = agent
+        self._init = library[f"{agent.name}_init"]
+        self._step = library[f"{agent.name}_step"]
+        self._state = ctypes.create_string_buffer(8 + 16 * 8 * 4096)
+        self._actions = (ctypes.c_double * len(agent.logic.inputs))()
+
+    def begin(self, **parameters):
+        """Begin an episode, with parameters set as a user of the struct would."""
+        self._init(self._state)
+        assert all(one.dtype.itemsize == 8 for one in self.agent.logic.kept) or not parameters
+        for parameter in self.agent.logic.parameters:
+            if parameter.name in parameters:
+                before = self.agent.logic.kept[: parameter.field]
+                place = 8 + 8 * (sum(len(one.starts) for one in before) + parameter.element)
+                value = ctypes.c_double.from_buffer(self._state, place)
+                assert value.value == parameter.start
+                value.value = parameters[parameter.name]
+
+    def step(self, measurements):
+        """The actions, or None if the agent has refused the measurements."""
+        numbers = (ctypes.c_double * len(measurements))(*measurements)
+        if self._step(self._state, numbers, self._actions):
+            return None
+        return list(self._actions)
+
+
+@contextmanager
+def plant_of(env, tmp_path):
+    """The FMU of an environment in FMPy, with the parameters of its episode."""
+    path = env.fmu.path
+    description = read_model_description(str(path))
+    folder = extract(str(path), unzipdir=str(tmp_path / "plant"))
+    variables = {v.name: v for v in description.modelVariables}
+    slave = FMU2Slave(
+        guid=description.guid,
+        unzipDirectory=folder,
+        modelIdentifier=description.coSimulation.modelIdentifier,
+        instanceName="plant",
+    )
+    slave.instantiate()
+    slave.setupExperiment(startTime=0.0)
+    for name, value in env.parameters.items():
+        reference = [variables[name].valueReference]
+        if variables[name].type == "Enumeration":
+            slave.setInteger(reference, [int(value)])
+        else:
+            slave.setReal(reference, [value])
+    slave.enterInitializationMode()
+    slave.exitInitializationMode()
+
+    def read(names):
+        return slave.getReal([variables[name].valueReference for name in names])
+
+    def write(names, values):
+        slave.setReal([variables[name].valueReference for name in names], values)
+
+    def step(time):
+        parts = env.config.substeps
+        size = env._interface.time_step / parts
+        for index in range(parts):
+            slave.doStep(time + index * size, size)
+
+    yield SimpleNamespace(read=read, write=write, step=step)
+    slave.terminate()
+    slave.freeInstance()

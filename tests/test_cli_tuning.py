@@ -1,0 +1,138 @@
+"""The command that finds the numbers of a controller: tune."""
+
+import json
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import fmugym
+from fmugym.baselines import PID
+from fmugym.baselines.parsing import search_of
+from fmugym.tools.cli import main
+
+pytest.importorskip("scipy", reason="needs SciPy: the extra identification")
+
+HOUSE = "fmugym/House-v0"
+RANGES = "pid of=T setpoint=20..22 kp=0.05..5 ti=14400"
+FEW = "--rounds", "2", "--candidates", "8", "--episodes", "2", "--steps", "100"
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def rewards(capsys, *arguments):
+    """Those of single environments."""
+    code, out, _ = run(capsys, "simulate", *arguments, "--json")
+    assert code == 0
+    return [one["total_reward"] for one in json.loads(out)["episodes"]]
+
+
+class TestTune:
+    def test_its_reward_is_that_of_the_controller_it_prints(self, capsys):
+        code, out, err = run(capsys, "tune", HOUSE, RANGES, *FEW, "--seed", "5", "--json")
+        found = json.loads(out)
+        assert code == 0
+        assert len(found["rewards_of_rounds"]) == 2 == err.count("round ")
+        assert found["mean_reward"] == max(found["rewards_of_rounds"])
+        options = "--episodes", "2", "--seed", "5", "--steps", "100"
+        played = rewards(capsys, HOUSE, "--controller", found["controller"], *options)
+        assert found["mean_reward"] == pytest.approx(sum(played) / 2, rel=1e-12)
+        assert found["controller"].endswith("ti=14400")
+        numbers = [float(word.partition("=")[2]) for word in found["controller"].split()[2:4]]
+        assert list(found["parameters"].values()) == numbers
+
+    def test_the_file_that_it_writes_is_a_task_with_the_controller(self, tmp_path, capsys):
+        base, output = tmp_path / "house.toml", tmp_path / "more" / "tuned.toml"
+        output.parent.mkdir()
+        fmugym.Task.read(Path(fmugym.__file__).parent / "envs" / "house.toml").write(base)
+        options = "--scenario", "frost", "--output", output, "--name", "best"
+        code, out, _ = run(capsys, "tune", base, RANGES, *FEW, *options)
+        assert code == 0
+        written = tomllib.loads(output.read_text())
+        assert written == {"extends": "../house.toml", "controllers": {"best": out.strip()}}
+        frost = "--scenario", "frost", "--steps", "50"
+        named = rewards(capsys, output, "--controller", "best", *frost)
+        assert named == rewards(capsys, base, "--controller", out.strip(), *frost)
+        code, _, err = run(capsys, "evaluate", output, "--controller", "bset")
+        assert code == 1
+        assert "'best'" in err
+
+    def test_an_end_of_a_range_is_told(self, capsys):
+        pid = "pid of=T setpoint=10..11 kp=1"
+        _, _, err = run(capsys, "tune", HOUSE, pid, *FEW, "--rounds", "6")
+        assert "setpoint" in err.splitlines()[-1]
+
+    @pytest.mark.parametrize(
+        ("arguments", "fact"),
+        [
+            ([RANGES.replace("pid", "pod")], "'pid'"),
+            ([RANGES.replace("setpoint", "setpont")], "'setpoint'"),
+            ([RANGES.replace("of=T", "of=Tr")], "'T'"),
+            ([RANGES.replace("0.05..5", "0.05..five")], "'0.05..five'"),
+            ([RANGES.replace("0.05..5", "5..0.05")], "5.0"),
+            (["pid of=T setpoint=21 kp=1"], "range"),
+            (["pid of=T setpoint=20..21"], "'kp'"),
+            (["schedule 06:00=0..1"], "hysteresis, pid"),
+            ([RANGES, "--candidates", "7"], "8"),
+            ([RANGES, "--rounds", "0"], "--rounds"),
+            ([RANGES, "--output", "a.json"], ".toml"),
+            ([RANGES, "--output", "a.toml", "--name", "a b"], "'a b'"),
+            ([RANGES, "--scenario", "frst"], "'frost'"),
+        ],
+    )
+    def test_mistakes(self, arguments, fact, capsys):
+        code, out, err = run(capsys, "tune", HOUSE, *arguments)
+        assert (code, out) == (1, "")
+        assert fact in err
+
+    def test_a_file_that_exists_is_kept(self, tmp_path, capsys):
+        path = tmp_path / "a.toml"
+        path.write_text("mine")
+        assert run(capsys, "tune", HOUSE, RANGES, "--output", path)[0] == 1
+        assert path.read_text() == "mine"
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="needs the signal of Ctrl-C")
+    def test_ctrl_c_keeps_the_best_until_then(self, tmp_path):
+        path = tmp_path / "tuned.toml"
+        command = [sys.executable, "-m", "fmugym", "tune", HOUSE, RANGES, *FEW, "--rounds", "9999"]
+        with subprocess.Popen(
+            [*command, "--output", str(path)],
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        ) as process:
+            assert "round 1" in process.stderr.readline()
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60)
+        assert process.returncode == 130
+        assert "Traceback" not in err
+        assert tomllib.loads(path.read_text()) == {"controllers": {"tuned": out.strip()}}
+        assert out.startswith("pid of=T")
+
+
+class TestSearch:
+    def test_scales(self):
+        search = search_of("pid of=T setpoint=-1..1 kp=0.1..1 ti=5..49 td=0..9")
+        assert search.ranges == {
+            "setpoint": fmugym.Uniform(-1, 1),
+            "kp": fmugym.LogUniform(0.1, 1),
+            "ti": fmugym.Uniform(5, 49),
+            "td": fmugym.Uniform(0, 9),
+        }
+
+    def test_the_text_names_all_arguments_and_nothing_is_lost(self):
+        search = search_of("pid ti=14400.123456789 kp=1..2 of='zone 1' setpoint=21")
+        assert search.text({"kp": 1.23456789}) == (
+            "pid 'of=zone 1' setpoint=21 kp=1.2346 ti=14400.123456789"
+        )
+        made = search.make(kp=1.23456789)
+        assert isinstance(made, PID)
+        assert (made.of, made.kp, made.ti) == ("zone 1", 1.2346, 14400.123456789)

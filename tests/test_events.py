@@ -1,0 +1,311 @@
+"""Event mode in co-simulation, clocks, early return: FMI 3.0."""
+
+import logging
+from contextlib import closing
+
+import clocks_tools
+import exchange_tools
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import FMU, ConfigError
+from fmugym import pool as pools
+from fmugym.pool import PoolSpec
+from fmugym.trial import opening
+
+LOG = logging.getLogger("fmugym.test")
+OPTIONS = {
+    "python": {"backend": "python"},
+    "native": {"backend": "native"},
+    "process": {"backend": "auto", "isolation": "process", "workers": 1},
+}
+TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
+COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
+LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
+all_kinds = pytest.mark.parametrize("kind", list(OPTIONS))
+both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+
+
+@pytest.fixture(scope="session")
+def fmu_path(tmp_path_factory):
+    folder, made = tmp_path_factory.mktemp("clocks"), {}
+
+    def make(interface="CoSimulation", event_mode=True):
+        key = interface, event_mode
+        if key not in made:
+            made[key] = clocks_tools.clocks_fmu(folder / f"clocks{len(made)}.fmu", *key)
+        return made[key]
+
+    return make
+
+
+@pytest.fixture
+def make_pool(fmu_path):
+    made = []
+
+    def make(kind, interface="CoSimulation", n=1, inputs=(), outputs=COUNTS, step=0.1, **spec):
+        if kind == "native" and not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        fmu = FMU(fmu_path(interface), probe_timeout=None)
+        spec = PoolSpec(
+            inputs=tuple(map(fmu.variable, inputs)),
+            outputs=tuple(map(fmu.variable, outputs)),
+            time_step=step,
+            **spec,
+        )
+        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS[kind])
+        pool.variable = fmu.variable
+        made.append(pool)
+        return pool
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+def start(pool, **values):
+    """Reset a pool with start values, numbers or one for each instance."""
+    variables = tuple(map(pool.variable, values))
+    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
+    pool.reset(variables, np.array(rows, float).reshape(len(rows), pool.num_instances))
+    assert not pool.statuses.any(), pool.failure(0)
+    return pool
+
+
+def step(pool, *inputs):
+    rows = np.array([np.broadcast_to(v, pool.num_instances) for v in inputs], float)
+    outputs, statuses = pool.step(rows.reshape(len(inputs), pool.num_instances))
+    assert not statuses.any(), pool.failure(0)
+    return outputs.copy()
+
+
+def ticks_of(period=0.2, pace=0.5, until=10.0):
+    """The times of all ticks by the definitions in ``exchange/clocks.c``."""
+    many = np.arange(1000)
+    changing = 0.1 * many * (many + 3) / 2
+    times = {
+        "constant": 0.05 + 0.1 * many,
+        "fixed": 0.25 * many,
+        "calculated": period * (0.5 + many),
+        "tunable": pace * many,
+        "changing": changing,
+        "countdown": 0.55 + many,
+    }
+    return {name: values[values <= until + 1e-9] for name, values in times.items()}
+
+
+class TestTimedClocks:
+    @all_kinds
+    @both_interfaces
+    @pytest.mark.parametrize("size", [0.1, 0.37, 1.3])
+    def test_each_ticks_at_its_times_within_steps(self, make_pool, kind, interface, size):
+        pool = start(make_pool(kind, interface, outputs=COUNTS + LASTS, step=size))
+        for index in range(int(5 / size)):
+            now = (index + 1) * size
+            found = dict(zip(COUNTS + LASTS, step(pool)[:, 0], strict=True))
+            for name, times in ticks_of(until=now).items():
+                assert found[f"count of {name}"] == len(times), (name, now)
+                last = times[-1] if len(times) else -1.0
+                assert found[f"last {name}"] == pytest.approx(last, abs=1e-9)
+
+    @both_interfaces
+    def test_ticks_do_not_drift(self, make_pool, interface):
+        if not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        pool = start(make_pool("native", interface, outputs=("last constant",), step=10.0))
+        for index in range(1000):
+            last = step(pool)[0, 0]
+            assert last == pytest.approx(10.0 * (index + 1) - 0.05, abs=1e-10)
+
+    @all_kinds
+    @both_interfaces
+    def test_each_instance_has_its_own_clocks(self, make_pool, kind, interface):
+        periods, paces = np.array([0.2, 0.3, 0.7]), np.array([0.5, 0.11, 1.3])
+        pool = start(make_pool(kind, interface, n=3), period=periods, pace=paces)
+        for _ in range(23):
+            found = step(pool)
+        for i in range(3):
+            for name, times in ticks_of(periods[i], paces[i], until=2.3).items():
+                assert found[COUNTS.index(f"count of {name}"), i] == len(times)
+
+    @all_kinds
+    @both_interfaces
+    def test_a_new_interval_of_a_tunable_clock_begins_with_its_next_tick(
+        self, make_pool, kind, interface
+    ):
+        pool = start(make_pool(kind, interface, inputs=("pace",), outputs=("last tunable",)))
+        lasts = [step(pool, 0.5 if now < 0.65 else 0.2)[0, 0] for now in np.arange(15) * 0.1]
+        expected = [0.0] * 4 + [0.5] * 5 + [1.0, 1.0, 1.2, 1.2, 1.4, 1.4]
+        np.testing.assert_allclose(lasts, expected, atol=1e-9)
+
+    @all_kinds
+    def test_early_returns_leave_the_time_of_the_step(self, make_pool, kind):
+        pool = start(make_pool(kind, outputs=("x", *COUNTS), step=0.5), eager=0.013)
+        for index in range(6):
+            found = step(pool)[:, 0]
+            assert found[0] == pytest.approx(0.5 * (index + 1), abs=1e-12)
+        for name, times in ticks_of(until=3.0).items():
+            assert found[1 + COUNTS.index(f"count of {name}")] == len(times)
+
+
+class TestEarlyReturn:
+    """Without event mode: FMI 3.0 by a flag, FMI 2.0 by Discard and the last successful time."""
+
+    @all_kinds
+    @pytest.mark.parametrize("version", [2, 3])
+    @pytest.mark.parametrize("size", [0.1, 0.37])
+    def test_the_rest_of_the_step_follows(self, tmp_path, kind, version, size):
+        if kind == "native" and not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        ends = {}
+        for options in ((), ("-DEARLY=0.03",)):
+            path = exchange_tools.exchange_fmu(
+                tmp_path / "model.fmu", "dahlquist", version, ("CoSimulation",), "", options
+            )
+            fmu = FMU(path, probe_timeout=None)
+            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=size)
+            with closing(opening.make_pool(fmu, spec, 2, LOG, **OPTIONS[kind])) as pool:
+                pool.variable = fmu.variable
+                start(pool)
+                ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
+        plain, early = ends.values()
+        np.testing.assert_allclose(early, plain, rtol=2e-3)  # its Euler steps end elsewhere
+
+
+class TestTriggeredClocks:
+    @all_kinds
+    @both_interfaces
+    def test_an_input_clock_ticks_when_it_is_set(self, make_pool, kind, interface):
+        outputs = ("count of strike", "last strike", "strike")
+        pool = start(make_pool(kind, interface, inputs=("strike",), outputs=outputs))
+        found = np.array([step(pool, value)[:, 0] for value in (0, 1, 1, 0, 1, 0)])
+        np.testing.assert_array_equal(found[:, 0], [0, 1, 2, 2, 3, 3])
+        np.testing.assert_allclose(found[:, 1], [-1, 0.1, 0.2, 0.2, 0.4, 0.4], atol=1e-12)
+        np.testing.assert_array_equal(found[:, 2], [0, 1, 1, 0, 1, 0])
+
+    @all_kinds
+    @both_interfaces
+    def test_an_output_clock_tells_whether_it_ticked_in_the_step(self, make_pool, kind, interface):
+        pool = start(make_pool(kind, interface, outputs=("bell", "count of bell", "countdown")))
+        found = np.array([step(pool)[:, 0] for _ in range(7)])
+        np.testing.assert_array_equal(found[:, 0], [0, 0, 1, 0, 0, 1, 0])
+        np.testing.assert_array_equal(found[:, 1], [0, 0, 1, 1, 1, 2, 2])
+        np.testing.assert_array_equal(found[:, 2], [0, 0, 0, 0, 0, 1, 0])
+
+
+class TestClockedInputs:
+    @all_kinds
+    @both_interfaces
+    def test_a_value_takes_effect_with_the_next_tick(self, make_pool, kind, interface):
+        pool = make_pool(
+            kind, interface, inputs=("command", "plain"), outputs=("sample",), step=0.04
+        )
+        start(pool)
+        values = np.arange(12) + 1.0
+        found = [step(pool, value, 0.5 * value)[0, 0] for value in values]
+        ticks = 0.05 + 0.1 * np.arange(10)
+        ends = 0.04 * (np.arange(12) + 1)
+        held = [max([values[int(t // 0.04)] for t in ticks if t <= e], default=0) for e in ends]
+        np.testing.assert_array_equal(found, held)
+
+
+class TestStates:
+    @all_kinds
+    @both_interfaces
+    def test_a_restored_state_goes_on_with_the_same_ticks(self, make_pool, kind, interface):
+        inputs = ("strike", "command")
+        pool = make_pool(kind, interface, 2, inputs, COUNTS + LASTS + ("sample", "bell"))
+        start(pool, pace=[0.5, 0.15])
+        actions = np.random.default_rng(1).integers(0, 2, (40, 2))
+        for action in actions[:13]:
+            step(pool, *action)
+        snapshot = pool.save()
+        first = [step(pool, *action) for action in actions[13:]]
+        pool.restore(snapshot)
+        again = [step(pool, *action) for action in actions[13:]]
+        np.testing.assert_array_equal(first, again)
+
+    @both_interfaces
+    def test_all_pools_give_the_same_numbers(self, make_pool, interface):
+        if not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        rows = {}
+        for kind in OPTIONS:
+            inputs = ("strike", "command", "pace")
+            pool = start(make_pool(kind, interface, 2, inputs, COUNTS + LASTS, 0.17))
+            random = np.random.default_rng(2)
+            rows[kind] = [
+                step(pool, *random.integers(0, 2, (2, 2)), random.uniform(0.05, 0.6, 2))
+                for _ in range(30)
+            ]
+        np.testing.assert_array_equal(rows["native"], rows["python"])
+        np.testing.assert_array_equal(rows["process"], rows["python"])
+
+
+class Env(fmugym.FMUEnv):
+    def _is_done(self):
+        return False
+
+
+class TestEnvironments:
+    CONFIG = {  # noqa: RUF012
+        "model_input_names": ["strike", "command"],
+        "model_output_names": ["x", "sample", "bell", "strike"],
+        "bounds": {"command": (-1, 1)},
+        "time_step": 0.1,
+        "max_episode_steps": 20,
+    }
+
+    @pytest.mark.parametrize("isolation", ["none", "process"])
+    def test_single_and_vector_environments_agree(self, fmu_path, isolation):
+        path = fmu_path()
+        single = Env(path, self.CONFIG, isolation=isolation)
+        vector = fmugym.FMUVectorEnv(
+            lambda: Env(path, self.CONFIG, isolation=isolation), num_envs=3
+        )
+        try:
+            single.reset(seed=1)
+            vector.reset(seed=1)
+            vector.action_space.seed(1)
+            for _ in range(15):
+                actions = vector.action_space.sample()
+                rows = vector.step(actions)[0]
+                row = single.step(actions[0])[0]
+                np.testing.assert_array_equal(rows[0], row)
+        finally:
+            single.close()
+            vector.close()
+
+    def test_snapshots_go_on_alike(self, fmu_path):
+        env = Env(fmu_path(), self.CONFIG)
+        env.reset(seed=1)
+        for _ in range(5):
+            env.step(np.array([1, 3.0]))
+        snapshot = env.save_state()
+        first = [env.step(np.array([i % 2, i]))[0] for i in range(9)]
+        env.restore_state(snapshot)
+        again = [env.step(np.array([i % 2, i]))[0] for i in range(9)]
+        np.testing.assert_array_equal(first, again)
+        env.close()
+
+
+class TestRefusals:
+    @pytest.mark.parametrize("name", [*TIMED, "bell"])
+    def test_clocks_that_tick_by_themselves_are_no_inputs(self, fmu_path, name):
+        with pytest.raises(ConfigError, match=f"'{name}'.*triggered"):
+            Env(fmu_path(), {"model_input_names": [name], "model_output_names": ["x"]})
+
+    def test_clocks_need_event_mode(self, fmu_path):
+        config = {"model_input_names": ["strike"], "model_output_names": ["x"]}
+        with pytest.raises(ConfigError, match=r"'strike'.*event mode"):
+            Env(fmu_path(event_mode=False), config)
+
+    def test_clocks_have_no_start_values(self, fmu_path):
+        config = {
+            "model_input_names": ["plain"],
+            "model_output_names": ["x"],
+            "model_parameters": {"strike": 1},
+        }
+        with pytest.raises(ConfigError, match=r"'strike'.*clock"):
+            Env(fmu_path(), config)

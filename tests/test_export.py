@@ -1,0 +1,370 @@
+"""Exported agents do what the originals do: in C, in a loop with the plant."""
+
+import gymnasium
+import numpy as np
+import pytest
+from export_tools import COMPILERS, compiled, network_for, plant_of
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.export import Activation, Layer, Network, agent_of, write_c
+
+BALANCING = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.5, 10.0, 2.0]], np.float32)
+"""The second action of a cart-pole is better than the first one where this feedback is positive."""
+
+HEATING = {
+    "fmu": {"bundled": "House"},
+    "time_step": "15min",
+    "episode_length": "2d",
+    "parameters": {"T_m_0": {"distribution": "uniform", "low": 292, "high": 296}},
+    "variables": {"T": {"name": "T_op", "unit": "degC", "min": 10, "max": 30}},
+    "data": {"price": {"values": [1, 3, 2], "step": "1h"}},
+    "reward": "-abs(T - 21)",
+}
+LATE = "sin(elapsed / 3600) % 0.3 + previous(T) / 50"
+PRESENT = {"actions": ["u"], "observations": ["T", "price"], "normalize": True, "rescale": True}
+SENSOR = {"delay": "30min", "noise": 0.2, "quantum": 0.5, "bias": 0.3}
+TASKS = {
+    "history": {
+        "agent": PRESENT | {"history": {"of": ["T", "u"], "length": "1h"}, "observations": ["T"]}
+    },
+    "forecast": {"agent": PRESENT | {"forecast": {"of": "price", "horizon": "2h"}}},
+    "change": {"variables": {"u": {"delta": 0.1}}, "agent": PRESENT},
+    "rate": {"variables": {"u": {"rate": 0.0001, "quantum": 0.05}}, "agent": PRESENT},
+    "levels": {
+        "variables": {"u": {"levels": [0, 0.5, 1], "min_on": "1h", "min_off": "45min"}},
+        "agent": {"actions": ["u"], "observations": ["T", "price"]},
+    },
+    "memory": {
+        "memory": {"debt": {"start": 0.0, "update": "0.9 * debt + 21 - T", "min": -50, "max": 50}},
+        "agent": PRESENT | {"observations": ["T", "debt"]},
+    },
+    "set point": {
+        "setpoints": {"T_set": {"distribution": "uniform", "low": 19, "high": 22}},
+        "agent": PRESENT | {"observations": ["T", "T_set"], "normalize": False},
+    },
+    "expression": {
+        "expressions": {"late": {"expr": LATE, "min": 0, "max": 2}},
+        "agent": PRESENT | {"observations": ["T", "late"]},
+    },
+}  # fmt: skip
+
+
+def made(env_id, **arguments):
+    return gymnasium.make(env_id, **arguments).unwrapped
+
+
+def heating(name):
+    own = TASKS[name]
+    variables = HEATING["variables"] | own.get("variables", {})
+    return fmugym.load(HEATING | own | {"variables": variables})
+
+
+def differences(env, network, controller, plant, steps):
+    """The largest differences of measurements and inputs between the two loops."""
+    logic = controller.agent.logic
+    measured, written = ([v.name for v in part] for part in (logic.measurements, logic.inputs))
+    observation, step = env._get_observation(), env._interface.time_step
+    worst = np.zeros(2)
+    for count in range(steps):
+        own = np.array(plant.read(measured))
+        actions = controller.step(own)
+        is_discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
+        action = network.action(np.ravel(observation))
+        seen = [env.out[name] for name in measured]
+        observation, _, terminated, truncated, _ = env.step(
+            int(action[0]) if is_discrete else action
+        )
+        inputs = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+        wanted = [inputs[name] for name in written]
+        worst = np.maximum(
+            worst, [np.abs(own - seen).max(), np.abs(actions - np.array(wanted)).max()]
+        )
+        plant.write(
+            [*written, *inputs.keys() - set(written)],
+            [*actions, *(inputs[n] for n in inputs.keys() - set(written))],
+        )
+        plant.step(count * step)
+        if terminated or truncated:
+            return *worst, count + 1
+    return *worst, steps
+
+
+class TestClosedLoop:
+    """The environment with its agent, beside the plant in FMPy with the agent in C."""
+
+    @pytest.mark.parametrize("language", COMPILERS)
+    @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House"])
+    def test_of_registered_tasks(self, env_id, language, tmp_path):
+        env = made(f"fmugym/{env_id}-v0")
+        network = network_for(env)
+        controller = compiled(agent_of(env, network, all_inputs=True), tmp_path, language)
+        env.reset(seed=3)
+        controller.begin(**{k: v for k, v in env.variables.items() if k == "clock"})
+        with plant_of(env, tmp_path) as plant:
+            measured, written, steps = differences(env, network, controller, plant, 200)
+        assert steps > 5
+        assert measured <= 1e-5
+        assert written <= 1e-5
+        env.close()
+
+    def test_a_cart_pole_that_is_balanced_all_the_time(self, tmp_path):
+        env = made("fmugym/CartPole-v0")
+        network = Network((Layer(BALANCING, np.zeros(2, np.float32)),), env.action_space)
+        controller = compiled(agent_of(env, network), tmp_path)
+        env.reset(seed=0)
+        controller.begin()
+        with plant_of(env, tmp_path) as plant:
+            assert differences(env, network, controller, plant, 500) == (0.0, 0.0, 500)
+        env.close()
+
+    @pytest.mark.parametrize("task", TASKS)
+    def test_of_what_a_task_file_declares(self, task, tmp_path):
+        env = heating(task)
+        network = network_for(env, scaled=False)
+        controller = compiled(agent_of(env, network), tmp_path)
+        env.reset(seed=1)
+        controller.begin(**env.variables)
+        with plant_of(env, tmp_path) as plant:
+            measured, written, steps = differences(env, network, controller, plant, 1000)
+        assert steps == 192
+        assert measured <= 1e-4
+        assert written <= 1e-5
+        env.close()
+
+    def test_a_second_episode_begins_as_the_first_one(self, tmp_path):
+        env = heating("history")
+        controller = compiled(agent_of(env, network_for(env)), tmp_path)
+        env.close()
+        runs = []
+        for _ in range(2):
+            controller.begin()
+            runs.append([controller.step([290.0 + i // 4]) for i in range(8)])
+        assert runs[0] == runs[1]
+        assert len(set(map(tuple, runs[0]))) > 3  # measurements of before count, too
+
+
+class Filtered(fmugym.FMI2CSEnv):
+    """A pendulum with hooks by hand: a filter, a table, a dict of observations, two actions."""
+
+    GAINS = np.array([0.5, 1.0, 2.0])
+
+    def __init__(self, **more):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"theta_0": 0.5, "m": fmugym.Uniform(0.9, 1.1)},
+            "episode_variables": {"slow": 0.0, "goal": fmugym.Uniform(-1, 1)},
+            "time_step": 0.05,
+            "max_episode_steps": 100,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config | more)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.MultiDiscrete([3, 3])
+
+    def _get_observation_space(self):
+        box = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        return gymnasium.spaces.Dict({"speed": box, "angle": box})
+
+    def _get_inputs(self):
+        return self.GAINS[self.action[0]] * (self.action[1] - 1.0)
+
+    def _update(self):
+        self.variables["slow"] = 0.9 * self.variables["slow"] + 0.1 * self.out["q_dot"]
+
+    def _is_done(self):
+        return False
+
+    def _reward_policy(self):
+        return -abs(self.out["q"])
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        angle = np.array([np.sin(q) - self.variables["goal"], np.cos(q)])
+        return {"angle": angle, "speed": np.array([q_dot, self.variables["slow"]])}
+
+
+class TestHooks:
+    """Agents of environments whose hooks are written by hand."""
+
+    def test_what_can_be_traced_is_translated(self, tmp_path):
+        env = Filtered()
+        network = network_for(env)
+        controller = compiled(agent_of(env, network), tmp_path)
+        observation, _ = env.reset(seed=5)
+        controller.begin(goal=env.variables["goal"])
+        for _ in range(100):
+            action = network.action(np.concatenate([observation["angle"], observation["speed"]]))
+            assert controller.step(env.state) == pytest.approx(
+                [[0.5, 1.0, 2.0][action[0]] * (action[1] - 1.0)]
+            )
+            observation, *_ = env.step(action)
+        env.close()
+
+    def test_what_was_drawn_is_a_parameter(self):
+        env = Filtered()
+        logic = agent_of(env, network_for(env)).logic
+        assert [one.name for one in logic.parameters] == ["goal"]  # no hook reads the mass
+        assert [kept.name for kept in logic.kept] == ["slow", "goal"]
+        env.close()
+
+    def test_a_hidden_state_is_refused(self):
+        task = HEATING | {"agent": PRESENT | {"observations": ["rate"]}}
+        variables = HEATING["variables"] | {"rate": {"name": "der_T_m", "min": -1, "max": 1}}
+        env = fmugym.load(task | {"variables": variables})
+        with pytest.raises(ConfigError, match=r"'der_T_m'.*'local'"):
+            agent_of(env, network_for(env))
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("hooks", "fact"),
+        [
+            ({"step": lambda self, action: None}, "step"),
+            ({"_get_observation": lambda self: float(self.state[0])}, "_get_observation"),
+            ({"_get_inputs": lambda self: [0.0]}, "input"),
+        ],
+    )  # fmt: skip
+    def test_what_cannot_be_is_refused(self, hooks, fact):
+        env = type("Odd", (Filtered,), hooks)()
+        with pytest.raises(ConfigError, match=fact):
+            agent_of(env, network_for(env))
+        env.close()
+
+    def test_the_end_of_an_episode_is_not_known_to_a_controller(self):
+        def observation(self):
+            angle = np.array([np.where(self.done, 1.0, 0.0), self.state[0]])
+            return {"angle": angle, "speed": angle}
+
+        env = type("Odd", (Filtered,), {"_get_observation": observation})()
+        with pytest.raises(ConfigError, match="done"):
+            agent_of(env, network_for(env))
+        env.close()
+
+
+class TestSensors:
+    """What sensors and actuators do to values is part of the plant."""
+
+    def test_are_left_out(self, tmp_path):
+        ideal, real = heating("history"), HEATING["variables"]["T"] | SENSOR
+        task = HEATING | TASKS["history"]
+        noisy = fmugym.load(
+            task | {"variables": {"T": real, "u": {"delay": "30min", "noise": 0.1}}}
+        )
+        texts = []
+        for env, name in ((ideal, "one"), (noisy, "two")):
+            (tmp_path / name).mkdir()
+            files = write_c(agent_of(env, network_for(ideal)), tmp_path / name)
+            texts.append([file.read_text() for file in files])
+            env.close()
+        assert texts[0] == texts[1]
+
+
+class TestFiles:
+    def test_measurements_and_actions_have_names_and_units(self, tmp_path):
+        env = made("fmugym/House-v0")
+        header, source = write_c(agent_of(env, network_for(env), name="heat"), tmp_path)
+        env.close()
+        text = header.read_text()
+        assert "heat_step(heat_state *state, const double *measurements, double *actions)" in text
+        assert "HEAT_MEASUREMENT_T_op, /* K, Operative temperature inside */" in text
+        assert "HEAT_ACTION_u" in text
+        assert "HEAT_SAMPLE_TIME 900.0" in text
+        assert "malloc" not in source.read_text()
+
+    def test_two_agents_live_in_one_program(self, tmp_path):
+        env = made("fmugym/CartPole-v0")
+        agents = [
+            compiled(agent_of(env, network_for(env, seed=seed), name=name), tmp_path)
+            for seed, name in enumerate(["left", "right"])
+        ]
+        env.close()
+        for agent in agents:
+            agent.begin()
+        seen = np.random.default_rng(0).normal(size=(50, 4)).tolist()
+        chosen = [[agent.step(one) for one in seen] for agent in agents]
+        assert chosen[0] != chosen[1]
+
+    def test_nothing_is_overwritten(self, tmp_path):
+        env = made("fmugym/CartPole-v0")
+        agent = agent_of(env, network_for(env))
+        env.close()
+        write_c(agent, tmp_path)
+        with pytest.raises(FileExistsError, match=r"agent\.h"):
+            write_c(agent, tmp_path)
+        with pytest.raises(ConfigError, match="nowhere"):
+            write_c(agent, tmp_path / "nowhere")
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf])
+    def test_a_measurement_that_is_not_finite_changes_nothing(self, bad, tmp_path):
+        env = heating("history")
+        controller = compiled(agent_of(env, network_for(env)), tmp_path)
+        env.close()
+        controller.begin()
+        controller.step([293.0])
+        before = controller._state.raw
+        assert controller.step([bad]) is None
+        assert controller._state.raw == before
+
+
+class TestNetworks:
+    @pytest.mark.parametrize("activation", ["tanh", "relu", "sigmoid", "silu"])
+    @pytest.mark.parametrize("squashed", [False, True])
+    def test_activations(self, activation, squashed, tmp_path):
+        env = made("fmugym/Pendulum-v0")
+        network = network_for(env, squashed=squashed, activation=activation)
+        self._compare(env, network, tmp_path)
+
+    @pytest.mark.parametrize(
+        "activation",
+        [
+            Activation("leaky_relu", (0.01,)),
+            Activation("elu", (0.7,)),
+            Activation("softplus", (1.5, 20.0)),
+            Activation("clamp", (-0.5, 0.25)),
+        ],
+    )
+    def test_activations_with_constants(self, activation, tmp_path):
+        env = made("fmugym/Pendulum-v0")
+        first, *rest = network_for(env).layers
+        layers = Layer(first.weights, first.bias, (activation,)), *rest
+        self._compare(env, Network(layers, env.action_space), tmp_path)
+
+    def test_double_precision(self, tmp_path):
+        env = made("fmugym/Pendulum-v0")
+        layers = network_for(env).layers
+        wide = [
+            Layer(one.weights.astype(float), one.bias.astype(float), one.activations)
+            for one in layers
+        ]
+        self._compare(
+            env, Network(tuple(wide), env.action_space, dtype=np.dtype(np.float64)), tmp_path
+        )
+
+    def _compare(self, env, network, tmp_path):
+        controller = compiled(agent_of(env, network), tmp_path)
+        controller.begin()
+        env.reset(seed=0)
+        for theta, speed in np.random.default_rng(0).normal(size=(100, 2)) * [1, 3]:
+            seen = np.array([np.cos(theta), np.sin(theta), speed], np.float32)
+            torque = np.float32(3 * np.clip(network.action(seen), -2, 2)[0]) / 3
+            assert controller.step([theta, speed]) == pytest.approx([torque], abs=2e-6)
+        env.close()
+
+    def test_of_another_task_is_refused(self):
+        env, other = made("fmugym/Pendulum-v0"), made("fmugym/CartPole-v0")
+        with pytest.raises(ConfigError, match="4 values, the task gives 3"):
+            agent_of(env, network_for(other))
+        env.close()
+        other.close()
+
+    def test_layers_that_do_not_fit_are_refused(self):
+        space = gymnasium.spaces.Discrete(2)
+        layers = [
+            Layer(np.zeros((b, a), np.float32), np.zeros(b, np.float32))
+            for a, b in [(4, 8), (9, 2)]
+        ]
+        with pytest.raises(ConfigError, match=r"8 values.*9"):
+            Network(tuple(layers), space)
+        with pytest.raises(ConfigError, match=r"8 values, expected 2"):
+            Network((layers[0],), space)

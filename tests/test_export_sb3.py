@@ -1,0 +1,250 @@
+"""Exported agents of Stable-Baselines3 and PyTorch, beside the originals."""
+
+import json
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from export_tools import compiled, plant_of
+from fmpy.validation import validate_fmu
+
+from fmugym import ConfigError
+from fmugym.export import Scaling, agent_of, network_of
+from fmugym.export.policies import network_of_model
+from fmugym.tools.cli import main
+
+sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra 'sb3'")
+torch = pytest.importorskip("torch", reason="needs PyTorch")
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+CONTINUOUS = ["PPO", "A2C", "SAC", "TD3", "DDPG", "TRPO", "TQC"]
+DISCRETE = ["PPO", "DQN", "QRDQN"]
+SMALL = {
+    **{key: {"net_arch": [32, 32]} for key in ["SAC", "TD3", "DDPG", "TQC"]},
+    **{key: {"net_arch": [32, 32]} for key in ["DQN", "QRDQN"]},
+}
+pytestmark = pytest.mark.filterwarnings("ignore")  # those of the libraries
+
+
+def algorithm(name):
+    if hasattr(sb3, name):
+        return getattr(sb3, name)
+    return getattr(pytest.importorskip("sb3_contrib", reason="needs sb3-contrib"), name)
+
+
+def model_of(name, env, **more):
+    keywords = {"policy_kwargs": dict(SMALL.get(name, {})), "device": "cpu", "seed": 0} | more
+    return algorithm(name)("MlpPolicy", env, **keywords)
+
+
+def made(env_id):
+    return gymnasium.make(env_id).unwrapped
+
+
+def loops_differ(env, model, agent, tmp_path, normalization=None, seed=0):
+    """Play an episode in both loops.
+
+    Returns:
+        The largest differences of measurements and of inputs, and the number of steps.
+    """
+    controller = compiled(agent, tmp_path)
+    observation, _ = env.reset(seed=seed)
+    controller.begin(**{k: v for k, v in env.variables.items() if k == "clock"})
+    measured, written = (
+        [v.name for v in p] for p in (agent.logic.measurements, agent.logic.inputs)
+    )
+    worst, count, is_over = np.zeros(2), 0, False
+    with plant_of(env, tmp_path) as plant:
+        while not is_over:
+            own, seen = np.array(plant.read(measured)), [env.out[name] for name in measured]
+            actions = np.array(controller.step(own))
+            if normalization is not None:
+                observation = normalization.normalize_obs(observation)
+            action, _ = model.predict(observation, deterministic=True)
+            observation, _, terminated, truncated, _ = env.step(
+                action if action.ndim else int(action)
+            )
+            wanted = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+            errors = np.abs(own - seen).max(), np.abs(actions - [wanted[n] for n in written]).max()
+            worst = np.maximum(worst, errors)
+            plant.write(written, actions)
+            plant.step(count * env._interface.time_step)
+            count, is_over = count + 1, terminated or truncated or count == 699
+    return *worst, count
+
+
+class TestClosedLoop:
+    """Whole episodes: the environment with its agent, and the plant with the agent in C."""
+
+    @pytest.mark.parametrize("name", CONTINUOUS)
+    def test_continuous_actions(self, name, tmp_path):
+        env = made("fmugym/Pendulum-v0")
+        model = model_of(name, env)
+        measured, written, steps = loops_differ(env, model, agent_of(env, model), tmp_path)
+        assert measured <= 1e-4
+        assert written <= 1e-4
+        assert steps == 700
+        env.close()
+
+    @pytest.mark.parametrize("name", DISCRETE)
+    def test_discrete_actions(self, name, tmp_path):
+        env = made("fmugym/CartPole-v0")
+        model = model_of(name, env)
+        measured, written, steps = loops_differ(env, model, agent_of(env, model), tmp_path)
+        assert (measured, written) == (0.0, 0.0)
+        assert steps >= 8
+        env.close()
+
+    def test_a_house_with_running_normalization(self, tmp_path):
+        from stable_baselines3.common.vec_env import VecNormalize
+
+        from fmugym.sb3 import make_sb3_env
+
+        venv = VecNormalize(make_sb3_env("fmugym/House-v0", 4, seed=0))
+        model = model_of("PPO", venv, n_steps=64, batch_size=64)
+        model.learn(512)
+        venv.training = False
+        env = made("fmugym/House-v0")
+        agent = agent_of(env, model, venv, all_inputs=True)
+        measured, written, steps = loops_differ(env, model, agent, tmp_path, venv)
+        assert measured <= 1e-3
+        assert written <= 1e-4
+        assert steps == 672
+        env.close()
+        venv.close()
+
+    @pytest.mark.parametrize("name", ["PPO", "SAC"])
+    def test_noise_that_depends_on_states(self, name, tmp_path):
+        env = made("fmugym/Pendulum-v0")
+        model = model_of(name, env, use_sde=True)
+        measured, written, _ = loops_differ(env, model, agent_of(env, model), tmp_path)
+        assert measured <= 1e-4
+        assert written <= 1e-4
+        env.close()
+
+
+class TestPyTorch:
+    def test_a_sequential(self, tmp_path):
+        env = made("fmugym/CartPole-v0")
+        layers = [torch.nn.Linear(4, 8), torch.nn.ReLU(), torch.nn.Linear(8, 2)]
+        module = torch.nn.Sequential(torch.nn.Sequential(*layers[:2]), layers[2])
+        controller = compiled(agent_of(env, network_of(module, env.action_space)), tmp_path)
+        controller.begin()
+        env.close()
+        for seen in np.random.default_rng(0).normal(size=(100, 4)).astype(np.float32):
+            best = int(module(torch.as_tensor(seen)).argmax())
+            assert controller.step(seen.tolist()) == [[-10.0, 10.0][best]]
+
+    def test_the_agent_of_the_example(self, tmp_path, monkeypatch):
+        monkeypatch.syspath_prepend(str(EXAMPLES))
+        import ppo
+
+        options = {"env_id": "fmugym/Pendulum-v0", "num_envs": 8, "steps": 512, "normalize": True}
+        settings = ppo.Settings(**options)
+        example = ppo.train(settings, lambda steps, mean, agent: None)
+        env = made("fmugym/Pendulum-v0")
+        scale = Scaling(example.scale.mean, example.scale.spread, np.full(3, np.inf))
+        modules = [example._body, example._actor, torch.nn.Hardtanh()]
+        network = network_of(modules, env.action_space, scaling=scale, squashed=True)
+        controller = compiled(agent_of(env, network), tmp_path)
+        controller.begin()
+        env.close()
+        for theta, speed in np.random.default_rng(0).normal(size=(100, 2)):
+            seen = np.array([[np.cos(theta), np.sin(theta), speed]], np.float32)
+            torque = np.float32(3 * example.act(seen)[0, 0]) / 3
+            assert controller.step([theta, speed]) == pytest.approx([torque], abs=1e-5)
+
+    def test_other_modules_are_refused(self):
+        module = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.LayerNorm(8))
+        with pytest.raises(ConfigError, match="LayerNorm"):
+            network_of(module, gymnasium.spaces.Discrete(8))
+
+
+class TestRefused:
+    def test_a_policy_with_images(self):
+        space = gymnasium.spaces.Box(0, 255, (36, 36, 1), np.uint8)
+        env = Pretend(space, gymnasium.spaces.Discrete(2))
+        model = sb3.PPO("CnnPolicy", env, device="cpu")
+        with pytest.raises(ConfigError, match="NatureCNN"):
+            network_of_model(model)
+
+    @pytest.mark.parametrize(
+        ("name", "policy", "fact"),
+        [("RecurrentPPO", "MlpLstmPolicy", "memory"), ("MaskablePPO", "MlpPolicy", "masks")],
+    )
+    def test_a_policy_that_needs_more_than_observations(self, name, policy, fact):
+        env = made("fmugym/CartPole-v0")
+        model = algorithm(name)(policy, env, device="cpu")
+        with pytest.raises(ConfigError, match=f"{name}.*{fact}"):
+            agent_of(env, model)
+        env.close()
+
+    def test_a_policy_that_does_more_than_its_layers(self):
+        env = made("fmugym/Pendulum-v0")
+        model = model_of("PPO", env)
+        predict = model.policy._predict
+        model.policy._predict = lambda *args, **more: predict(*args, **more) + 0.5
+        with pytest.raises(ConfigError, match="more than its layers"):
+            agent_of(env, model)
+        env.close()
+
+
+class Pretend(gymnasium.Env):
+    """An environment of nothing but spaces."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+class TestCommand:
+    """``fmugym export``."""
+
+    def test_from_training_to_c(self, tmp_path, capsys):
+        task, folder = str(EXAMPLES / "cart_pole.toml"), tmp_path / "trained"
+        options = ["--steps", "256", "--envs", "2", "--episodes", "1", "n_steps=64"]
+        assert main(["train", task, "--output", str(folder), *options]) == 0
+        capsys.readouterr()
+        output = tmp_path / "agent.c"
+        command = ["export", str(folder), "--task", task, "--output", str(output)]
+        assert main([*command, "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["files"] == [str(tmp_path / "agent.h"), str(output)]
+        assert [one["name"] for one in facts["measurements"]] == ["x", "x_dot", "phi", "phi_dot"]
+        assert facts["actions"] == [{"name": "f", "unit": "N"}]
+        assert facts["sample_time"] == 0.02
+        assert main(command) == 1  # the files are there
+        assert "agent.h exists" in capsys.readouterr().err
+
+    def test_to_an_fmu(self, tmp_path, capsys):
+        env = made("fmugym/House-v0")
+        model_of("PPO", env).save(tmp_path / "model.zip")
+        env.close()
+        output = tmp_path / "heater.fmu"
+        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/House-v0"]
+        assert main([*command, "--output", str(output), "--fmi", "3.0", "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert [one["name"] for one in facts["parameters"]] == ["clock"]
+        assert validate_fmu(str(output)) == []
+        assert main(["info", str(output)]) == 0
+        assert "heater" in capsys.readouterr().out
+
+    def test_of_a_model_file(self, tmp_path, capsys):
+        env = made("fmugym/Pendulum-v0")
+        model_of("SAC", env).save(tmp_path / "model.zip")
+        env.close()
+        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/Pendulum-v0"]
+        command += ["--output", str(tmp_path / "swing.c")]
+        assert main([*command, "--algorithm", "SAC"]) == 0
+        assert "action tau N.m" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ("output", "fact"), [("agent.exe", ".c"), ("a-b.c", "'a-b'"), ("no/agent.c", "no folder")]
+    )
+    def test_mistakes(self, output, fact, tmp_path, capsys):
+        env = made("fmugym/CartPole-v0")
+        model_of("PPO", env).save(tmp_path / "model.zip")
+        env.close()
+        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/CartPole-v0"]
+        assert main([*command, "--output", str(tmp_path / output)]) == 1
+        assert fact in capsys.readouterr().err
