@@ -32,10 +32,12 @@ typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX
  * exists. */
 typedef struct {
     const Fmi *fmi;
+    const struct System *system; /* NULL for one FMU */
     const char *model; /* the model identifier */
     const char *token;
     const char *resources;
-    const char *const *paths; /* path of the library, or of one private copy per instance */
+    const char *const *paths; /* path of the library, or of one private copy per instance; of a
+                               * system, those of all parts each time */
     bool private_libraries;   /* whether each instance has its own library */
     bool logging;             /* whether FMUs are asked to log everything */
     const char *const *categories; /* the log categories of errors and warnings */
@@ -95,6 +97,7 @@ typedef enum {
 /* Why the last status was worse than a warning. */
 typedef struct {
     const char *doing; /* what failed; a whole sentence if the status is -1 */
+    const char *part;  /* the FMU of a system that failed, or NULL */
     int status;
     bool in_warm_up;
     double time;               /* time of the step, NaN for other calls */
@@ -114,7 +117,7 @@ typedef struct {
     Library *library;
     void *component;
     void *saved;       /* the FMU state after initialization with the start values, or NULL */
-    uint64_t start_id; /* of the list of start variables of the last initialization, or 0 */
+    double start_time; /* of its episode */
     int64_t steps;     /* communication steps done */
     int64_t counted;   /* those steps that are already in its health counters */
     Failure *failure;
@@ -133,13 +136,14 @@ typedef struct Snapshot {
     Atomic abandoned;      /* whether the pool must free it */
     void **states;
     int64_t *steps;
+    double *start_times;
     uint32_t *generations;
 } Snapshot;
 
 /* A value that was set before initialization. */
 typedef struct {
     double value;
-    uint32_t reference, type;
+    uint32_t type, reference, place; /* place: see Element */
 } RecordedStart;
 
 /* The episode of an instance so far; see records.h. */
@@ -182,9 +186,9 @@ typedef struct Pool {
     void *instance_memory;
     double *starts; /* start values of the last initialization, start_width for each instance */
     size_t start_width;
+    uint64_t *start_ids; /* the list of start variables of that initialization, or 0 */
     double *first_outputs; /* outputs of the start whose state was saved, if it restores */
     char *names;
-    size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
     void **spares;   /* for each instance, a state whose memory is used again, or NULL */

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from fmugym.checks import check_integer, check_mapping, check_path
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
+from fmugym.declared.warming import period_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -26,7 +27,7 @@ VERSION: Final = 1
 """The version of the format; it is raised when a key changes its meaning."""
 
 KEYS: Final = (
-    *("version", "extends", "description", "fmu", "class", "arguments"),
+    *("version", "extends", "description", "fmu", "system", "class", "arguments"),
     *("time_step", "substeps", "episode_length", "warm_up", "start_time", "clock", "scenarios"),
     *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
     "controllers",
@@ -127,6 +128,9 @@ class Task:
     def in_scenario(self, name: str) -> Task:
         """Return the task in one of its scenarios: its beginning and its length are given.
 
+        In a task with a start time and no clock, the FMU begins so early that the scenario follows
+        the warm-up.
+
         Raises:
             ConfigError: If there is no such scenario.
         """
@@ -134,6 +138,9 @@ class Task:
         with section.placing():
             scenario = scenario_of(read_scenarios(section), name)
         times = {"clock": scenario.start, "episode_length": scenario.length}
+        if "start_time" in self.document and "clock" not in self.document:
+            times["start_time"] = scenario.start_after(period_of(self.root.child("warm_up")))
+            del times["clock"]
         return Task({**self.document, **times}, self.sources)
 
     @property
@@ -141,6 +148,15 @@ class Task:
         """The name of the file; ``"task"`` for a dict."""
         path = self.sources[0].path
         return "task" if path is None else path.name
+
+    def with_paths(self, path_of: Callable[[str], str]) -> dict[str, Any]:
+        """Return what the task declares, with other paths of its files.
+
+        Args:
+            path_of: Takes the absolute path of the FMU or of a file of data, and returns the new
+                one.
+        """
+        return _mapped_paths(dict(self.document), path_of)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the task to a new TOML file. Reading the file gives an equal task.
@@ -270,7 +286,9 @@ def _relative_path(path: str, folder: Path) -> str:
 
 
 def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
-    fmu, data = document.get("fmu"), document.get("data")
+    fmu, data, system = document.get("fmu"), document.get("data"), document.get("system")
+    if isinstance(system, dict):
+        document = document | {"system": _mapped_system(system, function)}
     if isinstance(fmu, str):
         document = document | {"fmu": function(fmu)}
     if isinstance(data, dict):
@@ -278,6 +296,21 @@ def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
             "data": {name: _mapped_path(d, function) for name, d in data.items()}
         }
     return document
+
+
+def _mapped_system(system: dict[str, Any], function: Any) -> dict[str, Any]:
+    """Map the paths of the FMUs of components: texts, or texts in tables."""
+    components = system.get("components")
+    if not isinstance(components, dict):
+        return system
+    return system | {"components": {n: _mapped_fmu(c, function) for n, c in components.items()}}
+
+
+def _mapped_fmu(component: Any, function: Any) -> Any:
+    if isinstance(component, str):
+        return function(component)
+    fmu = component.get("fmu") if isinstance(component, dict) else None
+    return component | {"fmu": function(fmu)} if isinstance(fmu, str) else component
 
 
 def _mapped_path(column: Any, function: Any) -> Any:

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import SimulationError
-from fmugym.fmi.library import Library
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
+from fmugym.fmi.system import open_library
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
@@ -73,7 +73,7 @@ class PythonPool(SavingPool):
         self._mark = mark
         self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
         with self._resetting:
-            self._library = Library(fmu, log, spec.solving)
+            self._library = open_library(fmu, log, spec.solving, spec.inputs, spec.outputs)
         pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:
@@ -187,15 +187,17 @@ class PythonPool(SavingPool):
                 data, ends = joined([slot.serialize() for slot in chosen])
         finally:
             restore_arithmetic()
-        return data, ends, np.array([slot.count for slot in chosen], np.int64)
+        steps = np.array([slot.count for slot in chosen], np.int64)
+        return data, ends, steps, np.array([slot.start_time for slot in chosen], np.float64)
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``."""
+        times = bundle.start_times
         with fmu_calls:
             for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
                 state, outputs = bundle.state(source), bundle.outputs[:, source]
-                count = int(bundle.steps[source])
-                self._note(index, self._slots[index].deserialize(state, count, outputs))
+                count, start = int(bundle.steps[source]), float(times[source])
+                self._note(index, self._slots[index].deserialize(state, count, start, outputs))
 
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
