@@ -149,7 +149,14 @@ def each_score(
         played = wrap(env)
         for name, make_policy in policies.items():
             policy, begin = make_policy(env), perf_counter()
-            episodes = [simulate(played, policy, seed, most_steps, advance) for seed in seeds]
+            episodes: list[Summary] = []
+            each = (simulate(played, policy, seed, most_steps, advance) for seed in seeds)
+            try:
+                episodes.extend(each)
+            except KeyboardInterrupt:
+                if episodes:
+                    yield _score(name, episodes, perf_counter() - begin, scenario)
+                raise
             yield _score(name, episodes, perf_counter() - begin, scenario)
     finally:
         played.close()
