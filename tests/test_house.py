@@ -22,7 +22,7 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
-    {"export"},
+    {"export", "logs", "minari"},
     {"envs", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]

@@ -32,6 +32,8 @@ MODULES: Final = {
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
     "RLlib": "fmugym.rllib",
+    "Plant logs": "fmugym.logs",
+    "Minari": "fmugym.minari",
     "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",
