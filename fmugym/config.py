@@ -20,6 +20,7 @@ from fmugym.checks import (
     check_mapping,
     check_number,
     check_option,
+    flattened,
     integer_of,
     number_of,
 )
@@ -41,7 +42,7 @@ MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
 
 _REWARDS: Final = ("positive_reward", "negative_reward", "fault_reward")
-_TIMES: Final = ("start_time", "stop_time")
+_TIMES: Final = ("stop_time",)
 _POSITIVE: Final = (
     "time_step",
     "probe_timeout",
@@ -61,13 +62,16 @@ class EnvConfig:
 
     Attributes:
         model_input_names: The variables that the action is written to; a bare name is fine for one.
+            The name of an array stands for its elements in row-major order; ``v[3]`` is one.
         model_output_names: The variables that ``state`` holds, in this order.
-        model_parameters: Start values by name: numbers, or distributions drawn at each reset.
+        model_parameters: Start values by name: numbers, or distributions drawn at each reset; for
+            an array, nested lists of them, or one for all elements.
         time_step: Length of one ``step``; by default the FMU's own default step size.
         positive_reward: Default reward of a step.
         negative_reward: Default reward of a step that ends the task (``_is_done``).
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
-        start_time: First communication point; by default the FMU's own default start time.
+        start_time: First communication point of an episode: a time, or a distribution or a list of
+            times from which it is drawn at each reset; by default the FMU's own default start time.
         stop_time: Given to the FMU unless it is None; the episode is truncated there.
         tolerance: For the solver of the FMU, or the one that integrates it in model exchange; by
             default that of the FMU's default experiment.
@@ -131,7 +135,7 @@ class EnvConfig:
     positive_reward: float = 1.0
     negative_reward: float = -100.0
     max_episode_steps: int | None = None
-    start_time: float | None = None
+    start_time: Any = None
     stop_time: float | None = None
     tolerance: float | None = None
     substeps: int = 1
@@ -189,6 +193,7 @@ class EnvConfig:
     def __post_init__(self) -> None:
         for key in _NAMES:
             self._set(key, _names(key, getattr(self, key)))
+        self._take_start_time()
         self._take_mappings()
         self._take_floats()
         self._take_integers()
@@ -212,6 +217,18 @@ class EnvConfig:
 
     def _set(self, key: str, value: Any) -> None:
         object.__setattr__(self, key, value)
+
+    def _take_start_time(self) -> None:
+        start = self.start_time
+        if isinstance(start, list | tuple):
+            start = Choice(start)
+        if start is not None:
+            self._set("start_time", _number("start_time", as_distribution("start_time", start)))
+
+    @property
+    def draws_start_time(self) -> bool:
+        """Whether each episode has a start time of its own."""
+        return is_distribution(self.start_time)
 
     def _take_mappings(self) -> None:
         for key in ("model_parameters", "episode_variables", "bounds"):
@@ -261,11 +278,17 @@ class EnvConfig:
         if not self.model_output_names:
             raise ConfigError("config key 'model_output_names' names no output")
         for name in self.samplings:
-            if name not in read:
+            if name not in read and "[" not in name:  # an element of an array may be meant
                 raise unknown_name("output in 'samplings'", name, read)
         for name in self.episode_variables:
             if name in self.model_parameters:
                 raise ConfigError(f"{name!r} is both a model parameter and an episode variable")
+        taken = "start_time" in {*self.model_parameters, *self.episode_variables}
+        if taken and self.draws_start_time:
+            raise ConfigError(
+                "'start_time' is the name of the start time that is drawn for each episode; no "
+                "model parameter and no episode variable may have this name, too"
+            )
 
 
 def _names(key: str, value: Any) -> tuple[str, ...]:
@@ -288,7 +311,7 @@ def _variable(name: str, value: Any) -> Any:
     what = f"episode variable {name!r}"
     if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
         return _variable_array(what, value)
-    return _variable_element(what, as_distribution(what, value))
+    return _number(what, as_distribution(what, value))
 
 
 def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
@@ -309,33 +332,21 @@ def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
 
 def _drawn_array(what: str, value: Any) -> npt.NDArray[Any]:
     """Return an array of objects for an array with distributions in it."""
-    shape, elements = _flattened(value)
+    shape, elements = flattened(value)
     elements = [as_distribution(what, one) for one in elements]
     if shape is None or not any(map(is_distribution, elements)):
         raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}")
     array = np.empty(len(elements), object)
     for place, one in enumerate(elements):
-        array[place] = _variable_element(f"element {place} of {what}", one)
+        array[place] = _number(f"element {place} of {what}", one)
     return array.reshape(shape)
 
 
-def _variable_element(what: str, value: Any) -> Any:
+def _number(what: str, value: Any) -> Any:
+    """Return a number or a distribution of numbers."""
     if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
         raise ConfigError(f"{what} must be a number, got {shown(value)}")
     return value if is_distribution(value) else check_number(what, value)
-
-
-def _flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
-    """The shape of nested lists, and their elements; no shape if the lists differ in length."""
-    if isinstance(value, np.ndarray) and value.ndim:
-        value = list(value)
-    if not isinstance(value, list | tuple):
-        return (), [value]
-    parts = [_flattened(one) for one in value]
-    shapes = {shape for shape, _ in parts}
-    elements = [element for _, own in parts for element in own]
-    inner = shapes.pop() if len(shapes) == 1 else None
-    return (None if inner is None else (len(parts), *inner)), elements
 
 
 def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:

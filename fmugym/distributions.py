@@ -29,6 +29,7 @@ __all__ = [
     "Uniform",
     "as_distribution",
     "draw",
+    "highest_of",
     "is_distribution",
     "recipe_of",
 ]
@@ -214,6 +215,15 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
 }
 _OURS: Final = tuple(_KINDS.values())
 _LARGEST: Final = float(np.finfo(np.float64).max)
+
+
+def highest_of(distribution: Any) -> float:
+    """The highest value that can be drawn; minus infinity if that is not known."""
+    if isinstance(distribution, Choice):
+        return max(map(float, distribution.values))
+    if isinstance(distribution, Uniform | LogUniform):
+        return float(distribution.high)
+    return -math.inf
 
 
 def as_distribution(what: str, value: Any) -> Any:

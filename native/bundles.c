@@ -72,7 +72,7 @@ static Status bundle_instance(Pool *pool, Instance *me, Bundle *bundle) {
 }
 
 ptrdiff_t pool_bundle(Pool *pool, const int64_t *indices, size_t count, Bundle *bundle,
-                      int64_t *ends, int64_t *steps) {
+                      int64_t *ends, int64_t *steps, double *start_times) {
     pool->no_return = false;
     for (size_t i = 0; i < count; i++) {
         Instance *me = &pool->instances[indices[i]];
@@ -80,6 +80,7 @@ ptrdiff_t pool_bundle(Pool *pool, const int64_t *indices, size_t count, Bundle *
             return (ptrdiff_t)indices[i];
         }
         steps[i] = me->steps;
+        start_times[i] = me->start_time;
         ends[i] = (int64_t)bundle->size;
     }
     return -1;
@@ -131,6 +132,7 @@ Status instance_unbundle(Pool *pool, Instance *me, const States *states, size_t 
     if (status <= STATUS_WARNING) {
         status = set_state(pool, me, states->bytes + begin, size);
     }
+    me->start_time = states->start_times[number];
     instance_count_from(me, states->steps[number]);
     return status;
 }

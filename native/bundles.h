@@ -19,13 +19,14 @@ typedef struct States {
     size_t count;
     int64_t *ends;    /* where the bytes of each state end */
     int64_t *steps;   /* its communication steps */
+    const double *start_times;
     int64_t *sources; /* for each place in pool->chosen, which state its instance gets */
 } States;
 
 /* Appends the states of instances to a bundle. Returns the index of the first instance that fails,
  * or -1. An instance that cannot be stepped gets an empty state. */
 ptrdiff_t pool_bundle(Pool *pool, const int64_t *indices, size_t count, Bundle *bundle,
-                      int64_t *ends, int64_t *steps);
+                      int64_t *ends, int64_t *steps, double *start_times);
 
 /* Restores the states in the first count instances of pool->chosen. Returns how many of them have
  * a status worse than a warning. */

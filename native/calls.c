@@ -3,6 +3,7 @@
 #include "schedule.h"
 
 #include <stdlib.h>
+#include <string.h>
 
 #include "failures.h"
 #include "initial_states.h"
@@ -25,9 +26,7 @@ static bool make_room_for_starts(Pool *pool, const Access *start) {
     free(pool->starts);
     pool->starts = starts;
     pool->start_width = start->count;
-    for (size_t i = 0; i < count; i++) {
-        pool->instances[i].start_id = 0;
-    }
+    memset(pool->start_ids, 0, count * sizeof *pool->start_ids);
     return true;
 }
 
@@ -132,7 +131,7 @@ static Status read_instance(Pool *pool, Instance *me, const Access *access, doub
 }
 
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
-    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    double *memory = malloc((access->count + access->width + 1) * sizeof *memory);
     ptrdiff_t failed = -1;
 
     if (memory == NULL) {
@@ -165,7 +164,7 @@ static Status write_instance(Pool *pool, Instance *me, const Access *access, dou
 }
 
 ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
-    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    double *memory = malloc((access->count + access->width + 1) * sizeof *memory);
     ptrdiff_t failed = -1;
 
     if (memory == NULL) {

@@ -71,6 +71,7 @@ uint64_t number_of_initializations(void) {
 static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scratch scratch) {
     const Settings *s = &pool->settings;
     StartContext context = {pool, me, start, scratch, UINT32_MAX};
+    Experiment experiment = s->experiment;
     const char *doing = "initialization";
     Status status = instance_return_to_start(pool, me);
 
@@ -81,7 +82,8 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     instance_begin_turn(pool);
     atomic_add(&initializations, 1);
     begin_call(CALL_INITIALIZE);
-    status = s->fmi->initialize(me->library, me->component, &s->experiment,
+    experiment.start_time = me->start_time;
+    status = s->fmi->initialize(me->library, me->component, &experiment,
                                 (StartValues){set_start_values, &context}, &doing);
     end_call();
     instance_end_turn(pool);
@@ -125,6 +127,11 @@ static void keep_state(Pool *pool, Instance *me) {
     }
 }
 
+/* The list of start variables of the last initialization, or 0. */
+static uint64_t *start_id_of(const Pool *pool, const Instance *me) {
+    return &pool->start_ids[index_of(pool, me)];
+}
+
 static double *start_values_of(const Pool *pool, const Instance *me) {
     return pool->starts + index_of(pool, me) * pool->start_width;
 }
@@ -137,7 +144,7 @@ static double *first_outputs_of(const Pool *pool, const Instance *me) {
 static bool starts_as_before(const Pool *pool, const Instance *me, const Access *start,
                              const double *values) {
     const size_t size = start->count * sizeof *values;
-    return me->start_id == start->id && memcmp(start_values_of(pool, me), values, size) == 0;
+    return *start_id_of(pool, me) == start->id && memcmp(start_values_of(pool, me), values, size) == 0;
 }
 
 static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
@@ -148,8 +155,8 @@ static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
     if (status > STATUS_WARNING) {
         return status;
     }
-    again = again && me->start_id == start->id; /* the instance may have been replaced */
-    me->start_id = start->id;
+    again = again && *start_id_of(pool, me) == start->id; /* the instance may have been replaced */
+    *start_id_of(pool, me) = start->id;
     memcpy(start_values_of(pool, me), scratch.values, start->count * sizeof(double));
     if (again && states_are_of_use(pool, me)) {
         keep_state(pool, me);
@@ -222,6 +229,7 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
         return STATUS_FATAL;
     }
     matrix_gather(values, index_of(pool, me), start->count, scratch.values);
+    instance_set_start_time(pool, me, start, scratch.values);
     const bool again = starts_as_before(pool, me, start, scratch.values);
 
     if (!again || me->saved == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me)) {
@@ -325,7 +333,7 @@ bool instance_adopt(Pool *pool, Instance *me, const Access *start, const Packed 
         me->saved = NULL;
         return false;
     }
-    me->start_id = start->id;
+    *start_id_of(pool, me) = start->id;
     memcpy(start_values_of(pool, me), packed->start_values, start->count * sizeof(double));
     memcpy(first_outputs_of(pool, me), packed->outputs,
            pool->settings.outputs->count * sizeof(double));

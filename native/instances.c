@@ -154,7 +154,9 @@ void instance_discard(Pool *pool, Instance *me) {
     me->component = NULL;
     me->phase = PHASE_DEAD;
     me->generation++;
-    me->start_id = 0;
+    if (pool->start_ids != NULL) {
+        pool->start_ids[index_of(pool, me)] = 0;
+    }
     me->unsavable = false;
     log_forget(&pool->log, index_of(pool, me));
 }

@@ -56,10 +56,12 @@ static bool allocate(Pool *pool) {
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->spares = calloc(s->count, sizeof *pool->spares);
     pool->starts = calloc(1, sizeof *pool->starts); /* the width is still 0 */
+    pool->start_ids = calloc(s->count, sizeof *pool->start_ids);
     pool->first_outputs = calloc(s->restores ? s->count * s->outputs->count + 1 : 1,
                                  sizeof *pool->first_outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
-           pool->chosen != NULL && pool->spares != NULL && pool->starts != NULL && pool->first_outputs != NULL;
+           pool->chosen != NULL && pool->spares != NULL && pool->starts != NULL &&
+           pool->start_ids != NULL && pool->first_outputs != NULL;
 }
 
 static void prepare_instance(Pool *pool, size_t index) {
@@ -69,6 +71,7 @@ static void prepare_instance(Pool *pool, size_t index) {
     snprintf(pool->names + index * pool->name_size, pool->name_size, "%s_%u_%zu", s->model,
              (unsigned)pool->log.id, index);
     me->library = &pool->libraries[s->private_libraries ? index : 0];
+    me->start_time = s->experiment.start_time;
 }
 
 static bool load_libraries(Pool *pool, char *error, size_t size) {
@@ -163,6 +166,7 @@ void pool_close(Pool *pool) {
     free(pool->libraries);
     free(pool->instance_memory);
     free(pool->starts);
+    free(pool->start_ids);
     free(pool->first_outputs);
     free(pool->names);
     free(pool->chosen);

@@ -114,7 +114,7 @@ typedef struct {
     Library *library;
     void *component;
     void *saved;       /* the FMU state after initialization with the start values, or NULL */
-    uint64_t start_id; /* of the list of start variables of the last initialization, or 0 */
+    double start_time; /* of its episode */
     int64_t steps;     /* communication steps done */
     int64_t counted;   /* those steps that are already in its health counters */
     Failure *failure;
@@ -133,13 +133,14 @@ typedef struct Snapshot {
     Atomic abandoned;      /* whether the pool must free it */
     void **states;
     int64_t *steps;
+    double *start_times;
     uint32_t *generations;
 } Snapshot;
 
 /* A value that was set before initialization. */
 typedef struct {
     double value;
-    uint32_t reference, type;
+    uint32_t type, reference, place; /* place: see Element */
 } RecordedStart;
 
 /* The episode of an instance so far; see records.h. */
@@ -182,6 +183,7 @@ typedef struct Pool {
     void *instance_memory;
     double *starts; /* start values of the last initialization, start_width for each instance */
     size_t start_width;
+    uint64_t *start_ids; /* the list of start variables of that initialization, or 0 */
     double *first_outputs; /* outputs of the start whose state was saved, if it restores */
     char *names;
     size_t name_size;

@@ -24,6 +24,7 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
     if (status > STATUS_WARNING) {
         return status;
     }
+    me->start_time = task->snapshot->start_times[index];
     instance_count_from(me, task->snapshot->steps[index]);
     return instance_read_outputs(task->pool, me, scratch);
 }
@@ -249,6 +250,8 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
     const Exchange e = {
         .input_references = in->groups[0].references,
         .output_references = out->groups[0].references,
+        .number_of_input_references = in->groups[0].count,
+        .number_of_output_references = out->groups[0].count,
         .number_of_inputs = in->count,
         .number_of_outputs = out->count,
         .step = pool->step_size,

@@ -13,8 +13,10 @@ Snapshot *snapshot_new(size_t count) {
     }
     snapshot->states = calloc(count, sizeof *snapshot->states);
     snapshot->steps = calloc(count, sizeof *snapshot->steps);
+    snapshot->start_times = calloc(count, sizeof *snapshot->start_times);
     snapshot->generations = calloc(count, sizeof *snapshot->generations);
-    if (snapshot->states == NULL || snapshot->steps == NULL || snapshot->generations == NULL) {
+    if (snapshot->states == NULL || snapshot->steps == NULL || snapshot->start_times == NULL ||
+        snapshot->generations == NULL) {
         snapshot_free(snapshot);
         return NULL;
     }
@@ -24,6 +26,7 @@ Snapshot *snapshot_new(size_t count) {
 void snapshot_free(Snapshot *snapshot) {
     free(snapshot->states);
     free(snapshot->steps);
+    free(snapshot->start_times);
     free(snapshot->generations);
     free(snapshot);
 }
@@ -83,6 +86,7 @@ static Status save_instance(Pool *pool, Instance *me, Snapshot *snapshot) {
     }
     snapshot->generations[index] = me->generation;
     snapshot->steps[index] = me->steps;
+    snapshot->start_times[index] = me->start_time;
     return instance_save(pool, me, &snapshot->states[index]);
 }
 

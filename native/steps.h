@@ -20,8 +20,15 @@ typedef struct {
 static inline double instance_time(const Pool *pool, const Instance *me) {
     const Settings *s = &pool->settings;
     const double since_start = (double)me->steps * s->time_step;
-    return s->experiment.start_time +
+    return me->start_time +
            (s->substeps == 1 ? since_start : since_start / (double)s->substeps);
+}
+
+/* Takes the start time of its next episode from its start values; without one, that of the pool. */
+static inline void instance_set_start_time(const Pool *pool, Instance *me, const Access *start,
+                                           const double *values) {
+    me->start_time =
+        start->start_time < 0 ? pool->settings.experiment.start_time : values[start->start_time];
 }
 
 static inline void instance_count_from(Instance *me, int64_t steps) {

@@ -16,6 +16,7 @@ STATES = {
     "tank": ["x"],
     "prothero": ["x"],
     "relay": ["x"],
+    "sun": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -30,12 +31,14 @@ OTHERS = {
     "tank": ["u", "discards"],
     "prothero": ["k"],
     "relay": ["turns", "last", "speed"],
+    "sun": ["now", "sine", "seconds", "u"],
 }
 """The other variables in the order of their value references."""
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
 OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns"}
+OUTPUTS |= {"now", "sine", "seconds"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},
     "ball": {"h": 1, "v": 0, "g": -9.81, "e": 0.7, "v_min": 0.1},
@@ -46,6 +49,7 @@ START = {
     "tank": {"x": 0.01, "u": 0},
     "prothero": {"x": 1, "k": 1},
     "relay": {"x": 0, "last": 1e9, "speed": 1},
+    "sun": {"x": 0, "u": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

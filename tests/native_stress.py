@@ -221,9 +221,9 @@ class Subject:
         """Serialize the states of some, as far as the FMU can."""
         indices = np.flatnonzero(self.mask())
         with contextlib.suppress(ValueError):
-            data, ends, steps = self.pool.serialize_states(indices)
+            data, ends, steps, times = self.pool.serialize_states(indices)
             outputs = np.zeros((len(self.outputs), len(indices)))
-            self.bundled = Bundle(outputs, steps, data, ends)
+            self.bundled = Bundle(outputs, steps, times, data, ends)
             counts["bundled"] += 1
 
     def unbundle(self):

@@ -10,13 +10,16 @@ SLOW_MODULES = {
     "test_call_order",
     "test_cli_docs",
     "test_cli_tuning",
+    "test_compile",
     "test_copies",
+    "test_events",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
     "test_examples_train_house",
     "test_export",
+    "test_export_fmu",
     "test_export_sb3",
     "test_fuzz",
     "test_fuzz_face",
@@ -25,12 +28,15 @@ SLOW_MODULES = {
     "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
+    "test_nested_fmus",
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_start_times",
+    "test_value_types",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -59,6 +65,8 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_quirks": 4,
     "test_snapshot_machine": 4,
+    "test_start_times": 5,
+    "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,
 }
@@ -174,6 +182,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import shlex
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -333,6 +334,8 @@ class FMU(LoadableFMU):
             f"{self.path.name} has no library for this platform ({self.library}); it was built "
             f"for: {', '.join(self.platforms) or 'no platform at all'}"
         )
+        if any(place.startswith("sources/") for place in self._archive.files):
+            text += f". It has its source code: fmugym compile {shlex.quote(self.path.name)}"
         if can_run_windows() and {p.casefold() for p in self.platforms} & _WINDOWS_32:
             text += ". Those for 32-bit Windows cannot run in Wine here; export for 64-bit Windows"
         return text

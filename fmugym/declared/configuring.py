@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, Final
 
@@ -12,8 +11,9 @@ from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
 from fmugym.declared.naming import CLOCK, Naming
 from fmugym.declared.quantities import duration
-from fmugym.declared.seasons import read_clock, read_scenarios
+from fmugym.declared.seasons import read_begin, read_scenarios
 from fmugym.declared.variables import Record, is_plain
+from fmugym.distributions import is_distribution
 from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = ["bounds_of", "clock_of", "own_config", "samplings_of", "time_step_of", "times_of"]
@@ -68,17 +68,28 @@ def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
     """
     root, times = declared.root, dict[str, Any](time_step=time_step)
     start, substeps, length = map(root.child, ("start_time", "substeps", "episode_length"))
-    if isinstance(start.value, Mapping | list):
-        raise start.error("start_time is one time; 'clock' takes lists, seasons and what is drawn")
     if declared.warm_up.period:
         times["warm_up"] = declared.warm_up.period
-    if start.value is not None:
-        times["start_time"] = start.check(duration)
     if substeps.value is not None:
         times["substeps"] = substeps.value
     if length.value is not None:
         times["max_episode_steps"] = _episode_steps(length, time_step)
+    if start.value is not None:
+        times["start_time"] = _start_time(declared, times.get("max_episode_steps", 0) * time_step)
     return times
+
+
+def _start_time(declared: Declarations, length: float) -> Any:
+    """The start time of the FMU, or what it is drawn from; a warm-up and the episode follow."""
+    root = declared.root
+    start, scenarios = root.child("start_time"), read_scenarios(root.child("scenarios"))
+    found = read_begin(start, scenarios, declared.warm_up.period + length)
+    if is_distribution(found) and root.child("clock").value is not None:
+        raise start.error(
+            "start_time and clock cannot both be given where the start time is drawn: data follow "
+            "the time of the FMU"
+        )
+    return found
 
 
 def _episode_steps(entry: Entry, step: float) -> int:
@@ -107,7 +118,7 @@ def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[
     if clock.value is None:
         return {}
     length = times_of(declared, time_step).get("max_episode_steps", 0) * time_step
-    return {CLOCK: read_clock(clock, scenarios, length, warm_steps * time_step)}
+    return {CLOCK: read_begin(clock, scenarios, length, warm_steps * time_step)}
 
 
 def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:

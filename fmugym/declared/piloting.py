@@ -200,6 +200,7 @@ class WarmUpMaker:
         histories: Sequence[History],
         switches: Mapping[str, str],
         variables: Mapping[str, Any],
+        start_time: Any,
     ) -> DeclaredWarmUp:
         """Make the warm-up.
 
@@ -210,6 +211,7 @@ class WarmUpMaker:
             histories: The histories that are written.
             switches: Code for other episode variables by name.
             variables: All episode variables of the config.
+            start_time: That of the config.
 
         Raises:
             ConfigError: If a controller does not fit, or states cannot be kept.
@@ -231,14 +233,17 @@ class WarmUpMaker:
                 table.caches,
             )
         if table.caches:
-            self._require_few_states(warm_up, variables)
+            self._require_few_states(warm_up, variables, start_time)
         return warm_up
 
-    def _require_few_states(self, warm_up: DeclaredWarmUp, variables: Mapping[str, Any]) -> None:
+    def _require_few_states(
+        self, warm_up: DeclaredWarmUp, variables: Mapping[str, Any], start_time: Any
+    ) -> None:
         """Refuse to keep states that hardly any later episode could use."""
+        begin = {"start_time": start_time}
         parameters = {name: value for name, (_, value) in self._declared.parameters.items()}
         own = {name: variables[name] for name in warm_up.depends_on}
-        for name, value in (parameters | own).items():
+        for name, value in (parameters | own | begin).items():
             if is_distribution(value) and not isinstance(value, Choice):
                 raise self._declared.warm_up.entry.child("cache").error(
                     f"the state after the warm-up depends on {name!r}, which is drawn from "

@@ -131,6 +131,7 @@ class Plan:
             [*self._kept, *self._sensors],
             switches,
             self.config["episode_variables"],
+            self.config.get("start_time"),
         )
 
     # The config.
@@ -176,7 +177,8 @@ class Plan:
         if not is_noisy and not self._declared.steps:
             return {}
         parameters = [value for _, value in self._declared.parameters.values()]
-        draws = any(map(is_distribution, [*parameters, *variables.values()]))
+        start = times_of(self._declared, self._time_step).get("start_time")
+        draws = any(map(is_distribution, [*parameters, start, *variables.values()]))
         return {NOISE: NoiseKey(draws=not draws)}
 
     @property

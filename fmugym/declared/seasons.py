@@ -14,7 +14,7 @@ from fmugym.declared.values import number_or_distribution
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Scenario", "read_clock", "read_scenarios", "scenario_of"]
+__all__ = ["Scenario", "read_begin", "read_scenarios", "scenario_of"]
 
 _SEASON_KEYS: Final = ("from", "to", "step", "exclude")
 _SCENARIO_KEYS: Final = ("start", "length", "description")
@@ -36,6 +36,10 @@ class Scenario(NamedTuple):
 
     start: float
     length: float
+
+    def start_after(self, warm_up: float) -> float:
+        """When an FMU has to begin so that the scenario follows its warm-up, at least 0."""
+        return self.start - warm_up if self.start >= warm_up else (self.start - warm_up) % _YEAR
 
     def overlaps(self, start: float, length: float) -> bool:
         """Whether an episode shares time with it, in this or the next year."""
@@ -62,16 +66,16 @@ def _scenario(entry: Entry) -> Scenario:
     return Scenario(_moment(entry.required("start")), length)
 
 
-def read_clock(
+def read_begin(
     entry: Entry, scenarios: Mapping[str, Scenario], length: float, before: float = 0.0
 ) -> Any:
-    """Read when episodes begin.
+    """Read when episodes begin: the time of data, or the start time of the FMU.
 
     Args:
         entry: A time or date, a distribution of seconds, a list of times and dates, or a season.
         scenarios: What a season may exclude.
         length: The length of an episode in seconds; 0 if it has no limit.
-        before: The length of a warm-up with the data of the time before an episode.
+        before: The length of a warm-up with the data of the time before the beginning.
 
     Returns:
         Seconds since the beginning of the year, or a distribution of them.
@@ -83,7 +87,8 @@ def read_clock(
     if is_distribution(value) or (isinstance(value, Mapping) and "distribution" in value):
         return number_or_distribution(entry)
     if isinstance(value, list | tuple):
-        return Choice([_moment(one) for one in entry.elements()])
+        with entry.placing():
+            return Choice([_moment(one) for one in entry.elements()])
     if not isinstance(value, Mapping):
         return _moment(entry)
     starts = list(_starts(entry))

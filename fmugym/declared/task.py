@@ -16,6 +16,7 @@ import numpy as np
 from fmugym.checks import check_integer, check_mapping, check_path
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
+from fmugym.declared.warming import period_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -127,6 +128,9 @@ class Task:
     def in_scenario(self, name: str) -> Task:
         """Return the task in one of its scenarios: its beginning and its length are given.
 
+        In a task with a start time and no clock, the FMU begins so early that the scenario follows
+        the warm-up.
+
         Raises:
             ConfigError: If there is no such scenario.
         """
@@ -134,6 +138,9 @@ class Task:
         with section.placing():
             scenario = scenario_of(read_scenarios(section), name)
         times = {"clock": scenario.start, "episode_length": scenario.length}
+        if "start_time" in self.document and "clock" not in self.document:
+            times["start_time"] = scenario.start_after(period_of(self.root.child("warm_up")))
+            del times["clock"]
         return Task({**self.document, **times}, self.sources)
 
     @property

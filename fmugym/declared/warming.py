@@ -14,7 +14,7 @@ from fmugym.errors import shown, unknown_name
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
 
-__all__ = ["WARM_UP_KEYS", "WarmUpTable", "read_warm_up", "signals_of"]
+__all__ = ["WARM_UP_KEYS", "WarmUpTable", "period_of", "read_warm_up", "signals_of"]
 
 WARM_UP_KEYS: Final = ("period", "controller", "cache")
 """The keys of a warm-up."""
@@ -48,6 +48,13 @@ def signals_of(controller: Controller) -> list[str]:
     return [name for name in given if isinstance(name, str)]
 
 
+def period_of(entry: Entry) -> float:
+    """The length of a warm-up in seconds; 0 if there is none."""
+    if entry.value is None:
+        return 0.0
+    return (entry.required("period") if isinstance(entry.value, Mapping) else entry).check(duration)
+
+
 def read_warm_up(root: Entry, actions: Sequence[Record]) -> WarmUpTable:
     """Read the warm-up of a task.
 
@@ -58,10 +65,10 @@ def read_warm_up(root: Entry, actions: Sequence[Record]) -> WarmUpTable:
     entry = root.child("warm_up")
     if entry.value is None:
         return WarmUpTable(entry)
+    period = period_of(entry)
     if not isinstance(entry.value, Mapping):
-        return WarmUpTable(entry, entry.check(duration))
+        return WarmUpTable(entry, period)
     table = entry.table(WARM_UP_KEYS)
-    period = entry.required("period").check(duration)
     caches = "cache" in table and table["cache"].flag()
     given = table.get("controller")
     entries = {} if given is None else _by_action(given, actions)

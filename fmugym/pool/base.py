@@ -94,6 +94,7 @@ class Pool(ABC):
 
         Args:
             variables: The variables to set before initialization, P of them; all numeric.
+                ``START_TIME`` of ``fmugym.pool.spec`` stands for the first communication point.
             values: Their values, shape (P, N); only the columns in the mask are used.
             mask: Which instances to start anew, shape (N,); None for all.
 

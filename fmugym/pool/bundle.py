@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.pool.spec import START_TIME
+
 __all__ = ["Bundle", "Copies", "Record", "SaveMethod", "joined"]
 
 FloatArray = npt.NDArray[np.float64]
@@ -44,6 +46,13 @@ class Record:
     starts: FloatArray
     inputs: FloatArray
 
+    def start_time(self, default: float) -> float:
+        """The first communication point, which is the default unless it is among the starts."""
+        for name, value in zip(self.names, self.starts, strict=True):
+            if name == START_TIME.name:
+                return float(value)
+        return default
+
     @property
     def content(self) -> tuple[object, ...]:
         """What two equal records have in common."""
@@ -74,6 +83,7 @@ class Bundle:
     Attributes:
         outputs: Their outputs, shape (k, M).
         steps: Their communication steps, shape (M,).
+        start_times: The first communication points of their episodes, shape (M,).
         data: The serialized states one after the other; ``b""`` if there are records.
         ends: Where each of them ends in the data, shape (M,).
         records: Or a record for each; None for an empty state.
@@ -82,6 +92,7 @@ class Bundle:
 
     outputs: FloatArray
     steps: IndexArray
+    start_times: FloatArray
     data: bytes
     ends: IndexArray
     records: tuple[Record | None, ...] | None = None
@@ -95,7 +106,8 @@ class Bundle:
         return SaveMethod.REPLAY if self.copies is None else SaveMethod.COPY
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Bundle, (self.outputs, self.steps, self.data, self.ends, self.records)
+        arrays = self.outputs, self.steps, self.start_times
+        return Bundle, (*arrays, self.data, self.ends, self.records)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -109,29 +121,31 @@ class Bundle:
         """The states at these places."""
         chosen = np.asarray(places, np.int64)
         outputs = np.ascontiguousarray(self.outputs[:, chosen])
+        arrays = outputs, self.steps[chosen], self.start_times[chosen]
         if self.records is not None:
             records = tuple(self.records[place] for place in chosen.tolist())
             copies = self.copies and replace(self.copies, indices=self.copies.indices[chosen])
-            return Bundle(outputs, self.steps[chosen], b"", self.ends[chosen], records, copies)
+            return Bundle(*arrays, b"", self.ends[chosen], records, copies)
         data, ends = joined(map(self.state, chosen.tolist()))
-        return Bundle(outputs, self.steps[chosen], data, ends)
+        return Bundle(*arrays, data, ends)
 
     @classmethod
     def of_all(cls, bundles: Sequence[Bundle]) -> Bundle:
         """Put bundles of one pool together."""
         outputs = np.concatenate([bundle.outputs for bundle in bundles], axis=1)
         steps = np.concatenate([bundle.steps for bundle in bundles])
+        times = np.concatenate([bundle.start_times for bundle in bundles])
         data, ends = joined(b.state(place) for b in bundles for place in range(len(b)))
         records = [bundle.records for bundle in bundles if bundle.records is not None]
-        return cls(outputs, steps, data, ends, sum(records, ()) if records else None)
+        return cls(outputs, steps, times, data, ends, sum(records, ()) if records else None)
 
     @property
     def content(self) -> tuple[object, ...]:
         """What two equal bundles have in common."""
         records = self.records
         held = None if records is None else tuple(None if r is None else r.content for r in records)
-        arrays = self.outputs.shape, self.outputs.tobytes(), self.steps.tobytes()
-        return (*arrays, self.data, self.ends.tobytes(), held)
+        arrays = (self.outputs, self.steps, self.start_times, self.ends)
+        return (self.outputs.shape, *(a.tobytes() for a in arrays), self.data, held)
 
 
 def joined(states: Iterable[bytes]) -> tuple[bytes, IndexArray]:

@@ -50,14 +50,14 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     manner_of,
     record_from,
     solving_settings,
-    types_and_references,
     variable_settings,
     variables_of,
 )
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import ResetMethod, start_variables
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 
 __all__ = ["NativePool"]
@@ -190,8 +190,8 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
-            parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, manner_of(self._fmu.description))
+            manner = manner_of(self._fmu.description)
+            access = _native.Access(version, *listing(variables, version), manner)
             self._accesses[variables] = access
         return access
 
@@ -293,16 +293,19 @@ class NativePool(SavingPool):
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``."""
         ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
-        data = self._open_pool().bundle(np.ascontiguousarray(indices), ends, steps)
+        start_times = np.empty(len(indices))
+        chosen = np.ascontiguousarray(indices)
+        data = self._open_pool().bundle(chosen, ends, steps, start_times)
         if isinstance(data, int):
             raise SimulationError(self.failure(data))
-        return data, ends, steps
+        return data, ends, steps, start_times
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``."""
         pool = self._open_pool()
         sources, indices = np.ascontiguousarray(sources), np.ascontiguousarray(indices)
-        pool.unbundle(indices, sources, bundle.data, bundle.ends, bundle.steps, bundle.outputs)
+        parts = bundle.data, bundle.ends, bundle.steps, bundle.start_times, bundle.outputs
+        pool.unbundle(indices, sources, *parts)
 
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
@@ -313,7 +316,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(tuple(self._variables[name] for name in record.names))
+        access = self._access(start_variables(self._variable, record.names))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
@@ -608,7 +611,7 @@ class _Listener:
     def _tape(
         self,
         types: bytes,
-        references: bytes,
+        elements: bytes,
         starts: bytes,
         first_outputs: bytes,
         inputs: bytes,
@@ -616,8 +619,9 @@ class _Listener:
         statuses: bytes,
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
+        references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
         return Tape(
-            variables_of(self._description, types, np.frombuffer(references, np.uint32).tolist()),
+            variables_of(self._description, types, references, places),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),

@@ -187,15 +187,17 @@ class PythonPool(SavingPool):
                 data, ends = joined([slot.serialize() for slot in chosen])
         finally:
             restore_arithmetic()
-        return data, ends, np.array([slot.count for slot in chosen], np.int64)
+        steps = np.array([slot.count for slot in chosen], np.int64)
+        return data, ends, steps, np.array([slot.start_time for slot in chosen], np.float64)
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``."""
+        times = bundle.start_times
         with fmu_calls:
             for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
                 state, outputs = bundle.state(source), bundle.outputs[:, source]
-                count = int(bundle.steps[source])
-                self._note(index, self._slots[index].deserialize(state, count, outputs))
+                count, start = int(bundle.steps[source]), float(times[source])
+                self._note(index, self._slots[index].deserialize(state, count, start, outputs))
 
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""

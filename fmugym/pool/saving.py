@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import weakref
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,14 +17,15 @@ from fmugym.fmi.status import Status
 from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, Copies, IndexArray, Record, SaveMethod
-from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.spec import PoolSpec, ResetMethod, start_variables
 
 __all__ = ["SavingPool", "Serialized", "offered_method"]
 
 logger = logging.getLogger(__name__)
 
-Serialized = tuple[bytes, IndexArray, IndexArray]
-"""Serialized states one after the other, where each ends, and the communication steps of each."""
+Serialized = tuple[bytes, IndexArray, IndexArray, FloatArray]
+"""Serialized states one after the other, where each ends, and the communication steps and the start
+time of each."""
 
 
 def offered_method(description: ModelDescription, spec: PoolSpec) -> SaveMethod:
@@ -44,13 +45,14 @@ class SavingPool(AttendedPool):
     A subclass calls ``_prepare_saving`` in its constructor.
     """
 
-    _variables: Mapping[str, Variable]
+    _variable: Callable[[str], Variable]
+    _start_time = 0.0
     _offered = SaveMethod.REPLAY
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
         """Take over what saving needs; returns whether the pool must keep records."""
-        self._variables = description.variables
+        self._variable, self._start_time = description.variable, spec.start_time
         self._offered = offered_method(description, spec)
         return spec.records or self._offered is not SaveMethod.STATE
 
@@ -70,13 +72,15 @@ class SavingPool(AttendedPool):
         """See ``Pool.save_instances``."""
         outputs = np.ascontiguousarray(self.outputs[:, indices])
         if self.save_method is SaveMethod.STATE:
-            data, ends, steps = self.serialize_states(indices)
-            return Bundle(outputs, steps, data, ends)
+            data, ends, steps, start_times = self.serialize_states(indices)
+            return Bundle(outputs, steps, start_times, data, ends)
         records = self._records(indices)
         lengths = [0 if record is None else len(record.inputs) for record in records]
         ends = np.zeros(len(indices), np.int64)
         steps, copies = np.array(lengths, np.int64), self._copies(indices)
-        return Bundle(outputs, steps, b"", ends, tuple(records), copies)
+        usual = self._start_time
+        times = [usual if record is None else record.start_time(usual) for record in records]
+        return Bundle(outputs, steps, np.array(times), b"", ends, tuple(records), copies)
 
     def _copies(self, indices: IndexArray) -> Copies | None:
         """Copy the states of all instances; None if some are not asked for, or cannot be copied."""
@@ -198,7 +202,7 @@ class SavingPool(AttendedPool):
             mask = np.zeros(self.num_instances, np.bool_)
             for record, index in group:
                 values[:, index], mask[index] = record.starts, True
-            self.reset(tuple(self._variables[name] for name in names), values, mask)
+            self.reset(start_variables(self._variable, names), values, mask)
 
     def _step_again(self, records: Sequence[tuple[Record, int]]) -> None:
         inputs, skip = self.inputs.copy(), np.ones(self.num_instances, np.bool_)

@@ -20,7 +20,7 @@ from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.samples import Samples
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import ResetMethod, is_start_time
 
 __all__ = ["Slot", "Snapshot"]
 
@@ -33,11 +33,13 @@ class Snapshot:
         instance: The only instance that can restore the state.
         state: The FMU state.
         count: The number of communication steps before the state.
+        start_time: The first communication point of its episode.
     """
 
     instance: Instance
     state: SavedState
     count: int
+    start_time: float
 
 
 _REUSING = (ResetMethod.RESTORE, ResetMethod.RESET)
@@ -72,6 +74,7 @@ class Slot:
 
     Attributes:
         failure: Why the last status was worse than a warning.
+        start_time: The first communication point of its episode.
         is_due: Whether the next reset replaces the instance.
         keeps_record: Whether the inputs of its episodes are kept.
     """
@@ -93,6 +96,7 @@ class Slot:
         self._count = self._counted = 0
         self._library = library
         self._spec = spec
+        self.start_time = spec.start_time
         self._input_row, self._output_row = input_row, output_row
         self._step_size = spec.communication_step_size
         self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
@@ -106,6 +110,7 @@ class Slot:
         self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
         self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
         self._start_variables: tuple[Variable, ...] = ()
+        self._own_starts: list[int] = []
         self._start = Access(self._instance, ())
         self._start_key: tuple[tuple[Variable, ...], bytes] | None = None
         self._saved: SavedState | None = None
@@ -131,6 +136,7 @@ class Slot:
         self._played = None
         if self.keeps_record:
             self._played = tuple(v.name for v in variables), np.array(values), []
+        self.start_time = self._start_time_in(variables, values)
         try:
             self._make_anew_if_due()
             self._instance.begin_episode()
@@ -143,6 +149,12 @@ class Slot:
         status = self._read_outputs(Status.OK)
         self._first_outputs = self._output_row.tobytes()
         return status
+
+    def _start_time_in(self, variables: tuple[Variable, ...], values: FloatArray) -> float:
+        for variable, value in zip(variables, values, strict=True):
+            if is_start_time(variable):
+                return float(value)
+        return self._spec.start_time
 
     def count_steps(self) -> None:
         """Add the steps so far to the counts."""
@@ -232,13 +244,14 @@ class Slot:
     def _initialize_once(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         self._return_to_instantiated()
         if variables is not self._start_variables:
-            self._start = Access(self._instance, variables)
+            self._own_starts = [i for i, v in enumerate(variables) if not is_start_time(v)]
+            self._start = Access(self._instance, [variables[i] for i in self._own_starts])
             self._start_variables = variables
-        self._start.values[:] = values
+        self._start.values[:] = values[self._own_starts]
         spec = self._spec
         self._pacer.wait()
         self._instance.initialize(
-            spec.start_time, spec.stop_time, spec.tolerance, self._set_start_values
+            self.start_time, spec.stop_time, spec.tolerance, self._set_start_values
         )
         self._warm_up()
 
@@ -323,7 +336,7 @@ class Slot:
 
     def _step_once(self) -> int:
         spec = self._spec
-        time = spec.communication_point(self._count)
+        time = spec.communication_point(self._count, self.start_time)
         if spec.fault_retries:
             status = self._step_with_retries(time, self._step_size)
         else:
@@ -415,7 +428,8 @@ class Slot:
 
     def save(self) -> Snapshot:
         """Copy the FMU state and the time."""
-        return Snapshot(self._instance, self._instance.save_state(), self._count)
+        state = self._instance.save_state()
+        return Snapshot(self._instance, state, self._count, self.start_time)
 
     def require_own(self, snapshot: Snapshot) -> None:
         """Refuse a state of another instance, because FMUs accept it silently."""
@@ -430,6 +444,7 @@ class Slot:
             self._instance.restore_state(snapshot.state)
         except SimulationError as error:
             return self._failed(str(error))
+        self.start_time = snapshot.start_time
         self._begin_counting_at(snapshot.count)
         return self._read_outputs(Status.OK)
 
@@ -475,8 +490,15 @@ class Slot:
         finally:
             state.release()
 
-    def deserialize(self, data: bytes, count: int, outputs: FloatArray) -> int:
-        """Return to a serialized state, its number of communication steps and its outputs."""
+    def deserialize(self, data: bytes, count: int, start_time: float, outputs: FloatArray) -> int:
+        """Return to a serialized state.
+
+        Args:
+            data: The state.
+            count: Its number of communication steps.
+            start_time: The first communication point of its episode.
+            outputs: Its outputs.
+        """
         self.count_steps()
         self._played = None
         self._output_row[:] = outputs
@@ -492,6 +514,7 @@ class Slot:
             state.release()
         except SimulationError as error:
             return self._failed(str(error))
+        self.start_time = start_time
         self._begin_counting_at(count)
         return Status.OK
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
@@ -20,8 +21,11 @@ __all__ = [
     "ISOLATIONS",
     "SAMPLINGS",
     "SOLVERS",
+    "START_TIME",
     "PoolSpec",
     "ResetMethod",
+    "is_start_time",
+    "start_variables",
     "whole_number_of_steps",
 ]
 
@@ -54,6 +58,30 @@ DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
 """How many bytes resets may leak."""
 
 
+START_TIME: Final = Variable(
+    "the start time", "StartTime", 0, "independent", "continuous", "exact", unit="s"
+)
+"""Stands among start variables for the first communication point of the episode.
+
+Without it, episodes begin at ``PoolSpec.start_time``.
+"""
+
+
+def is_start_time(variable: Variable) -> bool:
+    """Whether a start variable is ``START_TIME``, which other processes have copies of."""
+    return variable.type == START_TIME.type
+
+
+def start_variables(find: Callable[[str], Variable], names: Iterable[str]) -> tuple[Variable, ...]:
+    """Find start variables by name, ``START_TIME`` included.
+
+    Args:
+        find: Finds a variable of the FMU.
+        names: The names.
+    """
+    return tuple(START_TIME if n == START_TIME.name else find(n) for n in names)
+
+
 class ResetMethod(StrEnum):
     """How an instance starts a new episode, from the fastest method to the most reliable."""
 
@@ -81,7 +109,8 @@ class PoolSpec:
         substeps: Number of communication steps in one step.
         samplings: For each output, one of ``SAMPLINGS``; empty if all are ``"last"``. Between steps
             an integral is 0, and the others are the values at that time.
-        start_time: First communication point, in seconds.
+        start_time: First communication point, in seconds, unless ``START_TIME`` is among the start
+            variables.
         stop_time: Passed to the FMU unless it is None, in seconds.
         tolerance: Passed to the FMU unless it is None.
         warm_up_steps: Steps simulated at each reset, inputs at their start values, before the
@@ -139,9 +168,15 @@ class PoolSpec:
     solver: str = SOLVERS[0]
     max_step: float | None = None
 
-    def communication_point(self, count: int) -> float:
-        """The time after ``count`` communication steps; not a running sum, which would drift."""
-        return self.start_time + count * self.time_step / self.substeps
+    def communication_point(self, count: int, start_time: float | None = None) -> float:
+        """The time after ``count`` communication steps; not a running sum, which would drift.
+
+        Args:
+            count: The number of steps.
+            start_time: That of the episode; by default that of the spec.
+        """
+        start = self.start_time if start_time is None else start_time
+        return start + count * self.time_step / self.substeps
 
     @property
     def start_outputs(self) -> tuple[float, ...]:

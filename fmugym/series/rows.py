@@ -158,6 +158,7 @@ class Rows:
         self._sums = np.zeros((count, 1 + len(self._summed)))
         self._steps = np.zeros(count, np.int64)
         self._number = np.full(count, -1, np.int64)
+        self._starts: Any = np.zeros(count)
         self.columns = tuple(self._columns())
 
     def _columns(self) -> Iterator[Quantity]:
@@ -182,6 +183,8 @@ class Rows:
         """Make the first rows of episodes."""
         self._number[mask] += 1
         self._steps[mask] = 0
+        begun = np.flatnonzero(mask)
+        self._starts[begun] = self._episodes.evaluate(lambda env: (env._start_time,), begun)[0]
         self._sums[mask] = 0.0
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations), (no, no), infos)
@@ -228,7 +231,7 @@ class Rows:
             *([which] if self._is_vector else []),
             *(self._number[which], self._steps[which]),
             *(
-                spec.communication_point(passed),
+                spec.communication_point(passed, self._starts[which]),
                 *values[is_due].T,
                 *self._sums[which].T,
             ),

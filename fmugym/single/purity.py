@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from inspect import getattr_static
-from types import BuiltinFunctionType, FunctionType, ModuleType
+from types import BuiltinFunctionType, FunctionType, MappingProxyType, ModuleType
 from typing import Any, Final
 
 import gymnasium
@@ -147,7 +147,8 @@ def _require_plain_attributes(env: FMUEnv, function: FunctionType) -> None:
             )
 
 
-_CODE: Final = (FunctionType, classmethod, staticmethod, property, type)
+_CODE: Final = (FunctionType, classmethod, staticmethod, property, type, MappingProxyType)
+"""Types of attributes that hooks cannot change: code, and the parameters."""
 
 
 def _require_computing(function: FunctionType, module: ModuleType) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import cache
 from math import floor, nan
@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from fmugym.checks import check_mapping
 from fmugym.config import EnvConfig
-from fmugym.distributions import as_distribution
+from fmugym.distributions import as_distribution, highest_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool import Pool, PoolSpec
 from fmugym.task import spaces as fmu_spaces
@@ -25,7 +25,7 @@ from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import OwnHooks
 from fmugym.task.inputs import InputWriter
-from fmugym.task.interface import checked, resolve, start_variable
+from fmugym.task.interface import resolve
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
@@ -189,7 +189,8 @@ class Constructed(Pictured):
         self.inputs = tuple(start for _, start in self._start_inputs)
         self.action = None
         self.previous_action = None
-        self.parameters: Mapping[str, Any] = MappingProxyType({})
+        start = {"start_time": self._spec.start_time} if self.config.draws_start_time else {}
+        self.parameters: Mapping[str, Any] = MappingProxyType(start)
         self.variables = EpisodeVariables(self.config.episode_variables)
         self.step_count = 0
         self.done = False
@@ -217,6 +218,9 @@ class Constructed(Pictured):
         """Find out which hooks the class overrides, and prepare the defaults of the others."""
         interface, space = self._interface, self.observation_space
         self._own = own = OwnHooks.of(self, self._base)
+        if self.config.draws_start_time and self.config.stop_time is not None:
+            self._let_stop_time_end_episodes()
+            self._own = own = OwnHooks.of(self, self._base)
         self._form = Numbers(self)
         # A subclass with its own step may take other actions.
         self._elements = None if own.step else elements_of(self.action_space)
@@ -235,6 +239,12 @@ class Constructed(Pictured):
         self._input_writer = InputWriter(interface.inputs)
         self._as_constructed = plain_attributes(vars(self), self._own_names)
 
+    def _let_stop_time_end_episodes(self) -> None:
+        """Each episode has its own last step, as each has its own start time."""
+        hook = self._is_truncated if self._own.is_truncated else None
+        if not isinstance(hook, _StopTime):
+            vars(self)["_is_truncated"] = _StopTime(self, hook)
+
     def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
         if options is None:
             return self._plan
@@ -252,17 +262,14 @@ class Constructed(Pictured):
     def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
         """Prepare the draws of episodes in which these parameters replace the config's."""
         parameters = dict(self._interface.parameters)
-        for name, value in overrides.items():
-            value = as_distribution(repr(name), value)
-            variable = start_variable(self.fmu.description, name, value)
-            if not variable.numeric:
-                raise ConfigError(f"{name!r} is a String: it can be set in the config only")
-            parameters[name] = checked(variable, value)
+        given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
+        own = self._interface.start_values(given)
+        parameters |= own
         return EpisodePlan(
-            tuple(map(self.fmu.variable, parameters)),
+            tuple(map(self._interface.parameter, parameters)),
             parameters,
             self.config.episode_variables,
-            overrides.keys(),
+            own.keys(),
         )
 
 
@@ -285,13 +292,31 @@ def _step_limit(config: EnvConfig, spec: PoolSpec, warm_up_steps: int) -> int:
     limit = sys.maxsize if config.max_episode_steps is None else config.max_episode_steps
     if config.stop_time is None:
         return limit
-    span = (config.stop_time - spec.start_time) / spec.time_step
+    start = highest_of(config.start_time) if config.draws_start_time else spec.start_time
+    span = (config.stop_time - start) / spec.time_step
     if span > limit:
         return limit
     steps = floor(span + 1e-9) - warm_up_steps
     if steps < 1:
         raise ConfigError(
             f"stop_time = {config.stop_time} s leaves no time for a step of {spec.time_step} s "
-            f"after start_time = {spec.start_time} s and the warm-up"
+            f"after start_time = {start} s and the warm-up"
         )
-    return min(limit, steps)
+    return limit if config.draws_start_time else min(limit, steps)
+
+
+class _StopTime:
+    """The hook that truncates an episode if another step would pass the stop time.
+
+    Args:
+        env: The environment, whose episodes begin at different times.
+        own: Its own hook that truncates episodes, if it has one.
+    """
+
+    def __init__(self, env: Constructed, own: Callable[[], Any] | None) -> None:
+        self._env, self._own = env, own
+
+    def __call__(self) -> Any:
+        env: Any = self._env
+        is_over = env.config.stop_time - env.time < env._spec.time_step * (1 - 1e-9)
+        return is_over if self._own is None else self._own() | is_over

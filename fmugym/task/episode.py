@@ -15,6 +15,7 @@ from fmugym.checks import check_number
 from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import checked_value
+from fmugym.task.values import ParameterValues
 from fmugym.trial.rehearsal import Starts
 
 __all__ = ["Draw", "Episode", "EpisodePlan", "Sampler"]
@@ -51,8 +52,9 @@ class Episode(NamedTuple):
 class EpisodePlan:
     """The draws of an episode, prepared once so that a reset only has to draw.
 
-    The parameters are drawn first, then the episode variables, each in the order of their dict.
-    The elements of an array are drawn in C order: the last index changes first.
+    The parameters are drawn first, then the episode variables, each in the order of their dict. A
+    start time that is drawn is the last of the parameters. The elements of an array are drawn in C
+    order: the last index changes first.
 
     Args:
         model_variables: The FMU's variables for the parameters.
@@ -74,7 +76,7 @@ class EpisodePlan:
         overridden: Collection[str] = (),
     ) -> None:
         self.model_variables = model_variables
-        self._parameters = dict(parameters)
+        self._parameters = ParameterValues(parameters)
         self._variables = dict(episode_variables)
         self.constants = np.array(
             [0.0 if is_distribution(value) else value for value in parameters.values()],

@@ -31,7 +31,7 @@ __all__ = [
     "taken",
 ]
 
-_VERSION: Final = 1
+_VERSION: Final = 2
 """Of pickles; it changes with their content."""
 
 _OPERATION: Final = {

@@ -24,7 +24,7 @@ from fmugym.pool.patience import failed_reset
 from fmugym.pool.states import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.trial.trial import state_files
 
 __all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
@@ -285,7 +285,7 @@ class WarmUps:
 
     def _files(self, pool_width: int) -> StateFiles | None:
         prefix = self._prefix or ""
-        width = pool_width + len(self._env._interface.inputs) + sum(self._sizes)
+        width = pool_width + 1 + len(self._env._interface.inputs) + sum(self._sizes)
         return StateFiles(prefix, width) if prefix else None
 
     def _read(self, key: bytes) -> Warmed | None:
@@ -295,20 +295,22 @@ class WarmUps:
         if found is None:
             return None
         numbers = np.frombuffer(found.outputs)
-        outputs, rest = np.split(numbers, [len(spec.outputs)])
+        outputs, start, rest = np.split(numbers, [len(spec.outputs), len(spec.outputs) + 1])
         inputs, rest = np.split(rest, [count])
         parts = np.split(rest, np.cumsum(self._sizes)[:-1]) if self._sizes else []
         shapes = self._shapes.items()
         variables = {n: p.reshape(s) for (n, s), p in zip(shapes, parts, strict=True)}
         steps, ends = np.array([self._warm_up.steps * spec.substeps]), np.array([len(found.data)])
-        warmed = Warmed(Bundle(outputs[:, None].copy(), steps, found.data, ends), inputs, variables)
+        state = Bundle(outputs[:, None].copy(), steps, start, found.data, ends)
+        warmed = Warmed(state, inputs, variables)
         _memory.keep(key, warmed)
         return warmed
 
     def _write(self, key: bytes, warmed: Warmed) -> None:
         files = self._files(len(warmed.state.outputs))
         if files is not None:
-            values = [warmed.state.outputs, warmed.inputs, *warmed.variables.values()]
+            state = warmed.state
+            values = [state.outputs, state.start_times, warmed.inputs, *warmed.variables.values()]
             numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
             files.keep(key.hex()[:32], InitialState(numbers.tobytes(), warmed.state.data))
 
@@ -331,7 +333,9 @@ def rows_of_one(env: Any) -> Readings:
         readings,
         **rows,
         state=rows["values"][: env._output_count],
-        parameters=MappingProxyType({n: _row(v) for n, v in readings.parameters.items()}),
+        parameters=MappingProxyType(
+            ParameterValues((n, _row(v)) for n, v in readings.parameters.items())
+        ),
         variables=variables,
         step_count=np.zeros(1, np.int64),
         done=np.zeros(1, np.bool_),

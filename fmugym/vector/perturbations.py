@@ -102,12 +102,12 @@ class _Perturbation:
         self._start = start
         self._everywhere = np.arange(envs.num_envs)
         fixed = {
-            name: checked_value(env.fmu.variable(name), column[0])
+            name: checked_value(env._interface.parameter(name), column[0])
             for name, column in start.columns_for(envs._scope)["parameters"].items()
-            if column[0] is not None and env.fmu.variable(name).kind != "string"
+            if column[0] is not None and env._interface.parameter(name).kind != "string"
         }
         names = [*(name for name in fixed if name not in states.values()), *states.values()]
-        self._variables: tuple[Variable, ...] = tuple(map(env.fmu.variable, names))
+        self._variables: tuple[Variable, ...] = tuple(map(env._interface.parameter, names))
         self._fixed = np.array([fixed[name] for name in names[: -len(states)]])
         self._starts = tuple(states.values())
 

@@ -41,7 +41,7 @@ static int64_t *copy_of(PyObject *object, const char *name, Py_ssize_t length, s
 typedef struct {
     int64_t *indices;
     size_t count;
-    Py_buffer ends, steps;
+    Py_buffer ends, steps, start_times;
     Bundle bundle;
     ptrdiff_t failed;
 } Saving;
@@ -50,7 +50,8 @@ static void do_bundle(PyPool *self, bool alone, void *context) {
     Saving *s = context;
     (void)alone;
     s->failed =
-        pool_bundle(&self->pool, s->indices, s->count, &s->bundle, s->ends.buf, s->steps.buf);
+        pool_bundle(&self->pool, s->indices, s->count, &s->bundle, s->ends.buf, s->steps.buf,
+                    s->start_times.buf);
 }
 
 static bool take_saving(PyPool *self, PyObject *const *args, Saving *s) {
@@ -59,6 +60,8 @@ static bool take_saving(PyPool *self, PyObject *const *args, Saving *s) {
            take_vector(args[1], &s->ends, WRITTEN, "the ends", ITEM_INT64,
                        (Py_ssize_t)s->count) &&
            take_vector(args[2], &s->steps, WRITTEN, "the steps", ITEM_INT64,
+                       (Py_ssize_t)s->count) &&
+           take_vector(args[3], &s->start_times, WRITTEN, "the start times", ITEM_FLOAT64,
                        (Py_ssize_t)s->count);
 }
 
@@ -77,7 +80,7 @@ PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     Saving s = {.indices = NULL};
     PyObject *result = NULL;
 
-    if (has_arguments(nargs, 3) && can_serialize(self) && take_saving(self, args, &s) &&
+    if (has_arguments(nargs, 4) && can_serialize(self) && take_saving(self, args, &s) &&
         perform(self, NEVER_SHORT, do_bundle, &s) && report_messages(self)) {
         result = s.failed >= 0
                      ? PyLong_FromSsize_t(s.failed)
@@ -85,6 +88,7 @@ PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     }
     release_buffer(&s.ends);
     release_buffer(&s.steps);
+    release_buffer(&s.start_times);
     free(s.indices);
     free(s.bundle.bytes);
     return result;
@@ -96,7 +100,7 @@ typedef struct {
     States states;
     int64_t *indices;
     size_t count;
-    Py_buffer outputs;
+    Py_buffer start_times, outputs;
     size_t troubled;
 } Restoring;
 
@@ -163,7 +167,9 @@ static bool take_restoring(PyPool *self, PyObject *const *args, Restoring *r) {
                                : copy_of(args[4], "the steps", (Py_ssize_t)s->count, &unused);
     return s->sources != NULL && s->steps != NULL && are_instances(self, r->indices, r->count) &&
            are_different(self, r) && are_sound(r, size) &&
-           take_matrix(args[5], &r->outputs, IN_PLACE, "the outputs", ITEM_FLOAT64,
+           take_vector(args[5], &r->start_times, IN_PLACE, "the start times", ITEM_FLOAT64,
+                       (Py_ssize_t)s->count) &&
+           take_matrix(args[6], &r->outputs, IN_PLACE, "the outputs", ITEM_FLOAT64,
                        (Py_ssize_t)self->pool.settings.outputs->count, (Py_ssize_t)s->count);
 }
 
@@ -172,12 +178,14 @@ PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs)
     Restoring r = {.indices = NULL};
     PyObject *result = NULL;
 
-    if (has_arguments(nargs, 6) && can_serialize(self) && take_restoring(self, args, &r)) {
+    if (has_arguments(nargs, 7) && can_serialize(self) && take_restoring(self, args, &r)) {
+        r.states.start_times = r.start_times.buf;
         r.states.outputs = r.outputs.buf;
         if (perform(self, NEVER_SHORT, do_unbundle, &r) && report_messages(self)) {
             result = PyLong_FromSize_t(r.troubled);
         }
     }
+    release_buffer(&r.start_times);
     release_buffer(&r.outputs);
     free(r.indices);
     free(r.states.sources);
@@ -297,7 +305,8 @@ static PyObject *starts_of(const Record *record) {
 
     for (Py_ssize_t i = 0; starts != NULL && i < count; i++) {
         const RecordedStart *start = &record->starts[i];
-        PyObject *item = Py_BuildValue("(IId)", start->type, start->reference, start->value);
+        PyObject *item =
+            Py_BuildValue("(IIId)", start->type, start->reference, start->place, start->value);
         if (item == NULL || PyTuple_SetItem(starts, i, item) < 0) {
             Py_CLEAR(starts);
         }
@@ -305,7 +314,7 @@ static PyObject *starts_of(const Record *record) {
     return starts;
 }
 
-/* Returns the starts as (type, value reference, value), the number of steps, and their inputs as
+/* Returns the starts as (type, value reference, place, value), the number of steps, and their inputs as
  * bytes. */
 PyObject *py_record_of(PyObject *object, PyObject *index) {
     PyPool *self = (PyPool *)object;

@@ -95,13 +95,15 @@ void answer_bundle(Worker *w, Reader *reader) {
     int64_t *indices = read_integers(reader, &count);
     int64_t *ends = memory_for(NULL, count * sizeof *ends);
     int64_t *steps = memory_for(NULL, count * sizeof *steps);
+    double *start_times = memory_for(NULL, count * sizeof *start_times);
     Bundle bundle = {.bytes = NULL};
 
     if (!can_serialize(w) || !reader->sound) {
         send_error("the FMU cannot serialize its state");
     } else {
         pool_enter(&w->pool);
-        const ptrdiff_t failed = pool_bundle(&w->pool, indices, count, &bundle, ends, steps);
+        const ptrdiff_t failed =
+            pool_bundle(&w->pool, indices, count, &bundle, ends, steps, start_times);
         pool_leave(&w->pool);
         worker_report(w);
         if (failed >= 0) {
@@ -111,6 +113,7 @@ void answer_bundle(Worker *w, Reader *reader) {
             write_block(&writer, bundle.bytes, bundle.size);
             write_block(&writer, ends, count * sizeof *ends);
             write_block(&writer, steps, count * sizeof *steps);
+            write_block(&writer, start_times, count * sizeof *start_times);
             send_result(&writer);
         }
     }
@@ -118,6 +121,7 @@ void answer_bundle(Worker *w, Reader *reader) {
     free(indices);
     free(ends);
     free(steps);
+    free(start_times);
 }
 
 void answer_unbundle(Worker *w, Reader *reader) {
@@ -127,7 +131,9 @@ void answer_unbundle(Worker *w, Reader *reader) {
 
     states.ends = read_integers(reader, &states.count);
     states.steps = read_integers(reader, &size);
-    int64_t *outputs = read_integers(reader, &size); /* of the same size as float64 */
+    int64_t *start_times = read_integers(reader, &size); /* of the same size as float64 */
+    int64_t *outputs = read_integers(reader, &size);
+    states.start_times = (const double *)start_times;
     states.outputs = (const double *)outputs;
     states.bytes = read_block(reader, &size);
     if (!can_serialize(w) || !reader->sound || count > w->settings.count) {
@@ -147,6 +153,7 @@ void answer_unbundle(Worker *w, Reader *reader) {
     free(states.sources);
     free(states.ends);
     free(states.steps);
+    free(start_times);
     free(outputs);
 }
 
@@ -164,6 +171,7 @@ void answer_record_of(Worker *w, Reader *reader) {
         for (size_t i = 0; i < record->number_of_starts; i++) {
             write_integer(&writer, record->starts[i].type);
             write_integer(&writer, record->starts[i].reference);
+            write_integer(&writer, record->starts[i].place);
             write_number(&writer, record->starts[i].value);
         }
         write_integer(&writer, (int64_t)record->rows);

@@ -23,6 +23,7 @@ from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import Column, CountedPool, no_counts, note
+from fmugym.pool.spec import is_start_time
 
 __all__ = ["Backend", "BackendPool"]
 
@@ -109,7 +110,9 @@ class BackendPool(CountedPool):
         """See ``Pool.reset``."""
         self._require_open()
         chosen = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask)
-        names = [variable.name for variable in variables]
+        given = [not is_start_time(variable) for variable in variables]  # a real time begins now
+        values = values[given]
+        names = [variable.name for variable in variables if not is_start_time(variable)]
         strings = {variable.name: text for variable, text in self._spec.strings}
         starts = {
             index: dict(zip(names, values[:, index].tolist(), strict=True)) | strings

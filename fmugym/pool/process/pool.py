@@ -306,14 +306,16 @@ class ProcessPool(SavingPool):
             replies = self._crew.run(
                 "saving states", list(parts), lambda s: s.tell("bundle", _within(s, parts[s]))
             )
-        states: dict[int, tuple[bytes, int]] = {}
-        for supervisor, (data, ends, steps) in replies.items():
-            one = Bundle(np.zeros((0, len(ends))), steps, data, ends)
+        states: dict[int, tuple[bytes, int, float]] = {}
+        for supervisor, (data, ends, steps, times) in replies.items():
+            one = Bundle(np.zeros((0, len(ends))), steps, times, data, ends)
             for place, index in enumerate(parts[supervisor].tolist()):
-                states[index] = one.state(place), int(steps[place])
-        found = [states.get(index, (b"", 0)) for index in indices.tolist()]
-        data, ends = joined(state for state, _ in found)
-        return data, ends, np.array([steps for _, steps in found], np.int64)
+                states[index] = one.state(place), int(steps[place]), float(times[place])
+        lost = b"", 0, self._spec.start_time
+        found = [states.get(index, lost) for index in indices.tolist()]
+        data, ends = joined(state for state, *_ in found)
+        steps = np.array([steps for _, steps, _ in found], np.int64)
+        return data, ends, steps, np.array([time for *_, time in found], np.float64)
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``; a lost worker is replaced."""

@@ -30,13 +30,13 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     manner_of,
     record_from,
     solving_settings,
-    types_and_references,
     variable_settings,
 )
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import ResetMethod, start_variables
 from fmugym.wine.loader import windows_path
 
 __all__ = ["REQUESTS", "ProgramCoding"]
@@ -94,7 +94,7 @@ class _Writer:
         self.parts.append(np.ascontiguousarray(array, dtype).tobytes())
 
     def access(self, variables: Sequence[Variable], version: int) -> None:
-        for part in types_and_references(variables, version):
+        for part in listing(variables, version):
             self.block(part)
 
     def optional(self, number: float | None) -> None:
@@ -292,13 +292,15 @@ class ProgramCoding:
         writer.block(np.ascontiguousarray(indices, np.int64).tobytes())
 
     def _answer_bundle(self, reader: _Reader, _: IndexArray) -> Serialized:
-        return reader.block(), reader.indices(), reader.indices()
+        data, ends, steps = reader.block(), reader.indices(), reader.indices()
+        return data, ends, steps, np.frombuffer(reader.block(), np.float64)
 
     def _ask_unbundle(self, writer: _Writer, bundle: Bundle, indices: IndexArray) -> None:
         sources = np.arange(len(indices))
         for numbers in (indices, sources, bundle.ends, bundle.steps):
             writer.block(np.ascontiguousarray(numbers, np.int64).tobytes())
-        writer.block(np.ascontiguousarray(bundle.outputs, np.float64).tobytes())
+        for values in (bundle.start_times, bundle.outputs):
+            writer.block(np.ascontiguousarray(values, np.float64).tobytes())
         writer.block(bundle.data)
 
     def _ask_record_of(self, writer: _Writer, index: int) -> None:
@@ -308,16 +310,17 @@ class ProgramCoding:
         if reader.is_done:
             return None
         starts = [
-            (reader.integer(), reader.integer(), reader.number()) for _ in range(reader.integer())
+            (reader.integer(), reader.integer(), reader.integer(), reader.number())
+            for _ in range(reader.integer())
         ]
         steps = reader.integer()
         setup = self._setup
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
 
     def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
-        variables = self._setup.description.variables
+        variables = start_variables(self._setup.description.variable, record.names)
         writer.integers(index, len(record.inputs))
-        writer.access([variables[name] for name in record.names], self._version)
+        writer.access(variables, self._version)
         for values in (record.starts, record.inputs):
             writer.block(np.ascontiguousarray(values, np.float64).tobytes())
 

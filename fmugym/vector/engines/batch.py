@@ -24,6 +24,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
+from fmugym.task.values import ParameterValues
 from fmugym.task.warm_up import WarmUps, grouped
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
@@ -72,8 +73,9 @@ class BatchEngine(Engine):
     def _make_parameters(self, plan: EpisodePlan) -> None:
         self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
         self._drawn_rows = np.array(plan.drawn_rows, np.intp)[:, None]
-        names = [variable.name for variable in plan.model_variables]
-        self._parameters = dict(zip(names, self._start_values, strict=True))
+        self._parameters = ParameterValues(
+            zip(plan.parameter_names, self._start_values, strict=True)
+        )
         self.env.parameters = MappingProxyType(self._parameters)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
@@ -315,7 +317,7 @@ class BatchEngine(Engine):
             self._place_given(indices, plan)
         if default:
             return self._start_values
-        return np.stack([self._parameters[variable.name] for variable in plan.model_variables])
+        return np.stack([self._parameters[name] for name in plan.parameter_names])
 
     def _place_given(self, indices: IndexArray, plan: EpisodePlan) -> None:
         constant = plan.constant_parameters.keys() - plan.told.keys()

@@ -1,0 +1,533 @@
+"""Start times that differ from episode to episode: pools, environments and declared tasks."""
+
+import logging
+import pickle
+from functools import partial
+
+import exchange_tools
+import gymnasium
+import numpy as np
+import pytest
+import wine_tools
+
+import fmugym
+from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUVectorEnv, Uniform
+from fmugym import pool as pools
+from fmugym.errors import TaskError
+from fmugym.pool import PoolSpec
+from fmugym.pool.spec import START_TIME
+from fmugym.trial import opening
+
+LOG = logging.getLogger("fmugym.test")
+KINDS = {
+    "python": {"backend": "python"},
+    "native": {"backend": "native"},
+    "process": {"backend": "auto", "isolation": "process", "workers": 2},
+    "wine": {},
+}
+STEP = 0.25
+STARTS = np.array([0.0, 1.5, 86400.25])
+OUTPUTS = ("x", "now", "sine", "seconds")
+SUNS = [("ModelExchange", 1), ("ModelExchange", 2), ("ModelExchange", 3)]
+SUNS += [("CoSimulation", 2), ("CoSimulation", 3)]
+CASES = [(kind, *sun) for kind in KINDS for sun in SUNS if (kind, sun[0]) != ("wine", SUNS[-1][0])]
+all_cases = pytest.mark.parametrize(("kind", "interface", "version"), CASES)
+with_states = pytest.mark.parametrize(
+    ("kind", "interface", "version"), [case for case in CASES if case[2] > 1]
+)
+
+
+@pytest.fixture(scope="session")
+def sun(tmp_path_factory):
+    """Write FMUs that tell their time, each once."""
+    folder, made = tmp_path_factory.mktemp("suns"), {}
+
+    def make(interface="CoSimulation", version=2):
+        key = interface, version
+        if key not in made:
+            path = folder / f"{interface}{version}.fmu"
+            made[key] = exchange_tools.exchange_fmu(path, "sun", version, (interface,))
+        return made[key]
+
+    return make
+
+
+@pytest.fixture
+def make_pool(request, sun):
+    """Make pools that are closed after the test."""
+    made = []
+
+    def make(kind, interface="CoSimulation", version=2, n=3, **spec):
+        if kind == "native" and not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        path = sun(interface, version)
+        if kind == "wine":
+            request.getfixturevalue("wine")
+            path = wine_tools.exchange_fmu(path.with_suffix(".win.fmu"), "sun", version)
+        fmu = FMU(path, probe_timeout=None)
+        spec = PoolSpec(
+            inputs=(), outputs=tuple(map(fmu.variable, OUTPUTS)), time_step=STEP, **spec
+        )
+        pool = opening.make_pool(fmu, spec, n, LOG, **KINDS[kind])
+        pool.x = fmu.variable("x")
+        made.append(pool)
+        return pool
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+def start(pool, times, x=None):
+    """Reset a pool with the start time of each instance, and the state if it is given."""
+    variables, rows = (START_TIME,), [times]
+    if x is not None:
+        variables, rows = (pool.x, START_TIME), [x, times]
+    pool.reset(variables, np.array(rows, np.float64))
+    assert not pool.statuses.any(), pool.failure(0)
+
+
+def steps(pool, count):
+    for _ in range(count):
+        pool.step()
+        assert not pool.statuses.any(), pool.failure(0)
+
+
+def require(pool, starts, count, x=0.0):
+    """Each FMU is where the closed form is after so many steps from its own start time."""
+    times = starts + count * STEP
+    found = dict(zip(OUTPUTS, pool.outputs, strict=True))
+    np.testing.assert_allclose(found["now"], times, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found["sine"], np.sin(times), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found["x"], x + np.sin(times) - np.sin(starts), atol=2e-3)
+    np.testing.assert_array_equal(found["seconds"], np.floor(times) - np.floor(starts))
+
+
+@all_cases
+def test_each_instance_begins_at_its_own_time(make_pool, kind, interface, version):
+    pool = make_pool(kind, interface, version)
+    start(pool, STARTS)
+    require(pool, STARTS, 0)
+    steps(pool, 5)
+    require(pool, STARTS, 5)
+    pool.reset((), np.zeros((0, 3)))  # without one, episodes begin at that of the spec
+    steps(pool, 1)
+    require(pool, np.zeros(3), 1)
+    for times in (STARTS, STARTS, STARTS[::-1]):  # which may find kept initial states
+        start(pool, times, np.array([0.5, 0.0, -0.5]))
+        steps(pool, 5)
+        require(pool, times, 5, np.array([0.5, 0.0, -0.5]))
+
+
+@with_states
+def test_snapshots_keep_it(make_pool, kind, interface, version):
+    pool = make_pool(kind, interface, version)
+    start(pool, STARTS)
+    steps(pool, 2)
+    snapshot = pool.save()
+    start(pool, STARTS + 100.0)
+    steps(pool, 1)
+    pool.restore(snapshot, np.array([True, False, True]))
+    steps(pool, 1)
+    mixed = np.where([True, False, True], STARTS, STARTS + 100.0)
+    np.testing.assert_allclose(pool.outputs[1], mixed + np.array([3, 2, 3]) * STEP, atol=1e-9)
+
+
+@all_cases
+def test_saved_states_take_it_to_other_instances_and_pools(make_pool, kind, interface, version):
+    pool = make_pool(kind, interface, version)
+    start(pool, STARTS)
+    steps(pool, 3)
+    bundle = pool.save_instances(np.arange(3))
+    other = make_pool("python" if kind == "native" else kind, interface, version)
+    start(other, STARTS + 7.0)
+    sources, indices = np.array([2, 0]), np.array([0, 1])
+    other.restore_instances(bundle.take([0, 1, 2]), sources, indices)
+    assert not other.statuses.any(), other.failure(0)
+    steps(other, 2)
+    expected = [STARTS[2] + 5 * STEP, STARTS[0] + 5 * STEP, STARTS[2] + 7.0 + 2 * STEP]
+    np.testing.assert_allclose(other.outputs[1], expected, atol=1e-9)
+
+
+# Environments
+
+
+class Sun(FMUEnv):
+    """Reads the time in all hooks."""
+
+    def __init__(self, path, hooks="auto", backend=None, isolation=None, **config):
+        config = {
+            "model_input_names": [],
+            "model_output_names": ["x", "now", "sine"],
+            "model_parameters": {"x": Uniform(-1, 1)},
+            "episode_variables": {"target": Uniform(0, 1), "early": 0.0},
+            "time_step": STEP,
+            "max_episode_steps": 5,
+            "start_time": Uniform(0, 100),
+        } | config
+        super().__init__(path, config, hooks=hooks, backend=backend, isolation=isolation)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def _get_observation_space(self):
+        return gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+
+    def _get_inputs(self):
+        return ()
+
+    def _update(self):
+        self.variables["early"] = self.variables["early"] + 0.1 * self.time
+
+    def _is_done(self):
+        return self.time % 10 > 9.5
+
+    def _reward_policy(self):
+        return self.time + 10 * self.out["x"] + self.variables["target"]
+
+    def _get_observation(self):
+        start = self.parameters["start_time"]
+        return np.array([self.time, self.out["now"], self.variables["early"], start])
+
+
+ACTION = np.zeros(1, np.float32)
+WAYS = {
+    "compiled": {"hooks": "compiled"},
+    "array": {"hooks": "array"},
+    "per_env": {"hooks": "per_env"},
+    "python": {"backend": "python"},
+    "process": {"isolation": "process"},
+}
+all_ways = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+
+
+def vector(make, n=3, **options):
+    return FMUVectorEnv(make, n, **options)
+
+
+def play(env, seed, steps):
+    """What a single environment tells, which begins a new episode where one has ended."""
+    observation, info = env.reset(seed=seed)
+    rows = [(observation.tolist(), info["drawn"])]
+    for _ in range(steps):
+        observation, reward, *ends, info = env.step(ACTION)
+        rows.append((observation.tolist(), reward, *ends))
+        if any(ends):
+            observation, info = env.reset()
+            rows.append((observation.tolist(), info["drawn"]))
+    return rows
+
+
+@pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+def test_a_single_environment(sun, interface):
+    env = Sun(sun(interface))
+    drawn = []
+    for seed in range(5):
+        observation, info = env.reset(seed=seed)
+        drawn.append(info["drawn"]["start_time"])
+        assert list(info["drawn"]) == ["x", "start_time", "target"]
+        assert env.time == env.parameters["start_time"] == drawn[-1]
+        for step in range(1, 4):
+            observation = env.step(ACTION)[0]
+            assert env.time == drawn[-1] + step * STEP
+            assert observation[1] == pytest.approx(env.time, abs=1e-9)
+    generator = np.random.default_rng(4)
+    assert drawn[-1] == [generator.uniform(*limits) for limits in ((-1, 1), (0, 100))][1]
+    assert 0 <= min(drawn) < max(drawn) < 100
+    env.close()
+
+
+@pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+@all_ways
+def test_many_environments_equal_single_ones(sun, way, interface):
+    make = partial(Sun, sun(interface))
+    envs = vector(make, **way)
+    found = [[(row.tolist(),)] for row in envs.reset(seed=7)[0]]
+    resets = np.zeros(3, np.bool_)
+    for _ in range(14):
+        result = envs.step(np.zeros((3, 1), np.float32))
+        for index in range(3):
+            if resets[index]:
+                found[index].append((result.observations[index].tolist(),))
+                assert result.infos["_drawn"][index]
+                start = result.infos["drawn"]["start_time"][index]
+                assert start == result.observations[index][3]
+            else:
+                values = (result.observations, result.rewards, *result[2:4])
+                found[index].append(tuple(value[index].tolist() for value in values))
+        resets = result.terminated | result.truncated
+    for index, rows in enumerate(found):
+        env = make()
+        expected = play(env, 7 + index, 14)[: len(rows)]
+        assert rows == [row[:1] if len(row) == 2 else row for row in expected]
+        env.close()
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_autoreset_modes_see_the_same_episodes(sun, mode):
+    make = partial(Sun, sun(), max_episode_steps=3)
+    told = []
+    for hooks in ("compiled", "array", "per_env"):
+        envs = vector(make, hooks=hooks, autoreset_mode=mode)
+        rows = [[envs.reset(seed=1)[0].tolist()]]
+        for _ in range(10):
+            result = envs.step(np.zeros((3, 1), np.float32))
+            rows.append([part.tolist() for part in result[:4]])
+            ended = result.terminated | result.truncated
+            if mode == "Disabled" and ended.any():
+                rows.append([envs.reset(options={"reset_mask": ended})[0].tolist()])
+        told.append(rows)
+        envs.close()
+    assert told[0] == told[1] == told[2]
+    starts = {row[3] for observations in told[0] for row in observations[0]}
+    assert len(starts) > 6  # those of later episodes, too
+
+
+def test_compiled_single_environments(sun):
+    compiled, plain = Sun(sun(), hooks="compiled"), Sun(sun(), hooks="python")
+    assert play(compiled, 3, 40) == play(plain, 3, 40)
+    compiled.close()
+    plain.close()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@all_ways
+def test_snapshots_and_rollouts_keep_it(sun, way, version):
+    make = partial(Sun, sun("ModelExchange", version), max_episode_steps=20)
+    env, envs = make(), vector(make, 2, **way)
+    env.reset(seed=11)
+    env.step(ACTION)
+    snapshot = pickle.loads(pickle.dumps(env.save_state()))
+    expected = [env.step(ACTION)[:2] for _ in range(3)]
+    envs.reset(seed=0)
+    rollout = envs.rollout(snapshot, np.zeros((2, 3, 1), np.float32))
+    for index in range(2):
+        assert rollout.rewards[index].tolist() == [reward for _, reward in expected]
+    envs.restore_state(snapshot, 1)
+    for observation, reward in expected:
+        result = envs.step(np.zeros((2, 1), np.float32))
+        assert result.observations[1].tolist() == observation.tolist()
+        assert result.rewards[1] == reward
+        assert result.observations[0][0] != observation[0]
+    env.close()
+    envs.close()
+
+
+@all_ways
+def test_the_stop_time_ends_episodes(sun, way):
+    make = partial(Sun, sun(), start_time=[1.0, 2.0, 3.0], stop_time=4.5, max_episode_steps=9)
+    env, envs = make(), vector(make, 1, **way)
+    rows, expected = [envs.reset(seed=5)[0][0].tolist()], play(env, 5, 30)
+    rows += [envs.step(np.zeros((1, 1), np.float32)).observations[0].tolist() for _ in range(30)]
+    assert rows == [row[0] for row in expected][: len(rows)]
+    lengths, count = set(), 0
+    for row in expected:
+        if len(row) == 2:
+            count, start = 0, row[1]["start_time"]
+            continue
+        count += 1
+        assert row[3] == (count == min(9, (4.5 - start) / STEP))
+        lengths |= {count} if row[3] else set()
+    assert lengths == {9, 6}
+    env.close()
+    envs.close()
+
+
+def test_kept_initial_states_are_of_one_start_time(sun):
+    starts = {"model_parameters": {}, "start_time": Choice([1.0, 20.0])}
+    env = Sun(sun(), **starts, max_episode_steps=2, reset_method="restore")
+    seen = set()
+    for episode in range(40):
+        observation, info = env.reset(seed=0 if episode == 0 else None)
+        assert observation[:2].tolist() == [info["drawn"]["start_time"]] * 2
+        seen.add(observation[0])
+        env.step(ACTION)
+    assert seen == {1.0, 20.0}
+    env.close()
+
+
+def test_an_episode_may_get_another_one(sun):
+    for make in (Sun, lambda path: vector(partial(Sun, path), 2)):
+        env = make(sun())
+        options = {"model_parameters": {"start_time": 5.0}}
+        observation, info = env.reset(seed=0, options=options)
+        assert np.atleast_2d(observation)[:, :2].tolist() == [[5.0, 5.0]] * len(
+            np.atleast_2d(observation)
+        )
+        assert np.all(info["drawn"]["start_time"] == 5.0)
+        assert np.all(env.reset(seed=0)[1]["drawn"]["start_time"] != 5.0)
+        env.close()
+
+
+def test_it_survives_the_trial(sun, monkeypatch):
+    monkeypatch.delenv("FMUGYM_PROBE")
+    env = Sun(sun("ModelExchange"))
+    assert env.reset_method == "restore"
+    observation, info = env.reset(seed=0)
+    assert observation[1] == info["drawn"]["start_time"]
+    assert env.save_state().method == "state"
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("config", "fact"),
+    [
+        ({"start_time": "noon"}, "start_time.*'noon'"),
+        ({"start_time": []}, "at least one"),
+        ({"start_time": ["noon"]}, "start_time.*noon"),
+        ({"start_time": {"low": 0}}, "start_time.*'distribution'"),
+        ({"start_time": [1.0, np.inf]}, "inf"),
+        ({"episode_variables": {"start_time": 0.0}}, "'start_time'.*episode variable"),
+        ({"start_time": [0.0, 9.9], "stop_time": 10.0}, "stop_time = 10.0.*9.9"),
+    ],
+)
+def test_mistakes_are_named(sun, config, fact):
+    with pytest.raises(ConfigError, match=fact):
+        Sun(sun(), **config)
+
+
+# Declared tasks
+
+DAY = 86400.0
+TASK = {
+    "time_step": "6h",
+    "episode_length": "2d",
+    "data": {"day": {"values": list(range(365)), "step": "1d", "interpolation": "previous"}},
+    "setpoints": {"T": {"schedule": {"06:00": 21, "22:00": 17}}},
+    "variables": {"u": {"min": -1, "max": 1}},
+    "agent": {
+        "actions": ["u"],
+        "observations": ["day", "T", "days", "hours"],
+        "forecast": {"of": "day", "horizon": "1d", "step": "1d"},
+    },
+    "expressions": {"days": "now / 86400", "hours": "clock / 3600"},
+    "reward": "day + 0.001 * sine",
+    "config": {"solver": "rk4", "max_step": 3600},
+}
+
+
+@pytest.fixture
+def task(sun):
+    return TASK | {"fmu": str(sun("ModelExchange"))}
+
+
+def first_days(env, episodes):
+    """The days of the FMU at the beginning of episodes."""
+    days = set()
+    for episode in range(episodes):
+        observation, info = env.reset(seed=0 if episode == 0 else None)
+        require_day(observation, env.time / DAY)
+        if "start_time" in info["drawn"]:
+            assert env.time == info["drawn"]["start_time"] + env._warm_up_steps * DAY / 4
+        days.add(round(env.time / DAY, 6))
+    env.close()
+    return days
+
+
+def require_day(observation, day):
+    """Data, schedule, forecast and clock follow the FMU's own time."""
+    is_day = 0.25 <= day % 1 < 22 / 24
+    expected = [int(day) % 365, 21 if is_day else 17, day, day * 24, int(day + 1) % 365]
+    np.testing.assert_allclose(observation, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("start_time", "days"),
+    [
+        ("01-15", {14}),
+        ("2024-03-01 12:00", {59.5}),
+        ("3d 6h", {3.25}),
+        (0.5 * DAY, {0.5}),
+        (["01-02", "03-01", "3d"], {1, 59, 3}),
+        ({"from": "12-30", "to": "01-02"}, {363, 364, 0, 1}),
+        ({"distribution": "choice", "values": [0, 21600]}, {0, 0.25}),
+    ],
+)
+def test_the_fmu_begins_at_a_time_of_the_year(task, start_time, days):
+    assert first_days(fmugym.load(task | {"start_time": start_time}), 40) == days
+
+
+def test_a_season_leaves_scenarios_out_with_its_warm_up(task):
+    season = task | {
+        "start_time": {"from": "01-01", "to": "01-15", "exclude": "scenarios"},
+        "scenarios": {"peak": {"start": "01-06", "length": "3d"}},
+        "warm_up": "1d",
+    }
+    # Days 5, 6 and 7 are left out. A warm-up of a day and an episode of two days follow.
+    assert first_days(fmugym.load(season), 70) == {1, 2, 3, *range(9, 16)}
+    env = fmugym.load(season, scenario="peak")
+    assert first_days(env, 2) == {5}
+    early = season | {"scenarios": {"peak": {"start": "01-01", "length": "2d"}}}
+    env = fmugym.load(early, scenario="peak")
+    observation, _ = env.reset(seed=0)
+    assert env.time == 365 * DAY  # an FMU begins at 0 or later
+    require_day(observation, 365)
+    assert [env.step([0.0])[3] for _ in range(8)] == [False] * 7 + [True]
+    env.close()
+
+
+def test_scenarios_of_a_task_with_a_clock_move_only_the_clock(task):
+    scenarios = {"clock": "02-01", "scenarios": {"peak": {"start": "01-06", "length": "1d"}}}
+    env = fmugym.load(task | scenarios | {"start_time": "3d"}, scenario="peak")
+    observation, _ = env.reset(seed=0)
+    assert (observation[0], env.time) == (5, 3 * DAY)
+    env.close()
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("warm_up", [0, {"period": "12h", "controller": 0.5, "cache": True}])
+def test_vectors_of_tasks_equal_single_ones(task, hooks, warm_up):
+    task = task | {"start_time": {"from": "10-01", "to": "10-03", "step": "6h"}}
+    task |= {"warm_up": warm_up} if warm_up else {}
+    envs = FMUVectorEnv(partial(fmugym.load, task), 3, hooks=hooks)
+    singles = [fmugym.load(task) for _ in range(3)]
+    observations = envs.reset(seed=3)[0]
+    for i, env in enumerate(singles):
+        assert observations[i].tolist() == env.reset(seed=3 + i)[0].tolist()
+        require_day(observations[i], env.time / DAY)
+    for step in range(1, 26):
+        result = envs.step(np.full((3, 1), 0.25, np.float32))
+        for i, env in enumerate(singles):
+            if step % 9 == 0:
+                assert result.observations[i].tolist() == env.reset()[0].tolist()
+            else:
+                observation, reward, *_ = env.step(np.array([0.25], np.float32))
+                assert result.observations[i].tolist() == observation.tolist()
+                assert result.rewards[i] == reward
+                require_day(observation, env.time / DAY)
+    for env in (envs, *singles):
+        env.close()
+
+
+def test_a_task_file_keeps_it(task, tmp_path):
+    season = {"from": "10-01", "to": "04-15", "exclude": "scenarios"}
+    scenarios = {"peak": {"start": "01-15", "length": "14d"}}
+    written = fmugym.Task.from_dict(task | {"start_time": season, "scenarios": scenarios})
+    written.write(tmp_path / "task.toml")
+    assert fmugym.Task.read(tmp_path / "task.toml") == written
+    env = fmugym.load(tmp_path / "task.toml", scenario="peak")
+    assert env.reset(seed=0)[0][0] == 14
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "fact"),
+    [
+        ({"start_time": "13-01"}, "start_time.*'13-01'"),
+        ({"start_time": []}, "start_time.*at least one"),
+        ({"start_time": {"from": "01-01"}}, "start_time.*'to'"),
+        ({"start_time": ["01-01", "02-01"], "clock": 0}, "start_time.*clock"),
+        ({"start_time": {"from": "01-01", "to": "01-02", "exclude": "peek"}}, "start_time"),
+        (
+            {
+                "start_time": {"distribution": "uniform", "low": 0, "high": 1},
+                "warm_up": {"period": "6h", "controller": 1, "cache": True},
+            },
+            "warm_up.cache.*start_time",
+        ),
+    ],
+)
+def test_mistakes_in_tasks_are_placed(task, change, fact):
+    with pytest.raises(TaskError, match=f"^{fact}"):
+        fmugym.load(task | change)
