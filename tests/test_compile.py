@@ -10,7 +10,7 @@ import fmpy
 import fmu_tools
 import numpy as np
 import pytest
-from source_tools import build_description, write_source_fmu
+from source_tools import BOTH, build_description, write_source_fmu
 
 from fmugym import FMU, ConfigError, FMULoadError
 from fmugym.pool import PoolSpec
