@@ -8,9 +8,9 @@ from contextlib import closing
 from pathlib import Path
 
 from fmugym.errors import ConfigError, shown
+from fmugym.extras import imported
 from fmugym.logs import PlantLog, play_log
 from fmugym.recording import Recorder, Recording
-from fmugym.series.store import imported
 from fmugym.tools.options import (
     HELP_OF_TASK,
     Commands,
