@@ -26,9 +26,9 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.description import Variable
+from fmugym.archive.units import conversion_between
 from fmugym.checks import check_number
 from fmugym.declared import Task
-from fmugym.declared.quantities import conversion_between
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.fmi.status import Status
