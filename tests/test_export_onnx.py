@@ -104,10 +104,9 @@ class TestFunctions:
     @pytest.mark.parametrize("dtype", [np.float64, np.float32])
     def test_of_numpy(self, dtype):
         nodes, wanted = Nodes(), []
-        own_types = [
-            one for one in FUNCTIONS if one(*arguments_of(one, dtype)).dtype in (dtype, bool)
-        ]
-        for ufunc in own_types:
+        for ufunc in FUNCTIONS:
+            if ufunc is np.float_power and dtype is np.float32:
+                continue  # it computes with float64
             values = arguments_of(ufunc, dtype)
             result = computed(nodes, ufunc, list("xy"[: ufunc.nin]), np.dtype(dtype))
             with np.errstate(all="ignore"):

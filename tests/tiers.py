@@ -20,6 +20,7 @@ SLOW_MODULES = {
     "test_examples_train_house",
     "test_export",
     "test_export_fmu",
+    "test_export_onnx",
     "test_export_sb3",
     "test_fuzz",
     "test_fuzz_face",

@@ -35,8 +35,8 @@ def write_onnx(agent: Agent, path: str | os.PathLike[str]) -> Path:
 
     The model takes ``measurements`` of type float64, shape (N, m), and gives ``actions`` of shape
     (N, a), for N plants at once. What the agent keeps from one sample to the next are inputs, too:
-    ``count``, the number of samples until now, and more arrays. The outputs ``next_count`` and so on
-    are their values for the next sample. The metadata of the model tell names, units, the time
+    ``count``, the number of samples until now, and more arrays. The outputs ``next_count`` and so
+    on are their values for the next sample. The metadata of the model tell names, units, the time
     between samples, and what the memory begins with.
 
     Args:
