@@ -153,7 +153,7 @@ class NativePool(SavingPool):
             return _native.Pool(
                 library=cast(
                     "_native.Library",
-                    library_settings(description, place)
+                    library_settings(description, spec, place)
                     | {
                         "private": private_libraries,
                         "logging": log.isEnabledFor(logging.INFO),
@@ -191,7 +191,7 @@ class NativePool(SavingPool):
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
             parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, manner_of(self._fmu.description))
+            access = _native.Access(version, *parts, manner_of(self._fmu.description, self._spec))
             self._accesses[variables] = access
         return access
 

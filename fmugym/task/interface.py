@@ -123,7 +123,32 @@ class Interface:
             samplings=self._samplings(),
             solver=config.solver,
             max_step=self._max_step(),
+            ramped=self._ramped(),
         )
+
+    def _ramped(self) -> tuple[Variable, ...]:
+        """The inputs that change linearly within a step.
+
+        Raises:
+            ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real.
+        """
+        inputs = {variable.name: variable for variable in self.inputs}
+        ramped = tuple(inputs[name] for name in self.config.ramped_inputs)
+        if ramped and not self.description.capabilities.can_interpolate_inputs:
+            raise ConfigError(
+                f"config key 'input_interpolation': {self.description.model_name} "
+                f"(FMI {self.description.fmi_version}) cannot interpolate inputs, which is an "
+                "option of FMI 1.0 and 2.0 for co-simulation; its inputs can only hold"
+            )
+        for variable in ramped:
+            found = variable.kind, variable.variability, variable.causality, variable.shape
+            if found != ("real", "continuous", "input", ()):
+                raise ConfigError(
+                    f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
+                    f"a {variable.variability} {variable.causality} of type {variable.type}, "
+                    "expected a continuous Real input"
+                )
+        return ramped
 
     def _max_step(self) -> float | None:
         """The config's, or else, for a solver of fixed steps, the FMU's default step size."""
