@@ -227,7 +227,9 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         offer.canBeInstantiatedOnlyOncePerProcess,
         offer.needsExecutionTool,
         _provides(root, _ELEMENTS[interface], "Adjoint"),
-        bool(getattr(offer, "canInterpolateInputs", False)),
+        interface == "co_simulation"
+        and source.fmiVersion.startswith("2")
+        and offer.canInterpolateInputs,
     )
 
 
