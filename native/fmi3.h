@@ -167,21 +167,22 @@ static inline void *instantiate_steps(const Library *library, const Identity *id
 }
 
 static inline Status get3(const Library *library, void *instance, Type type,
-                          const uint32_t *references, size_t count, void *values) {
+                          const uint32_t *references, size_t count, void *values, size_t size) {
     Get3 *function = functions_of(library)->get[type];
     if (function == NULL) {
         return STATUS_ERROR;
     }
-    return sane(function(instance, references, count, values, count));
+    return sane(function(instance, references, count, values, size));
 }
 
 static inline Status set3(const Library *library, void *instance, Type type,
-                          const uint32_t *references, size_t count, const void *values) {
+                          const uint32_t *references, size_t count, const void *values,
+                          size_t size) {
     Set3 *function = functions_of(library)->set[type];
     if (function == NULL) {
         return STATUS_ERROR;
     }
-    return sane(function(instance, references, count, values, count));
+    return sane(function(instance, references, count, values, size));
 }
 
 static inline Status set_string3(const Library *library, void *instance, uint32_t reference,

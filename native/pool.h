@@ -140,7 +140,7 @@ typedef struct Snapshot {
 /* A value that was set before initialization. */
 typedef struct {
     double value;
-    uint32_t reference, type;
+    uint32_t type, reference, place; /* place: see Element */
 } RecordedStart;
 
 /* The episode of an instance so far; see records.h. */

@@ -19,7 +19,7 @@ Status ramps_begin(Solver *me) {
     for (size_t i = 0; i < s->number_of_ramps && status <= STATUS_WARNING; i++) {
         double value = 0.0;
         status = me->model->fmi->get(me->library, me->component, TYPE_FLOAT64,
-                                     &s->ramped_references[i], 1, &value);
+                                     &s->ramped_references[i], 1, &value, 1);
         solver_restore_floats(me);
         me->ramps[i] = (Ramp){value, value, me->memory.time};
     }
@@ -43,7 +43,7 @@ static Status set_some(Solver *me, size_t first, size_t count, const double *val
                        const double *slopes) {
     const uint32_t *references = me->solving->ramped_references + first;
     Status status = me->model->fmi->set(me->library, me->component, TYPE_FLOAT64, references,
-                                        count, values);
+                                        count, values, count);
     int orders[MOST_AT_ONCE]; /* all first derivatives */
 
     for (size_t i = 0; i < count; i++) {

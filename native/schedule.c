@@ -41,8 +41,8 @@ size_t task_give_up(Task *task, size_t begin, size_t end) {
 
 static size_t most_values(const Task *task) {
     const Settings *s = &task->pool->settings;
-    const size_t in = s->inputs->count, out = s->outputs->count;
-    const size_t start = task->call->start == NULL ? 0 : task->call->start->count;
+    const size_t in = s->inputs->width, out = s->outputs->width;
+    const size_t start = task->call->start == NULL ? 0 : task->call->start->width;
     const size_t most = in > out ? in : out;
     return most > start ? most : start;
 }

@@ -8,7 +8,7 @@
  * need no event. */
 typedef struct {
     const uint32_t *references;
-    size_t size, room;
+    size_t count, size, room; /* the sizes in bytes */
     char *bytes;
 } LastSet;
 
@@ -141,14 +141,14 @@ Status solved_do_step(const Library *library, void *component, double time, doub
 }
 
 Status solved_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values) {
+                  size_t count, void *values, size_t size) {
     const Solver *me = component;
 
     if (type == TYPE_CLOCK) {
         clocks_tell(me, references, count, values);
         return STATUS_OK;
     }
-    return fmi_of(me)->get(library, me->component, type, references, count, values);
+    return fmi_of(me)->get(library, me->component, type, references, count, values, size);
 }
 
 static size_t size_of(const Fmi *fmi, Type type) {
@@ -157,8 +157,8 @@ static size_t size_of(const Fmi *fmi, Type type) {
 }
 
 /* Notes values; returns whether they are the same as those noted before. */
-static bool is_repeated(LastSet *last, const uint32_t *references, const void *values,
-                        size_t size) {
+static bool is_repeated(LastSet *last, const uint32_t *references, size_t count,
+                        const void *values, size_t size) {
     if (last->references == references && last->size == size &&
         memcmp(last->bytes, values, size) == 0) {
         return true;
@@ -170,21 +170,25 @@ static bool is_repeated(LastSet *last, const uint32_t *references, const void *v
     }
     last->references = last->room < size ? NULL : references;
     last->size = size;
+    last->count = count;
     if (last->references != NULL) {
         memcpy(last->bytes, values, size);
     }
     return false;
 }
 
-/* Sets some of the values that were last set: those of inputs with this clock, or, if there is no
- * such clock, those of inputs without clocks. */
+/* Sets some of the values that were last set, all of them scalars: those of inputs with this clock,
+ * or, if there is no such clock, those of inputs without clocks. */
 static Status set_one_by_one(Solved *me, Type type, size_t clock) {
     const Solving *s = me->solver.solving;
     const Fmi *fmi = fmi_of(&me->solver);
     const LastSet *last = &me->last[type];
-    const size_t size = size_of(fmi, type), count = last->references == NULL ? 0 : last->size / size;
+    const size_t size = size_of(fmi, type), count = last->references == NULL ? 0 : last->count;
     Status status = STATUS_OK;
 
+    if (count > 0 && last->size != count * size) {
+        return solver_fail(&me->solver, "arrays cannot be set together with inputs that have clocks");
+    }
     for (size_t i = 0; i < count && good(status); i++) {
         bool due = clock == SIZE_MAX && !clocks_own(&me->solver, last->references[i]);
         for (size_t j = 0; j < s->number_of_clocked; j++) {
@@ -192,7 +196,7 @@ static Status set_one_by_one(Solved *me, Type type, size_t clock) {
         }
         if (due) {
             status = fmi->set(me->solver.library, me->solver.component, type, &last->references[i],
-                              1, last->bytes + i * size);
+                              1, last->bytes + i * size, 1);
             floats_restore_if_seen(me->solver.floats);
         }
     }
@@ -232,7 +236,7 @@ static Status set_beside_ramps(Solver *me, Type type, const uint32_t *references
     for (size_t i = 0; i < count && good(status); i++) {
         if (type != TYPE_FLOAT64 || !ramps_own(me, references[i])) {
             status = fmi->set(me->library, me->component, type, &references[i], 1,
-                              (const char *)values + i * size);
+                              (const char *)values + i * size, 1);
         }
     }
     return status;
@@ -240,10 +244,9 @@ static Status set_beside_ramps(Solver *me, Type type, const uint32_t *references
 
 /* New values of inputs and parameters are an event: they may jump. */
 Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
+                  size_t count, const void *values, size_t size) {
     Solved *me = component;
     const Fmi *fmi = fmi_of(&me->solver);
-    const size_t size = count * size_of(fmi, type);
     Status status = STATUS_OK;
 
     if (type == TYPE_CLOCK) {
@@ -253,7 +256,7 @@ Status solved_set(const Library *library, void *component, Type type, const uint
         return set_beside_ramps(&me->solver, type, references, count, values);
     }
     if (me->solver.memory.mode != BEFORE_EVENTS) {
-        if (is_repeated(&me->last[type], references, values, size)) {
+        if (is_repeated(&me->last[type], references, count, values, size * size_of(fmi, type))) {
             return STATUS_OK;
         }
         if (me->solver.memory.mode == IN_CONTINUOUS_TIME) {
@@ -264,7 +267,7 @@ Status solved_set(const Library *library, void *component, Type type, const uint
         me->solver.memory.mode != BEFORE_EVENTS) {
         status = set_one_by_one(me, type, SIZE_MAX);
     } else if (good(status)) {
-        status = fmi->set(library, me->solver.component, type, references, count, values);
+        status = fmi->set(library, me->solver.component, type, references, count, values, size);
     }
     if (!good(status)) {
         me->last[type].references = NULL;

@@ -19,6 +19,7 @@ SLOW_MODULES = {
     "test_examples_planners",
     "test_examples_train_house",
     "test_export",
+    "test_export_fmu",
     "test_export_sb3",
     "test_fuzz",
     "test_fuzz_face",
@@ -36,6 +37,7 @@ SLOW_MODULES = {
     "test_soak",
     "test_stand_in",
     "test_start_times",
+    "test_value_types",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -65,6 +67,7 @@ EVERY_IN_CI = {
     "test_quirks": 4,
     "test_snapshot_machine": 4,
     "test_start_times": 5,
+    "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,
 }

@@ -210,7 +210,7 @@ class Instance(ABC):
             references.ctypes.data_as(ctypes.c_void_p),
             ctypes.c_size_t(len(references)),
             buffer.ctypes.data_as(ctypes.c_void_p),
-            *self._trailing_arguments(len(references)),
+            *self._trailing_arguments(len(buffer)),
         )
         return self._function(f"Get{c_type}"), self._function(f"Set{c_type}"), arguments
 

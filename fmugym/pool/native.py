@@ -50,10 +50,10 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     manner_of,
     record_from,
     solving_settings,
-    types_and_references,
     variable_settings,
     variables_of,
 )
@@ -190,8 +190,8 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = self._fmu.description.fmi_major_version
-            parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, manner_of(self._fmu.description, self._spec))
+            manner = manner_of(self._fmu.description, self._spec)
+            access = _native.Access(version, *listing(variables, version), manner)
             self._accesses[variables] = access
         return access
 
@@ -316,7 +316,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(start_variables(self._variables, record.names))
+        access = self._access(start_variables(self._variable, record.names))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
@@ -611,7 +611,7 @@ class _Listener:
     def _tape(
         self,
         types: bytes,
-        references: bytes,
+        elements: bytes,
         starts: bytes,
         first_outputs: bytes,
         inputs: bytes,
@@ -619,8 +619,9 @@ class _Listener:
         statuses: bytes,
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
+        references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
         return Tape(
-            variables_of(self._description, types, np.frombuffer(references, np.uint32).tolist()),
+            variables_of(self._description, types, references, places),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
+from fmugym.fmi.access import unlisted
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.wine.loader import windows_path, windows_uri
@@ -25,10 +26,10 @@ __all__ = [
     "PlaceOfFMU",
     "experiment_settings",
     "library_settings",
+    "listing",
     "manner_of",
     "record_from",
     "solving_settings",
-    "types_and_references",
     "variable_settings",
     "variables_of",
 ]
@@ -196,11 +197,19 @@ def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
     )
 
 
-def types_and_references(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes]:
-    """The C types of variables, a byte each, and their value references, four bytes each."""
-    types = bytes(_type_number(variable, version) for variable in variables)
-    references = np.array([v.value_reference for v in variables], np.uint32)
-    return types, references.tobytes()
+def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, bytes]:
+    """What ``listing_take`` of ``native/access.h`` takes.
+
+    Returns:
+        The C types of the variables, a byte each; their value references, places in their arrays,
+        and the sizes of these, three times four bytes each; and the values of the elements that
+        FMI needs besides, float64. The others come first.
+    """
+    rest = unlisted(variables)
+    both = [*variables, *rest]
+    types = bytes(_type_number(variable, version) for variable in both)
+    elements = np.array([(v.value_reference, v.place, v.size) for v in both], np.uint32)
+    return types, elements.tobytes(), np.array([v.start_number for v in rest]).tobytes()
 
 
 def _type_number(variable: Variable, version: int) -> int:
@@ -212,23 +221,29 @@ def _type_number(variable: Variable, version: int) -> int:
 
 
 def variables_of(
-    description: ModelDescription, types: Sequence[int], references: Sequence[int]
+    description: ModelDescription,
+    types: Sequence[int],
+    references: Sequence[int],
+    places: Sequence[int],
 ) -> tuple[Variable, ...]:
-    """Find variables by C type and value reference; aliases are as good."""
+    """Find variables by C type, value reference and place in an array; aliases are as good."""
     version = description.fmi_major_version
     known = {
         (_type_number(v, version), v.value_reference): v
         for v in description.variables.values()
-        if v.numeric
+        if v.is_number
     }
     known[_START_TIME, START_TIME.value_reference] = START_TIME
-    return tuple(known[pair] for pair in zip(types, references, strict=True))
+    return tuple(
+        known[type_, reference].elements[place]
+        for type_, reference, place in zip(types, references, places, strict=True)
+    )
 
 
 def record_from(
     description: ModelDescription,
     spec: PoolSpec,
-    starts: Sequence[tuple[int, int, float]],
+    starts: Sequence[tuple[int, int, int, float]],
     steps: int,
     inputs: bytes,
 ) -> Record:
@@ -237,13 +252,13 @@ def record_from(
     Args:
         description: That of the FMU.
         spec: That of the pool.
-        starts: The C type, value reference and value of each start value.
+        starts: The C type, value reference, place in an array and value of each start value.
         steps: The number of steps.
         inputs: Those of each step, float64.
     """
-    types, references, values = zip(*starts, strict=True) if starts else ((), (), ())
+    *identities, values = zip(*starts, strict=True) if starts else ((), (), (), ())
     return Record(
-        tuple(variable.name for variable in variables_of(description, types, references)),
+        tuple(variable.name for variable in variables_of(description, *identities)),
         np.array(values, np.float64),
         np.frombuffer(inputs).reshape(steps, len(spec.inputs)),
     )

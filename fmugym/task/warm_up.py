@@ -24,7 +24,7 @@ from fmugym.pool.patience import failed_reset
 from fmugym.pool.states import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.trial.trial import state_files
 
 __all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
@@ -333,7 +333,9 @@ def rows_of_one(env: Any) -> Readings:
         readings,
         **rows,
         state=rows["values"][: env._output_count],
-        parameters=MappingProxyType({n: _row(v) for n, v in readings.parameters.items()}),
+        parameters=MappingProxyType(
+            ParameterValues((n, _row(v)) for n, v in readings.parameters.items())
+        ),
         variables=variables,
         step_count=np.zeros(1, np.int64),
         done=np.zeros(1, np.bool_),

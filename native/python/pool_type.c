@@ -65,7 +65,7 @@ static PyObject *tape_as_tuple(const Tape *t) {
     const Py_ssize_t number = sizeof(double);
 
     return Py_BuildValue("y#y#y#y#y#y#y#", (const char *)t->start_types, starts,
-                         (const char *)t->start_references, starts * (Py_ssize_t)sizeof(uint32_t),
+                         (const char *)t->start_variables, starts * (Py_ssize_t)sizeof(Element),
                          (const char *)t->starts, starts * number, (const char *)t->first_outputs,
                          out * number, (const char *)t->inputs, rows * in * number,
                          (const char *)t->outputs, rows * out * number, (const char *)t->statuses,
