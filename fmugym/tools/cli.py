@@ -2,7 +2,7 @@
 
 ::
 
-    fmugym info model.fmu [--all] [--filter GLOB]
+    fmugym info model.fmu|system.ssp|task.toml [--all] [--filter GLOB] [--plot system.svg]
     fmugym new model.fmu [--class] [--output task.toml]
     fmugym validate TASK|model.fmu
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
@@ -12,8 +12,8 @@
         [KEY=VALUE ...]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
-    fmugym export AGENT --task TASK --output agent.c|agent.fmu [--algorithm PPO] [--all-inputs]
-        [--fmi 2.0|3.0] [--platform NAME ...]
+    fmugym export AGENT --task TASK --output agent.c|agent.fmu|agent.onnx [--algorithm PPO]
+        [--all-inputs] [--fmi 2.0|3.0] [--platform NAME ...]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
@@ -62,6 +62,8 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
   ``nominal``, ``start`` (in the variable's type; a text for arrays and for what is malformed or not
   finite), ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
   ``settable_in_step``
+- ``system``: for systems only: ``components``, ``connections``, ``connectors``, ``master``,
+  ``order`` (groups of components, each with ``is_loop``) and ``loops`` (lists of connections)
 """
 
 from __future__ import annotations
