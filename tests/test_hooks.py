@@ -407,7 +407,7 @@ class TestGoals:
             env.reset(seed=0)
             CALLS.clear()
             observation, reward, *_ = env.step(env.action_space.sample())
-            assert CALLS == [float]
+            assert [float] == CALLS
             assert (reward, observation["achieved_goal"]) == (-5.0, env.state[0])
 
     def test_so_does_a_step_on_arrays(self):
@@ -415,7 +415,7 @@ class TestGoals:
             envs.reset(seed=0)
             CALLS.clear()
             observations, rewards, *_ = envs.step(envs.action_space.sample())
-            assert CALLS == [np.ndarray]
+            assert [np.ndarray] == CALLS
             assert rewards.tolist() == [-5.0] * 3
             np.testing.assert_array_equal(
                 observations["achieved_goal"][:, 0], [state[0] for state in envs.get_attr("state")]
