@@ -13,10 +13,10 @@ import gymnasium
 import numpy as np
 import pytest
 from export_tools import network_for, plant_of
-from test_export import heating
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
+from test_export import heating
 
 import fmugym
 from fmugym import ConfigError
