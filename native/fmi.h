@@ -56,6 +56,10 @@ typedef struct {
     double tolerance;
     bool has_stop_time;
     bool has_tolerance;
+    /* FMI 3.0: the structural parameters that get other values than their start values. */
+    size_t number_of_structural;
+    const char *structural_references; /* 32-bit integers, not aligned */
+    const char *structural_values;     /* 64-bit integers, not aligned */
 } Experiment;
 
 /* Callbacks for initialization; each returns a status. */

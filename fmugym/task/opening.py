@@ -20,6 +20,7 @@ from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.interface import structural_values
 from fmugym.trial.opening import make_pool
 
 __all__ = ["PoolOpening", "deferred_pools", "env_numbers", "open_fmu", "pools_are_deferred"]
@@ -75,6 +76,13 @@ def open_fmu(
         "probe_timeout": config.probe_timeout,
         "interface": _interface_of(cls, config.interface, interface),
     }
+    fmu = _open(file, arguments)
+    sizes = structural_values(fmu.description, config.model_parameters)
+    return _open(file, arguments | {"sizes": sizes}) if sizes else fmu
+
+
+def _open(file: Path, arguments: dict[str, Any]) -> FMU:
+    """Open an FMU, or take the one that the environments of a vector environment share."""
     known = _fmus.get()
     if known is None:
         return FMU(file, **arguments)

@@ -102,12 +102,14 @@ class Candidate:
     preload: tuple[str, ...]
     timeout: float | None
     interface: str = "co_simulation"
+    sizes: tuple[tuple[str, int], ...] = ()
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
         interface = fmu.description.interface
-        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface)
+        sizes = tuple(fmu.sizes.items())
+        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, sizes)
 
     def open(self) -> FMU:
         """Open the FMU without another trial."""
@@ -117,6 +119,7 @@ class Candidate:
             preload=self.preload,
             probe_timeout=None,
             interface=self.interface,
+            sizes=dict(self.sizes),
         )
 
     @property
@@ -236,13 +239,13 @@ def meet(fmu: FMU) -> None:
 
 def known_verdict(fmu: FMU) -> Verdict | None:
     """The verdict of the last trial of an FMU on this machine; None if there was none."""
-    return Verdict.from_text(recall(_content_key(fmu.path, fmu.description.interface)))
+    return Verdict.from_text(recall(_content_key(Candidate.of(fmu))))
 
 
 def state_files(fmu: FMU) -> str:
     """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
-        return str(cache_folder() / "states" / _content_key(fmu.path, fmu.description.interface))
+        return str(cache_folder() / "states" / _content_key(Candidate.of(fmu)))
     except RuntimeError:  # there is no folder for caches
         return ""
 
@@ -253,7 +256,7 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
     Raises:
         RuntimeError: If there is no folder for caches.
     """
-    return cache_folder() / "marks", _content_key(candidate.path, candidate.interface)
+    return cache_folder() / "marks", _content_key(candidate)
 
 
 def locks_of(candidate: Candidate) -> str:
@@ -329,13 +332,13 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
 
 def is_known_to_harm(candidate: Candidate) -> bool:
     """Whether the cache says that an FMU harms its process."""
-    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
+    known = Verdict.from_text(recall(_content_key(candidate)))
     return known is not None and known.isolate
 
 
 def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
     """Add the harm to its process that the FMU has done with any other config."""
-    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
+    known = Verdict.from_text(recall(_content_key(candidate)))
     if known is None or not known.isolate or verdict.isolate:
         return verdict
     reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
@@ -367,7 +370,7 @@ def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> No
     verdict = _with_harm(verdict, candidate)
     for key in (
         _verdict_key(candidate, spec, starts),
-        _content_key(candidate.path, candidate.interface),
+        _content_key(candidate),
     ):
         remember(key, verdict.to_text())
 
@@ -426,9 +429,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         *(name, verdict.instances, verdict.initializations),
     )
     if verdict.complete:
-        remember(
-            _content_key(request.candidate.path, request.candidate.interface), verdict.to_text()
-        )
+        remember(_content_key(request.candidate), verdict.to_text())
     return verdict
 
 
@@ -684,7 +685,7 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
         keep_states=False,
     )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
-    return f"{_content_key(candidate.path, candidate.interface)}-{asked}"
+    return f"{_content_key(candidate)}-{asked}"
 
 
 def content_of(path: Path) -> str:
@@ -693,12 +694,14 @@ def content_of(path: Path) -> str:
     return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
 
-def _content_key(path: Path, interface: str) -> str:
-    """The scope of a verdict: content, interface, platform, and version of the package."""
-    scope = f"{content_of(path)} {fmpy.platform_tuple} {_version()}"
-    return _digest(
-        f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode()
-    )
+def _content_key(candidate: Candidate) -> str:
+    """The scope of a verdict: content, interface, sizes, platform, and version of the package."""
+    scope = f"{content_of(candidate.path)} {fmpy.platform_tuple} {_version()}"
+    if candidate.interface != "co_simulation":
+        scope += f" {candidate.interface}"
+    if candidate.sizes:
+        scope += f" {sorted(candidate.sizes)}"
+    return _digest(scope.encode())
 
 
 @functools.lru_cache(maxsize=256)
