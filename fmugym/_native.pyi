@@ -171,6 +171,7 @@ class Library(TypedDict):
     categories: tuple[bytes, ...]
     mark: Mark | None
     solving: tuple[Any, ...] | None
+    system: tuple[Any, ...] | None
 
 class Experiment(TypedDict):
     """The times of an episode."""

@@ -68,7 +68,12 @@ typedef struct {
     void *context;
     Status (*prepare)(void *prepared); /* in initialization mode of FMI 3.0, or NULL */
     void *prepared;
+    Status (*exchange)(void *context); /* with other FMUs in initialization mode, or NULL */
 } StartValues;
+
+static inline Status exchange_in(StartValues start_values) {
+    return start_values.exchange == NULL ? STATUS_OK : start_values.exchange(start_values.context);
+}
 
 typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
 
@@ -138,14 +143,21 @@ typedef struct Fmi {
                         size_t size);
     Status (*deserialize)(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
+
+    /* Of systems only, otherwise NULL: which FMU failed last, or NULL; and freeing what may still be
+     * freed after a fatal error. */
+    const char *(*blamed)(const void *component);
+    void (*drop)(const Library *library, void *component);
 } Fmi;
 
 /* How an FMU is run. fmugym/pool/settings.py has the same numbers. */
 typedef enum { CO_SIMULATION_ALONE, MODEL_EXCHANGE_SOLVED, CO_SIMULATION_WITH_EVENTS } Manner;
 
 extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
+/* Of systems. */
+extern const Fmi composite;
 
-/* NULL if the version has no such manner. */
+/* NULL if the version has no such manner. Version 0 are systems. */
 const Fmi *fmi_table(int64_t version, int64_t manner);
 
 static inline bool has_outputs(Outcome outcome) {

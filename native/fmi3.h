@@ -157,6 +157,9 @@ static inline Status initialize(const Library *library, void *instance,
         status = start_values.prepare(start_values.prepared);
     }
     if (status <= STATUS_WARNING) {
+        status = exchange_in(start_values);
+    }
+    if (status <= STATUS_WARNING) {
         *doing = "initialization";
         status = sane(f->exit_initialization(instance));
     }

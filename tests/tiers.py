@@ -37,6 +37,7 @@ SLOW_MODULES = {
     "test_stand_in",
     "test_start_times",
     "test_value_types",
+    "test_systems",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -67,6 +68,7 @@ EVERY_IN_CI = {
     "test_snapshot_machine": 4,
     "test_start_times": 5,
     "test_value_types": 3,
+    "test_systems": 5,
     "test_words": 5,
     "test_zoo": 5,
 }
@@ -75,6 +77,9 @@ EVERY_IN_CI = {
 The numbers have no factor in common with those of FMI versions and ways of running, so that each of
 these occurs with others in turn.
 """
+
+EVERY_IN_SYSTEMS = 17
+"""The same for the contract of pools with the FMU as a component of a system."""
 
 SLOW_TESTS = (
     "test_baselines_tuning.py::test_it_finds",
@@ -219,4 +224,5 @@ def is_exhaustive(node_id, number):
     module = node_id.partition(".py")[0]
     if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
-    return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0
+    every = EVERY_IN_SYSTEMS if "[system in " in node_id else EVERY_IN_CI.get(module, 1)
+    return is_slow(node_id, number) and number % every > 0

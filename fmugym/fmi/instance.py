@@ -68,6 +68,9 @@ class Instance(ABC):
     """The C type of enumerations in this FMI version."""
     _deserialize: ClassVar = "Deserialize"
 
+    exchange: Callable[[], None] | None = None
+    """Called in Initialization Mode, to exchange values with other FMUs. FMI 1.0 has none."""
+
     def __init__(
         self,
         description: ModelDescription,
@@ -294,6 +297,11 @@ class Instance(ABC):
             )
         self.check("reset", self._reset_function(self._component))
         self.phase = Phase.INSTANTIATED
+
+    def exchange_values(self) -> None:
+        """Exchange values with other FMUs in Initialization Mode."""
+        if self.exchange is not None:
+            self.exchange()
 
     def free(self) -> None:
         """Terminate and free the instance. It may be called more than once."""

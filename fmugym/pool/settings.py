@@ -20,6 +20,7 @@ from fmugym.archive.description import ModelDescription, Variable
 from fmugym.fmi.access import unlisted
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
+from fmugym.systems.description import SystemDescription
 from fmugym.wine.loader import windows_path, windows_uri
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "manner_of",
     "record_from",
     "solving_settings",
+    "table_of",
     "variable_settings",
     "variables_of",
 ]
@@ -103,7 +105,7 @@ def _place_of_resources(folder: Path, version: int) -> Path:
 def library_settings(description: ModelDescription, place: PlaceOfFMU) -> dict[str, Any]:
     """What to load, and what is known of it."""
     return {
-        "version": description.fmi_major_version,
+        "version": table_of(description),
         "manner": manner_of(description),
         "model": description.model_identifier.encode(),
         "token": description.instantiation_token.encode(),
@@ -199,8 +201,18 @@ def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
     )
 
 
+def table_of(description: ModelDescription) -> int:
+    """The table of functions in C: the major FMI version, or 0 for systems."""
+    is_system = isinstance(description, SystemDescription)
+    return 0 if is_system else description.fmi_major_version
+
+
 def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, bytes]:
     """What ``listing_take`` of ``native/access.h`` takes.
+
+    Args:
+        variables: The variables.
+        version: See ``table_of``; the values of systems are all of type Float64.
 
     Returns:
         The C types of the variables, a byte each; their value references, places in their arrays,
@@ -217,6 +229,8 @@ def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, 
 def _type_number(variable: Variable, version: int) -> int:
     if is_start_time(variable):
         return _START_TIME
+    if version == 0:
+        return _TYPES.index("Float64")
     if variable.kind == "enumeration":
         return _TYPES.index("Int64" if version == 3 else "Int32")
     return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
@@ -229,7 +243,7 @@ def variables_of(
     places: Sequence[int],
 ) -> tuple[Variable, ...]:
     """Find variables by C type, value reference and place in an array; aliases are as good."""
-    version = description.fmi_major_version
+    version = table_of(description)
     known = {
         (_type_number(v, version), v.value_reference): v
         for v in description.variables.values()

@@ -42,6 +42,8 @@ from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
+from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.plan import SystemPlan
 from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -102,17 +104,20 @@ class Candidate:
     preload: tuple[str, ...]
     timeout: float | None
     interface: str = "co_simulation"
+    plan: SystemPlan | None = None
     sizes: tuple[tuple[str, int], ...] = ()
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
-        interface = fmu.description.interface
-        sizes = tuple(fmu.sizes.items())
-        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, sizes)
+        sizes = tuple(getattr(fmu, "sizes", {}).items())
+        interface, plan = fmu.description.interface, getattr(fmu, "plan", None)
+        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, plan, sizes)
 
     def open(self) -> FMU:
         """Open the FMU without another trial."""
+        if self.plan is not None:
+            return SystemFMU(self.plan, probe_timeout=None)
         return FMU(
             self.path,
             limits=self.limits,
@@ -129,7 +134,8 @@ class Candidate:
         Raises:
             ConfigError: If the environment variable ``FMUGYM_PROBE`` has an unknown value.
         """
-        return _trials_are_off() or self.timeout is None or is_bundled(self.path)
+        files = [self.path] if self.plan is None else [c.path for c in self.plan.components]
+        return _trials_are_off() or self.timeout is None or all(map(is_bundled, files))
 
 
 def _trials_are_off() -> bool:
@@ -280,7 +286,7 @@ def locks_of(candidate: Candidate) -> str:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         raise ConfigError(f"the limits of a licence need the folder {folder}: {error}") from None
-    return str(folder / content_of(candidate.path))
+    return str(folder / content_of(candidate))
 
 
 def examine(
@@ -688,7 +694,18 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     return f"{_content_key(candidate)}-{asked}"
 
 
-def content_of(path: Path) -> str:
+def content_of(candidate: Candidate) -> str:
+    """The SHA-256 of a file, or that of a system: of its plan and its files."""
+    plan = candidate.plan
+    if plan is None:
+        return _content_of_file(candidate.path)
+    names = tuple(replace(part, path=Path(part.path.name)) for part in plan.components)
+    texts = [repr(replace(plan, components=names, file=None))]
+    texts += [_content_of_file(part.path) for part in plan.components]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def _content_of_file(path: Path) -> str:
     """The SHA-256 of a file; it is read again only when it has changed."""
     status = path.stat()
     return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
@@ -696,7 +713,7 @@ def content_of(path: Path) -> str:
 
 def _content_key(candidate: Candidate) -> str:
     """The scope of a verdict: content, interface, sizes, platform, and version of the package."""
-    scope = f"{content_of(candidate.path)} {fmpy.platform_tuple} {_version()}"
+    scope = f"{content_of(candidate)} {fmpy.platform_tuple} {_version()}"
     if candidate.interface != "co_simulation":
         scope += f" {candidate.interface}"
     if candidate.sizes:

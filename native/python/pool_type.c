@@ -181,6 +181,7 @@ static void pool_dealloc(PyObject *object) {
     for (int i = 0; i < BUFFERS; i++) {
         release_buffer(&self->buffers[i]);
     }
+    drop_system(self->system);
     free(self->paths);
     free(self->categories);
     free(self->strings);
@@ -196,7 +197,7 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *categories, *mark, *solving, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
@@ -222,12 +223,12 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "manner",  "model",  "token",      "resources", "paths",
-                            "private", "logging", "states", "categories", "mark", "solving",
+                            "private", "logging", "states", "categories", "mark", "solving", "system",
                             "structural_references", "structural_values", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iiyyyO!pppO!OOy#y#:library", names, &a->version, &a->manner, &s->model,
+    return parse_group(group, "$iiyyyO!pppO!OOOy#y#:library", names, &a->version, &a->manner, &s->model,
                        &s->token, &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving,
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system,
                        &s->experiment.structural_references, &a->size_of_references,
                        &s->experiment.structural_values, &a->size_of_values);
 }
@@ -317,8 +318,7 @@ static bool take_optional(PyObject *object, bool *given, double *value) {
     return !PyErr_Occurred();
 }
 
-/* Returns the texts of a tuple of bytes. Returns NULL with an exception if it holds others. */
-static const char **take_texts(PyObject *tuple) {
+const char **take_texts(PyObject *tuple) {
     const Py_ssize_t count = PyTuple_Size(tuple);
     const char **texts = calloc((size_t)count + 1, sizeof *texts);
 
@@ -385,8 +385,8 @@ static bool take_method(const char *name, Solving *solving) {
     return solving->method != NULL;
 }
 
-/* Takes the tuple that fmugym/pool/settings.py makes. The references stay in the pool's arguments. */
-static bool take_solving(PyObject *tuple, Solving *solving) {
+/* The references stay in the pool's arguments. */
+bool take_solving(PyObject *tuple, Solving *solving) {
     const char *method, *states, *rates, *clocks, *clocked;
     Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size;
     int completes;
@@ -442,6 +442,7 @@ static bool settle(PyPool *self, const Arguments *a) {
 
     s->fmi = fmi_of(a->version, a->manner);
     s->experiment.number_of_structural = (size_t)a->size_of_values / sizeof(uint64_t);
+    s->system = self->system;
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;
     s->can_save = a->can_save && s->fmi->get_state != NULL;
@@ -506,6 +507,19 @@ static PyObject *copy_of_groups(PyObject *kwargs) {
     return copy;
 }
 
+static bool check_system(const PyPool *self, const Arguments *a) {
+    const bool sound = (a->version == 0) == (self->system != NULL);
+    if (!sound) {
+        PyErr_SetString(PyExc_ValueError, "version 0 is that of systems");
+    }
+    return sound;
+}
+
+static Py_ssize_t number_of_paths(const PyPool *self, const Arguments *a) {
+    const Py_ssize_t parts = self->system == NULL ? 1 : (Py_ssize_t)self->system->count;
+    return parts * (a->private_libraries ? a->count : 1);
+}
+
 static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     PyPool *self = (PyPool *)allocate(type, 0);
@@ -516,7 +530,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     }
     self->arguments = copy_of_groups(kwargs);
     if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
-        check_start_outputs(self, &a) && check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
+        check_start_outputs(self, &a) && check_accesses(&a) && take_system(a.system, &self->system) && check_system(self, &a) && take_paths(self, a.paths, number_of_paths(self, &a)) &&
         take_categories(self, a.categories) && take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
         open_pool(self)) {
         return (PyObject *)self;
