@@ -17,6 +17,7 @@ SLOW_MODULES = {
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
+    "test_examples_system",
     "test_examples_train_house",
     "test_export",
     "test_export_fmu",
@@ -35,9 +36,13 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_pettingzoo",
     "test_start_times",
     "test_value_types",
     "test_systems",
+    "test_systems_description",
+    "test_systems_faces",
+    "test_systems_ssp",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -187,6 +192,8 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_examples_system.py",
+    "test_systems_ssp.py::TestDamaged",
     "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",

@@ -24,6 +24,7 @@ PAGES: Final = {
     "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
     "Recordings": ("Recorder", "Recording", "replay"),
     "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
+    "Systems": ("FMUSystem", "Component", "Connection"),
     "Rigs": ("Backend", "Paced"),
     "Errors": (),  # and all other exceptions
 }
@@ -31,6 +32,7 @@ MODULES: Final = {
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
+    "PettingZoo": "fmugym.pettingzoo",
     "RLlib": "fmugym.rllib",
     "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",

@@ -2,7 +2,7 @@
 
 ::
 
-    fmugym info model.fmu [--all] [--filter GLOB]
+    fmugym info model.fmu|system.ssp|task.toml [--all] [--filter GLOB] [--plot system.svg]
     fmugym new model.fmu [--class] [--output task.toml]
     fmugym validate TASK|model.fmu
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
@@ -62,6 +62,8 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
   ``nominal``, ``start`` (in the variable's type; a text for arrays and for what is malformed or not
   finite), ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
   ``settable_in_step``
+- ``system``: for systems only: ``components``, ``connections``, ``connectors``, ``master``,
+  ``order`` (groups of components, each with ``is_loop``) and ``loops`` (lists of connections)
 """
 
 from __future__ import annotations
