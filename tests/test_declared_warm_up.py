@@ -99,6 +99,23 @@ def test_a_schedule_acts_by_the_clock():
     later.close()
 
 
+@pytest.mark.parametrize("name", ["thermostat", "hysteresis"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"agent": {"observations": ["T", "T_set", "T_out"]}},
+        {"setpoints": {"T_set": {"schedule": {"06:00": 21, "22:00": 18}, "of": "T"}}},
+    ],
+)
+def test_a_thermostat_whose_arguments_the_task_tells(name, change):
+    full = "hysteresis of=T setpoint=T_set band=0 below=1 above=0"
+    env, same = fmugym.load(house(name, **change)), fmugym.load(house(full, **change))
+    assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
+    assert env._values == same._values
+    env.close()
+    same.close()
+
+
 def test_named_controllers_and_constants():
     named = house("thermostat", controllers={"thermostat": THERMOSTAT, "half": 0.5})
     for task, controller in ((named, THERMOSTAT), (house(0.5), "schedule 00:00=0.5")):
@@ -312,7 +329,8 @@ class TestCache:
         ({"period": "1d", "controler": 0}, "'controller'"),
         ({"period": "40min", "controller": 0}, "2400 s"),
         ({"period": "1d", "controller": "thermostt"}, "thermostat"),
-        ({"period": "1d", "controller": "pid of=T"}, "'setpoint'"),
+        ({"period": "1d", "controller": "pid of=T"}, "'setpoint'.*pid of=T setpoint=21 kp="),
+        ({"period": "1d", "controller": "hysteresis"}, "'of'.*of=T setpoint=T_set band=.*below=1"),
         ({"period": "1d", "controller": "pid of=TT setpoint=1 kp=1"}, "'T'"),
         ({"period": "1d", "controller": "hysteresis of=T setpoint=T_sot band=1"}, "'T_set'"),
         ({"period": "1d", "controller": {"v": 0}}, "'u'"),
