@@ -150,8 +150,9 @@ class WarmUps:
         self._prefix: str | None = None
         self._scope = b""
         self._keys: dict[int, bytes] = {}
-        self._has_told = self._is_prepared = False
+        self._has_told = False
         self._in_pass: Any = None
+        self._prepared_for: Pool | None = None
         self._left = STEPS_BEFORE
 
     # States that are known
@@ -257,8 +258,8 @@ class WarmUps:
         """What does warm-ups in the pool's pass; None until that is worth its time, or for good."""
         if self._left > 0:
             self._left -= count * self._warm_up.steps
-        elif not self._is_prepared:
-            self._is_prepared = True
+        elif self._prepared_for is not pool:
+            self._prepared_for = pool
             self._in_pass = import_module(_COMPILER).compiled(self._env, self._warm_up, pool)
         return self._in_pass
 

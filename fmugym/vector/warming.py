@@ -258,6 +258,7 @@ class CompiledWarmUp:
     def _fill(self, readings: Readings, indices: IndexArray) -> None:
         """Write down what the programs read at the beginning."""
         self._counts[indices] = -self._warm_up.steps
+        self._pool.inputs[:, indices] = readings.inputs
         self._kept[: len(readings.previous_state), indices] = readings.previous_state
         for rows, start in zip(self._state, self._warm_up.starts, strict=True):
             rows[indices] = start
