@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.vector.utils import batch_space
 
 import fmugym
 from fmugym.pool.native import NativePool
@@ -50,8 +51,8 @@ class ByHand(ABC):
         fmu = fmugym.FMU(env.fmu.path)
         interface = resolve(env.config, fmu.description)
         spec = interface.pool_spec()
-        self.num_envs, self.limit = num_envs, limit
-        self.rng = np.random.default_rng(0)
+        self.env, self.num_envs, self.limit = env, num_envs, limit
+        self.action_space = batch_space(env.action_space, num_envs)
         self.pool = NativePool(fmu, spec, num_envs, logging.getLogger(__name__), threads=1)
         self.outputs = self.pool.outputs
         parameters, variables = interface.parameters, env.config.episode_variables
@@ -65,6 +66,7 @@ class ByHand(ABC):
 
     def reset(self, drawn: Mapping[str, Floats] | None = None) -> Any:
         """Start all episodes, with these values instead of drawn ones where they are given."""
+        self.rng = np.random.default_rng(0)
         self._start(np.ones(self.num_envs, np.bool_), drawn or {})
         self.ended = np.zeros(self.num_envs, np.bool_)
         self.step_count[:] = 0
@@ -175,6 +177,11 @@ class CloudPendulumByHand(ByHand):
     """``fmugym/CloudPendulum-v0``."""
 
     last: Any = 0.0
+
+    def reset(self, drawn: Mapping[str, Floats] | None = None) -> Any:
+        """See ``ByHand.reset``; no torque is on its way then."""
+        self.last = 0.0
+        return super().reset(drawn)
 
     def _inputs(self, action: Any) -> Any:
         last = np.where(self.ended, 0.0, self.last)

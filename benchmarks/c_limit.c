@@ -15,7 +15,14 @@
  *     r:reference=value      a Real parameter
  *     i:reference=value      an Integer or Enumeration parameter
  *
- * It prints steps per second, by the wall clock and by processor time. */
+ * It prints steps per second, by the wall clock and by processor time.
+ *
+ * With one more item, @path, it repeats the steps that a file tells, by one thread, over and over for
+ * these seconds. The file has int64 numbers: instances, steps, start values of an instance; then the
+ * start values of all instances; then for each step a byte for each instance, 1 where an episode
+ * starts instead of a step, the inputs of all instances, and the start values of those that start.
+ * The program then prints the least time in s that each 16 steps of all instances have taken, without
+ * the starts of episodes. */
 
 #define _GNU_SOURCE
 
@@ -29,7 +36,7 @@
 #include <string.h>
 #include <time.h>
 
-enum { MOST_ITEMS = 64 };
+enum { MOST_ITEMS = 64, BLOCK = 16 };
 
 typedef struct {
     void (*logger)(void *, const char *, int, const char *, const char *, ...);
@@ -97,14 +104,10 @@ static uint64_t draw(Part *part) {
     return part->random;
 }
 
-static void initialize(Part *part, size_t index) {
+static void initialize_with(Part *part, size_t index, const double *values) {
     void *component = part->components[index];
-    double values[MOST_ITEMS];
     int whole[MOST_ITEMS];
 
-    for (size_t i = 0; i < starts.count; i++) {
-        values[i] = ((double)(draw(part) >> 11) / 9007199254740992.0 - 0.5) * starts.numbers[i];
-    }
     for (size_t i = 0; i < integers.count; i++) {
         whole[i] = (int)integers.numbers[i];
     }
@@ -117,6 +120,15 @@ static void initialize(Part *part, size_t index) {
     check(enter(component), "enter");
     check(leave(component), "exit");
     part->steps[index] = 0;
+}
+
+static void initialize(Part *part, size_t index) {
+    double values[MOST_ITEMS];
+
+    for (size_t i = 0; i < starts.count; i++) {
+        values[i] = ((double)(draw(part) >> 11) / 9007199254740992.0 - 0.5) * starts.numbers[i];
+    }
+    initialize_with(part, index, values);
 }
 
 static void step(Part *part, size_t index) {
@@ -141,6 +153,12 @@ static void step(Part *part, size_t index) {
     }
 }
 
+static void initialize_all(Part *part) {
+    for (size_t i = 0; i < part->count; i++) {
+        initialize(part, i);
+    }
+}
+
 static double now(clockid_t which) {
     struct timespec time;
     clock_gettime(which, &time);
@@ -162,6 +180,101 @@ static void *run(void *argument) {
     part->rate = (double)done / (now(CLOCK_MONOTONIC) - begin);
     part->cpu = now(CLOCK_THREAD_CPUTIME_ID) - cpu;
     return NULL;
+}
+
+/* Steps that are repeated: the header of a file, and what follows it. */
+typedef struct {
+    int64_t instances, steps, starts;
+    const char *first;
+} Recorded;
+
+static Recorded read_record(const char *path) {
+    FILE *file = fopen(path, "rb");
+    Recorded record;
+    int64_t header[3];
+
+    if (file == NULL || fread(header, sizeof header, 1, file) != 1) {
+        fprintf(stderr, "cannot read %s\n", path);
+        exit(1);
+    }
+    fseek(file, 0, SEEK_END);
+    const size_t size = (size_t)ftell(file) - sizeof header;
+    char *rest = malloc(size);
+    fseek(file, sizeof header, SEEK_SET);
+    if (rest == NULL || fread(rest, 1, size, file) != size) {
+        fprintf(stderr, "cannot read %s\n", path);
+        exit(1);
+    }
+    fclose(file);
+    record = (Recorded){header[0], header[1], header[2], rest};
+    return record;
+}
+
+/* Starts the episodes that the mask tells, or all if there is none. Returns what follows. */
+static const char *start_again(Part *part, const Recorded *record, const char *mask,
+                               const char *values) {
+    double numbers[MOST_ITEMS];
+    const size_t size = (size_t)record->starts * sizeof *numbers;
+
+    for (size_t i = 0; i < part->count; i++) {
+        if (mask == NULL || mask[i]) {
+            memcpy(numbers, values, size);
+            check(reset(part->components[i]), "reset");
+            initialize_with(part, i, numbers);
+            values += size;
+        }
+    }
+    return values;
+}
+
+static void repeat_step(Part *part, const char *mask, const char *given) {
+    const size_t size = inputs.count * sizeof(double);
+    double values[MOST_ITEMS], numbers[MOST_ITEMS];
+
+    for (size_t i = 0; i < part->count; i++, given += size) {
+        if (!mask[i]) {
+            memcpy(numbers, given, size);
+            const double time = (double)part->steps[i]++ * step_size;
+            check(set_real(part->components[i], inputs.references, inputs.count, numbers), "set");
+            check(do_step(part->components[i], time, step_size, 1), "step");
+            check(get_real(part->components[i], outputs.references, outputs.count, values), "get");
+        }
+    }
+}
+
+static void repeat_once(Part *part, const Recorded *record, double *least) {
+    const char *place = start_again(part, record, NULL, record->first);
+    const size_t given = inputs.count * sizeof(double) * part->count;
+    double taken = 0.0;
+
+    for (int64_t k = 0; k < record->steps; k++) {
+        const char *mask = place, *values = place + part->count;
+        place = start_again(part, record, mask, values + given);
+        const double begin = now(CLOCK_MONOTONIC);
+        repeat_step(part, mask, values);
+        taken += now(CLOCK_MONOTONIC) - begin;
+        if ((k + 1) % BLOCK == 0) {
+            least[k / BLOCK] = fmin(least[k / BLOCK], taken);
+            taken = 0.0;
+        }
+    }
+}
+
+static void repeat_steps(Part *part, const Recorded *record) {
+    const size_t blocks = (size_t)record->steps / BLOCK;
+    const double begin = now(CLOCK_MONOTONIC);
+    double *least = malloc((blocks + 1) * sizeof *least);
+
+    for (size_t i = 0; i < blocks; i++) {
+        least[i] = HUGE_VAL;
+    }
+    do {
+        repeat_once(part, record, least);
+    } while (now(CLOCK_MONOTONIC) - begin < seconds);
+    for (size_t i = 0; i < blocks; i++) {
+        printf("%.9f ", least[i]);
+    }
+    free(least);
 }
 
 static void *find(void *library, const char *name) {
@@ -226,7 +339,6 @@ static void prepare(Part *part, const char *token, size_t count, size_t seed) {
     part->observations = calloc(count * outputs.count + 1, sizeof *part->observations);
     for (size_t i = 0; i < count; i++) {
         part->components[i] = instantiate("c", 1, token, "file:///", &callbacks, 0, 0);
-        initialize(part, i);
     }
 }
 
@@ -238,7 +350,8 @@ int main(int argc, char *argv[]) {
     const size_t count = (size_t)atol(argv[3]), threads = (size_t)atol(argv[4]);
     seconds = atof(argv[5]);
     step_size = atof(argv[6]);
-    for (int i = 7; i < argc; i++) {
+    const int last = argc - (argv[argc - 1][0] == '@');
+    for (int i = 7; i < last; i++) {
         take_item(argv[i]);
     }
     load(argv[1]);
@@ -247,7 +360,15 @@ int main(int argc, char *argv[]) {
     for (size_t i = 0; i < threads; i++) {
         prepare(&parts[i], argv[2], count / threads + (i < count % threads), i);
     }
+    if (last < argc) {
+        const Recorded record = read_record(argv[last] + 1);
+        repeat_steps(parts, &record);
+        return 0;
+    }
     double rate = 0.0, done = 0.0, cpu = 0.0;
+    for (size_t i = 0; i < threads; i++) {
+        initialize_all(&parts[i]);
+    }
     for (size_t i = 0; i < threads; i++) {
         pthread_create(&ids[i], NULL, run, &parts[i]);
     }

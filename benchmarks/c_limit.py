@@ -24,9 +24,22 @@ from measure import MissingError
 
 import fmugym
 
-__all__ = ["Loop", "Rates", "build", "build_folder", "cart_pole", "compile_c", "measure"]
+__all__ = [
+    "BLOCK",
+    "Loop",
+    "Rates",
+    "build",
+    "build_folder",
+    "cart_pole",
+    "compile_c",
+    "measure",
+    "repeat",
+]
 
 SOURCE = Path(__file__).with_suffix(".c")
+
+BLOCK = 16
+"""How many steps of all instances ``repeat`` measures at a time, as in ``c_limit.c``."""
 
 
 class Loop(NamedTuple):
@@ -152,11 +165,30 @@ def measure(loop: Loop, num_envs: int, threads: int = 1, seconds: float = 1.0) -
     Raises:
         MissingError: See ``compile_c``.
     """
+    return Rates(*_run(loop, num_envs, threads, seconds))
+
+
+def repeat(loop: Loop, num_envs: int, record: Path, seconds: float = 1.0) -> list[float]:
+    """Let the program repeat recorded steps on one thread.
+
+    Args:
+        loop: Its starts and inputs name the variables whose values are in the record.
+        num_envs: Number of instances.
+        record: A file; ``c_limit.c`` describes it.
+        seconds: Length of the run, at least one repetition.
+
+    Returns:
+        The least time in s of each ``BLOCK`` steps of all instances, without resets.
+    """
+    return _run(loop, num_envs, 1, seconds, f"@{record}")
+
+
+def _run(loop: Loop, num_envs: int, threads: int, seconds: float, *arguments: str) -> list[float]:
     fmu = loop.fmu
     command = [str(build()), str(fmu.extract() / fmu.library), fmu.description.instantiation_token]
     command += [str(num_envs), str(threads), str(seconds), str(loop.time_step), *loop.items()]
-    result = subprocess.run(command, check=True, capture_output=True, text=True)
-    return Rates(*map(float, result.stdout.split()))
+    result = subprocess.run([*command, *arguments], check=True, capture_output=True, text=True)
+    return [float(number) for number in result.stdout.split()]
 
 
 def main() -> None:

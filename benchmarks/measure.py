@@ -6,7 +6,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 __all__ = [
     "Effort",
@@ -116,7 +116,9 @@ def thread_counts() -> dict[int, str]:
     return {1: "1 thread"} | ({count: f"{count} threads"} if count > 1 else {})
 
 
-def make_runs(makers: Mapping[str, Callable[[], Run]]) -> tuple[dict[str, Run], dict[str, str]]:
+def make_runs(
+    makers: Mapping[str, Callable[[], Callable[[float], Result]]],
+) -> tuple[dict[str, Callable[[float], Result]], dict[str, str]]:
     """Make the runs that can be made.
 
     Returns:
@@ -131,12 +133,17 @@ def make_runs(makers: Mapping[str, Callable[[], Run]]) -> tuple[dict[str, Run], 
     return runs, missing
 
 
-def by_turns(runs: Mapping[str, Run], effort: Effort) -> dict[str, list[Sample]]:
+Result = TypeVar("Result")
+
+
+def by_turns(
+    runs: Mapping[str, Callable[[float], Result]], effort: Effort
+) -> dict[str, list[Result]]:
     """Give each configuration a turn in every round, after a round to warm up.
 
     The first in a round is the last in the next, so that none always follows the same one.
     """
-    samples: dict[str, list[Sample]] = {name: [] for name in runs}
+    samples: dict[str, list[Result]] = {name: [] for name in runs}
     names = list(runs)
     for index in range(effort.rounds + 1):
         for name in names:

@@ -1,12 +1,15 @@
 """Measure typical tasks: compiled, on arrays, written by hand in numpy, and in Gymnasium's vectors.
 
-All run on one thread. The cells show the time of a call of ``step``, and how many times faster the
-task is than written by hand, without the time of the FMUs themselves on both sides.
+All run on one thread. A way plays the same steps again and again, in turns with the others. Their
+time is the sum of the least times that each 16 calls of ``step`` have taken, because other work on
+the machine only adds to it. The FMUs' own time is that of a C program which repeats the inputs and
+the starts of these very steps: what a step of an FMU costs depends on the inputs and on where it
+is. So the cells can show how many times faster a task is than by hand without the FMUs' time.
 """
 
 from __future__ import annotations
 
-import statistics
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -21,11 +24,12 @@ import numpy as np
 import user_tasks
 from c_fmus import build_building
 from cart_poles import require_native_pool
-from measure import Effort, MissingError, Run, Sample, Stopwatch, by_turns, make_runs
+from measure import Effort, MissingError, Run, by_turns, make_runs, repeated
 from tables import Table, duration, times
 
 import fmugym
 from fmugym.task.interface import resolve
+from fmugym.vector.hooks.program import OPERATIONS
 
 __all__ = ["TASKS", "Task", "fmugym_run", "tables"]
 
@@ -34,8 +38,11 @@ TITLE = (
     "Tasks, one thread: time of a step of all environments; in brackets, how many times faster\n"
     "than by hand in numpy, without the time of the FMUs themselves"
 )
-_LEAST_SHARE = 0.1
-"""The smallest part of a step that is compared, if the rest is the time of the FMUs."""
+STEPS = 256
+"""The steps that are repeated: at least one episode of most tasks."""
+
+_ALLOWED_CALL = 6e-6
+"""The time in s that a call of ``step`` may take beyond what it takes for each environment."""
 
 FMU, BY_HAND = "FMUs alone, in C", "by hand in numpy"
 MOST = {"SyncVectorEnv": 64, "AsyncVectorEnv": 8}
@@ -102,46 +109,98 @@ def _add(table: Table, task: Task, sizes: tuple[int, ...], effort: Effort) -> No
     columns = []
     for size in sizes:
         with ExitStack() as stack:
-            makers = dict(_makers(stack, task, size))
+            makers = dict(_makers(stack, task, size, 2 * c_limit.BLOCK if effort.quick else STEPS))
             runs, missing = make_runs(makers)
-            columns.append((by_turns(runs, effort), missing, size))
+            blocks = by_turns(runs, effort)
+            columns.append(({name: _call_time(blocks[name]) for name in runs}, missing, size))
     for name in makers:
-        cells = [_cell(name, samples, missing) for samples, missing, _ in columns]
+        cells = [_cell(name, seconds, missing) for seconds, missing, _ in columns]
         table.rows.append([f"{task.name}: {name}", *cells])
+    each = _allowed_each(task)
+    cells = [_rest(seconds, size, each) for seconds, _, size in columns]
+    table.rows.append([f"{task.name}: fmugym without the FMUs / allowed", *cells])
     table.data += [
-        {"task": task.name, "way": name, "num_envs": size, "call_s": _median(samples[name])}
-        for samples, _, size in columns
-        for name in samples
+        {"task": task.name, "way": name, "num_envs": size, "call_s": taken}
+        for seconds, _, size in columns
+        for name, taken in seconds.items()
     ]
 
 
-def _makers(stack: ExitStack, task: Task, size: int) -> Iterator[tuple[str, Callable[[], Run]]]:
-    yield FMU, lambda: _fmu_run(stack, task, size)
-    yield "fmugym", lambda: fmugym_run(stack, task, size, "auto")
-    yield 'hooks="array"', lambda: fmugym_run(stack, task, size, "array")
-    yield BY_HAND, lambda: _by_hand(stack, task, size)
+def _allowed_each(task: Task) -> float:
+    """The time in s that an environment may take beyond its FMU, according to its programs."""
+    with ExitStack() as stack:
+        programs = _fmugym(stack, task, 1, "auto")._engine._task
+    if programs is None:
+        return float("nan")
+    codes = np.concatenate([programs.inputs.code[:, 0], programs.judgement.code[:, 0]])
+    names = [OPERATIONS[code] for code in codes.tolist()]
+    return 1e-9 * (10.0 + sum(map(_allowed, names)))
+
+
+def _allowed(operation: str) -> float:
+    """The time in ns that an operation may take; moving values belongs to the environment."""
+    if operation.startswith(("load_", "store_")):
+        return 0.0
+    if operation.startswith("scalar_power") or operation == "call_square":
+        return 60.0
+    return 30.0 if operation in {"call", "call_sine", "call_cosine"} else 1.0
+
+
+def _rest(seconds: dict[str, float], size: int, each: float) -> str:
+    """What a call costs beyond the FMUs, and what it may cost."""
+    return f"{duration(seconds['fmugym'] - seconds[FMU])} / {duration(_ALLOWED_CALL + each * size)}"
+
+
+Blocks = list[float]
+"""The time of each ``BLOCK`` calls of ``step`` in s."""
+
+
+def _call_time(turns: list[Blocks]) -> float:
+    """The time of a call, from the least times of each block in all turns."""
+    return sum(map(min, zip(*turns, strict=True))) / (len(turns[0]) * c_limit.BLOCK)
+
+
+def _makers(
+    stack: ExitStack, task: Task, size: int, steps: int
+) -> Iterator[tuple[str, Callable[[], Callable[[float], Blocks]]]]:
+    yield FMU, lambda: _fmu_run(stack, task, size, steps)
+    for name, hooks in (("fmugym", "auto"), ('hooks="array"', "array")):
+        yield name, lambda hooks=hooks: _blocks(_fmugym(stack, task, size, hooks), steps)
+    yield BY_HAND, lambda: _blocks(_by_hand(stack, task, size), steps)
     for name in MOST:
-        yield name, lambda name=name: _gymnasium(stack, task, size, name)
+        yield name, lambda name=name: _blocks(_gymnasium(stack, task, size, name), steps)
 
 
-def fmugym_run(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
-    """Make a run of a vector environment of this package on one thread."""
+def _fmugym(stack: ExitStack, task: Task, size: int, hooks: str) -> Any:
     envs = fmugym.FMUVectorEnv(
         task.make, size, max_episode_steps=task.limit, hooks=hooks, threads=1
     )
     stack.callback(envs.close)
-    return _run(envs, envs.action_space)
+    return envs
 
 
-def _by_hand(stack: ExitStack, task: Task, size: int) -> Run:
+def fmugym_run(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
+    """Count calls of ``step`` of a vector environment of this package on one thread."""
+    envs = _fmugym(stack, task, size, hooks)
+    actions = _actions(envs)
+    envs.reset(seed=0)
+
+    def block() -> None:
+        for action in actions:
+            envs.step(action)
+
+    return repeated(block, len(actions))
+
+
+def _by_hand(stack: ExitStack, task: Task, size: int) -> by_hand.ByHand:
     env = task.make()
     stack.callback(env.close)
     envs = task.by_hand(env, size, task.limit)
     stack.callback(envs.close)
-    return _run(envs, gym.vector.utils.batch_space(env.action_space, size))
+    return envs
 
 
-def _gymnasium(stack: ExitStack, task: Task, size: int, name: str) -> Run:
+def _gymnasium(stack: ExitStack, task: Task, size: int, name: str) -> Any:
     if size > MOST[name]:
         raise MissingError("-")
     options = {"context": "fork"} if name == "AsyncVectorEnv" else {}
@@ -150,70 +209,82 @@ def _gymnasium(stack: ExitStack, task: Task, size: int, name: str) -> Run:
         make = partial(gym.wrappers.TimeLimit, max_episode_steps=task.limit)
         envs = getattr(gym.vector, name)([lambda: make(task.make())] * size, **options)
     stack.callback(envs.close)
-    return _run(envs, envs.action_space)
+    return envs
 
 
-def _run(envs: Any, space: gym.Space[Any]) -> Run:
-    """Count calls of ``step`` with a few random actions that repeat."""
-    space.seed(0)
-    actions = [space.sample() for _ in range(16)]
+def _actions(envs: Any) -> list[Any]:
+    """Random actions for the calls of a block."""
+    envs.action_space.seed(0)
+    return [envs.action_space.sample() for _ in range(c_limit.BLOCK)]
+
+
+def _blocks(envs: Any, steps: int) -> Callable[[float], Blocks]:
+    """Play the same steps until the time is over; return the least time of each block."""
+    actions = _actions(envs)
+    start = envs.reset if isinstance(envs, by_hand.ByHand) else partial(envs.reset, seed=0)
+
+    def run(seconds: float) -> Blocks:
+        end, least = time.perf_counter() + seconds, [np.inf] * (steps // len(actions))
+        while least[-1] == np.inf or time.perf_counter() < end:
+            start()
+            for index, before in enumerate(least):
+                begin = time.perf_counter()
+                for action in actions:
+                    envs.step(action)
+                least[index] = min(before, time.perf_counter() - begin)
+        return least
+
+    return run
+
+
+def _fmu_run(stack: ExitStack, task: Task, size: int, steps: int) -> Callable[[float], Blocks]:
+    """Repeat what the FMUs did in the steps that are played by hand."""
+    with ExitStack() as played:
+        envs = _by_hand(played, task, size)
+        loop = _loop_of(envs.env)
+        record = c_limit.build_folder() / f"{task.name}-{size}.steps"
+        rows = [[v.name for v in envs.parameters].index(name) for name in loop.starts]
+        record.write_bytes(b"".join(_recorded(envs, rows, steps)))
+    stack.callback(record.unlink)
+    return partial(c_limit.repeat, loop, size, record)
+
+
+def _recorded(envs: by_hand.ByHand, rows: list[int], steps: int) -> Iterator[bytes]:
+    """What ``c_limit.c`` reads, in its order; the rows are those of start values."""
+    actions = _actions(envs)
+    yield np.array([envs.num_envs, steps, len(rows)], np.int64).tobytes()
     envs.reset()
-
-    def run(seconds: float) -> Sample:
-        watch, done = Stopwatch(), 0
-        while watch.wall < seconds:
-            watch.start()
-            for action in actions:
-                envs.step(action)
-            watch.stop()
-            done += len(actions)
-        return watch.sample(done)
-
-    return run
-
-
-def _fmu_run(stack: ExitStack, task: Task, size: int) -> Run:
-    """Count what would be calls of ``step`` if they took the time of the FMUs alone."""
-    env = task.make()
-    stack.callback(env.close)
-    loop = _loop_of(env)
-    c_limit.build()
-
-    def run(seconds: float) -> Sample:
-        rates = c_limit.measure(loop, size, 1, seconds)
-        return Sample(rates.wall / size * seconds, seconds, seconds)
-
-    return run
+    yield envs.values[rows].T.tobytes()
+    for index in range(steps):
+        starting = envs.ended
+        envs.step(actions[index % len(actions)])
+        yield starting.tobytes()
+        yield envs.pool.inputs.T.tobytes()
+        yield envs.values[rows][:, starting].T.tobytes()
 
 
 def _loop_of(env: fmugym.FMUEnv) -> c_limit.Loop:
     """What a bare C program has to do to step this environment's FMU."""
-    config, parameters = env.config, {}
+    config, reals, others = env.config, {}, {}
     for name, value in resolve(config, env.fmu.description).parameters.items():
-        middle = (value.low + value.high) / 2 if isinstance(value, fmugym.Uniform) else value
-        is_real = env.fmu.variable(name).kind == "real"
-        parameters[name] = float(middle) if is_real else int(middle)
+        if env.fmu.variable(name).kind == "real":
+            reals[name] = 0.0  # the record has the value
+        else:
+            others[name] = int(value)
     return c_limit.Loop(
         env.fmu,
         config.time_step,
-        dict.fromkeys(config.model_input_names, 0.01),
+        dict.fromkeys(config.model_input_names, 0.0),
         dict.fromkeys(config.model_output_names, np.inf),
-        {},
-        parameters,
+        reals,
+        others,
     )
 
 
-def _median(samples: list[Sample]) -> float:
-    return statistics.median(sample.wall / sample.count for sample in samples)
-
-
-def _cell(name: str, samples: dict[str, list[Sample]], missing: dict[str, str]) -> str:
-    if name not in samples:
+def _cell(name: str, seconds: dict[str, float], missing: dict[str, str]) -> str:
+    if name not in seconds:
         return missing.get(name, "-")
-    own = _median(samples[name])
+    own = seconds[name]
     if name == FMU:
         return duration(own)
-    fmus, hand = _median(samples[FMU]), _median(samples[BY_HAND])
-    if own - fmus < _LEAST_SHARE * own:  # the difference would be noise
-        return duration(own)
-    return f"{duration(own)} ({times((hand - fmus) / (own - fmus))})"
+    return f"{duration(own)} ({times((seconds[BY_HAND] - seconds[FMU]) / (own - seconds[FMU]))})"

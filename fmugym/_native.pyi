@@ -93,12 +93,21 @@ class Access:
     Args:
         version: 1, 2 or 3.
         types: One byte for each variable, the number of its C type; see ``fmi.h``.
-        references: Their value references, as bytes of native 32-bit integers.
+        elements: Of each the value reference, the place in its array and the size of this, as
+            bytes of native 32-bit integers.
+        rest: The values of the last of them, which are no part of the list but needed to set whole
+            arrays, as bytes of float64.
         manner: How the FMU is run; see ``fmi.h``.
     """
 
     def __new__(
-        cls, version: int, types: bytes, references: bytes, manner: int = 0, /
+        cls,
+        version: int,
+        types: bytes,
+        elements: bytes,
+        rest: bytes,
+        manner: int = 0,
+        /,
     ) -> Access: ...
 
 @final
@@ -162,6 +171,7 @@ class Library(TypedDict):
     categories: tuple[bytes, ...]
     mark: Mark | None
     solving: tuple[Any, ...] | None
+    system: tuple[Any, ...] | None
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -204,8 +214,8 @@ class Arrays(TypedDict):
     last_initialization: Array
 
 Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
-"""An episode: types and references of the start variables, start values, first outputs, and rows of
-inputs, of outputs and of statuses."""
+"""An episode: types and elements (see ``Access``) of the start variables, start values, first
+outputs, and rows of inputs, of outputs and of statuses."""
 
 class Episodes(TypedDict):
     """See ``NativePool.prepare_play``."""
@@ -461,8 +471,10 @@ class Pool:
 
     def record_of(
         self, index: int, /
-    ) -> tuple[tuple[tuple[int, int, float], ...], int, bytes] | None:
-        """The start values (type, reference, value), number of steps, and inputs of an episode.
+    ) -> tuple[tuple[tuple[int, int, int, float], ...], int, bytes] | None:
+        """The start values, number of steps, and inputs of an episode.
+
+        A start value is a type, value reference, place in an array, and value.
 
         Returns:
             None if the episode is not known as a whole.

@@ -31,6 +31,7 @@ __all__ = [
     "check_path",
     "check_seed",
     "check_text",
+    "flattened",
     "float_or_nan",
     "has_method",
     "integer_of",
@@ -244,3 +245,16 @@ def check_path(what: str, value: Any) -> Path:
         return Path(os.fsdecode(value)).expanduser()
     except Exception:  # a TypeError; or nobody has this home, or the object's own method fails
         raise ConfigError(f"{what} must be a path, got {shown(value)}") from None
+
+
+def flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
+    """The shape of nested lists, and their elements; no shape if the lists differ in length."""
+    if isinstance(value, np.ndarray) and value.ndim:
+        value = list(value)
+    if not isinstance(value, list | tuple):
+        return (), [value]
+    parts = [flattened(one) for one in value]
+    shapes = {shape for shape, _ in parts}
+    elements = [element for _, own in parts for element in own]
+    inner = shapes.pop() if len(shapes) == 1 else None
+    return (None if inner is None else (len(parts), *inner)), elements

@@ -20,6 +20,7 @@ from fmugym.checks import (
     check_mapping,
     check_number,
     check_option,
+    flattened,
     integer_of,
     number_of,
 )
@@ -61,8 +62,10 @@ class EnvConfig:
 
     Attributes:
         model_input_names: The variables that the action is written to; a bare name is fine for one.
+            The name of an array stands for its elements in row-major order; ``v[3]`` is one.
         model_output_names: The variables that ``state`` holds, in this order.
-        model_parameters: Start values by name: numbers, or distributions drawn at each reset.
+        model_parameters: Start values by name: numbers, or distributions drawn at each reset; for
+            an array, nested lists of them, or one for all elements.
         time_step: Length of one ``step``; by default the FMU's own default step size.
         positive_reward: Default reward of a step.
         negative_reward: Default reward of a step that ends the task (``_is_done``).
@@ -275,7 +278,7 @@ class EnvConfig:
         if not self.model_output_names:
             raise ConfigError("config key 'model_output_names' names no output")
         for name in self.samplings:
-            if name not in read:
+            if name not in read and "[" not in name:  # an element of an array may be meant
                 raise unknown_name("output in 'samplings'", name, read)
         for name in self.episode_variables:
             if name in self.model_parameters:
@@ -329,7 +332,7 @@ def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
 
 def _drawn_array(what: str, value: Any) -> npt.NDArray[Any]:
     """Return an array of objects for an array with distributions in it."""
-    shape, elements = _flattened(value)
+    shape, elements = flattened(value)
     elements = [as_distribution(what, one) for one in elements]
     if shape is None or not any(map(is_distribution, elements)):
         raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}")
@@ -344,19 +347,6 @@ def _number(what: str, value: Any) -> Any:
     if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
         raise ConfigError(f"{what} must be a number, got {shown(value)}")
     return value if is_distribution(value) else check_number(what, value)
-
-
-def _flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
-    """The shape of nested lists, and their elements; no shape if the lists differ in length."""
-    if isinstance(value, np.ndarray) and value.ndim:
-        value = list(value)
-    if not isinstance(value, list | tuple):
-        return (), [value]
-    parts = [_flattened(one) for one in value]
-    shapes = {shape for shape, _ in parts}
-    elements = [element for _, own in parts for element in own]
-    inner = shapes.pop() if len(shapes) == 1 else None
-    return (None if inner is None else (len(parts), *inner)), elements
 
 
 def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:

@@ -23,7 +23,7 @@ from fmugym.pool.patience import failed_reset
 from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode, EpisodePlan
-from fmugym.task.interface import output_variable
+from fmugym.task.interface import outputs_named
 from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
@@ -585,7 +585,7 @@ class FMUEnv(Constructed):
     def observation_names(self) -> tuple[str, ...] | None:
         """The names of the observation's elements; None if a hook of the class makes it."""
         is_default = type(self)._get_observation is FMUEnv._get_observation
-        return tuple(self.config.model_output_names) if is_default else None
+        return tuple(v.name for v in self._interface.outputs) if is_default else None
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
@@ -601,6 +601,8 @@ class FMUEnv(Constructed):
     def read_variables(self, *names: str) -> dict[str, float]:
         """Read any numeric variables of the FMU now, for inspection outside of an episode's loop.
 
+        The name of an array stands for its elements, which come by their own names.
+
         Raises:
             ConfigError: If a name is unknown or its variable is not numeric.
             SimulationError: If the environment is closed or was never reset.
@@ -608,8 +610,9 @@ class FMUEnv(Constructed):
         pool = self._open_pool("read_variables")
         if not self._was_reset:
             raise SimulationError("read_variables was called before the first reset")
-        variables = tuple(output_variable(self.fmu.description, name) for name in names)
-        return dict(zip(names, pool.read(variables)[:, 0].tolist(), strict=True))
+        variables = outputs_named(self.fmu.description, names)
+        values = pool.read(variables)[:, 0].tolist()
+        return {variable.name: value for variable, value in zip(variables, values, strict=True)}
 
     @property
     def np_random(self) -> np.random.Generator:

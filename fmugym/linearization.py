@@ -67,7 +67,8 @@ def linearize(
     """Linearize an FMU at the point it reaches by its initialization.
 
     The FMU computes the derivatives itself, by ``fmi2GetDirectionalDerivative`` or
-    ``fmi3GetDirectionalDerivative``. So there is no step size and no truncation error.
+    ``fmi3GetDirectionalDerivative``, or by ``fmi3GetAdjointDerivative`` if it has nothing else. So
+    there is no step size and no truncation error.
 
     Args:
         fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` are used.
@@ -80,7 +81,7 @@ def linearize(
         The linear model.
 
     Raises:
-        ConfigError: If the FMU provides no directional derivatives or declares no states; if a name
+        ConfigError: If the FMU provides no such derivatives or declares no states; if a name
             is unknown or belongs to a variable of another kind; if a value does not fit.
         FMULoadError: If the FMU cannot be loaded.
         SimulationError: If the FMU fails.
@@ -100,10 +101,11 @@ def linearize(
 
 def _require_derivatives(description: ModelDescription) -> None:
     name = f"{description.model_name} (FMI {description.fmi_version})"
-    if not description.capabilities.provides_directional_derivatives:
+    if not description.capabilities.provides_derivatives:
         raise ConfigError(
-            f"{name} cannot be linearized: it provides no directional derivatives, which are an "
-            "option of FMI 2.0 and 3.0; its exporter may have a setting for them"
+            f"{name} cannot be linearized: it provides neither directional derivatives, which are "
+            "an option of FMI 2.0 and 3.0, nor adjoint ones, an option of FMI 3.0; its exporter "
+            "may have a setting for them"
         )
     if not description.state_derivatives:
         raise ConfigError(

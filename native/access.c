@@ -10,6 +10,30 @@
 
 static Atomic next_id;
 
+static bool are_sound(const char *types, const char *elements, size_t count) {
+    for (size_t i = 0; i < count; i++) {
+        Element element;
+        memcpy(&element, elements + i * sizeof element, sizeof element);
+        if (!is_type((uint8_t)types[i]) || element.place >= element.size) {
+            return false;
+        }
+    }
+    return true;
+}
+
+const char *listing_take(Listing *listing, const char *types, size_t count, const char *elements,
+                         size_t size, const char *rest, size_t size_of_rest) {
+    const size_t number_of_rest = size_of_rest / sizeof(double);
+
+    if (size != count * sizeof(Element) || size_of_rest % sizeof(double) != 0 ||
+        number_of_rest > count) {
+        return "the parts of a list of variables differ in length";
+    }
+    *listing = (Listing){(const uint8_t *)types, elements, count - number_of_rest, rest,
+                         number_of_rest};
+    return are_sound(types, elements, count) ? NULL : "unknown C type, or a place outside an array";
+}
+
 static Group *group_of(Access *access, Type type) {
     for (size_t i = 0; i < access->number_of_groups; i++) {
         if (access->groups[i].type == type) {
@@ -21,51 +45,125 @@ static Group *group_of(Access *access, Type type) {
     return group;
 }
 
-static void assign_memory(Access *access) {
+static bool allocate(Access *access, const Listing *listing) {
+    const size_t all = listing->count + listing->number_of_rest;
+
+    access->variables = malloc((all + 1) * sizeof *access->variables);
+    access->types = malloc(all + 1);
+    access->rest = malloc((listing->number_of_rest + 1) * sizeof *access->rest);
+    access->memory = malloc((4 * all + 1) * sizeof *access->memory);
+    if (access->variables == NULL || access->types == NULL || access->rest == NULL ||
+        access->memory == NULL) {
+        access_close(access);
+        return false;
+    }
+    memcpy(access->variables, listing->elements, all * sizeof *access->variables);
+    memcpy(access->types, listing->types, all);
+    memcpy(access->rest, listing->rest, listing->number_of_rest * sizeof *access->rest);
+    return true;
+}
+
+/* Each group gets the memory for as many value references as it has variables. */
+static void share_memory(Access *access, size_t all) {
     uint32_t *place = access->memory;
+
+    for (size_t i = 0; i < all; i++) {
+        if (access->types[i] != START_TIME) {
+            group_of(access, (Type)access->types[i])->count++;
+        }
+    }
     for (size_t i = 0; i < access->number_of_groups; i++) {
         Group *group = &access->groups[i];
+        const size_t count = group->count;
         group->references = place;
-        group->positions = place + group->count;
-        place += 2 * group->count;
-        group->count = 0; /* the loop below counts again */
+        group->offsets = place + count;
+        group->listed.positions = place + 2 * count;
+        group->listed.places = place + 3 * count;
+        place += 4 * count;
+        group->count = 0; /* add_reference counts again */
     }
 }
 
-bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const char *references,
-                 size_t count) {
+/* The first place of a variable's values in the memory of its group. Elements of an array mostly
+ * follow each other, so that the search ends at once. */
+static uint32_t offset_of(Group *group, const Element *element) {
+    for (size_t i = group->count; element->size > 1 && i > 0; i--) {
+        if (group->references[i - 1] == element->reference) {
+            return group->offsets[i - 1];
+        }
+    }
+    const uint32_t offset = (uint32_t)group->size;
+    group->references[group->count] = element->reference;
+    group->offsets[group->count++] = offset;
+    group->size += element->size;
+    return offset;
+}
+
+static void add(Group *group, Part *part, const Element *element, size_t position) {
+    part->positions[part->count] = (uint32_t)position;
+    part->places[part->count++] = offset_of(group, element) + element->place;
+}
+
+static bool is_direct(const Access *access) {
+    const Group *group = access->groups;
+    bool direct = access->number_of_groups == 1 && group->type == TYPE_FLOAT64 &&
+                  group->size == group->listed.count && group->rest.count == 0 &&
+                  (access->start_time < 0 || access->start_time == (ptrdiff_t)access->count - 1);
+
+    for (size_t i = 0; direct && i < group->listed.count; i++) {
+        direct = group->listed.places[i] == i;
+    }
+    return direct;
+}
+
+static size_t width_of(const Access *access) {
+    size_t width = access->count;
+
+    for (size_t i = 0; i < access->number_of_groups; i++) {
+        width = access->groups[i].size > width ? access->groups[i].size : width;
+    }
+    return width;
+}
+
+bool access_open(Access *access, const Fmi *fmi, const Listing *listing) {
+    const size_t all = listing->count + listing->number_of_rest;
+
     memset(access, 0, sizeof *access);
     access->fmi = fmi;
     access->id = 1 + atomic_add(&next_id, 1);
-    access->count = count;
+    access->count = listing->count;
     access->start_time = -1;
-    access->memory = malloc((2 * count + 1) * sizeof(uint32_t));
-    if (access->memory == NULL) {
+    if (!allocate(access, listing)) {
         return false;
     }
-    for (size_t i = 0; i < count; i++) {
-        if (types[i] == START_TIME) {
+    share_memory(access, all);
+    for (size_t i = 0; i < listing->count; i++) {
+        if (access->types[i] == START_TIME) {
             access->start_time = (ptrdiff_t)i;
-        } else {
-            group_of(access, (Type)types[i])->count++;
-        }
-    }
-    assign_memory(access);
-    for (size_t i = 0; i < count; i++) {
-        if (types[i] == START_TIME) {
             continue;
         }
-        Group *group = group_of(access, (Type)types[i]);
-        memcpy(&group->references[group->count], references + i * sizeof(uint32_t), 4);
-        group->positions[group->count++] = (uint32_t)i;
+        Group *group = group_of(access, (Type)access->types[i]);
+        add(group, &group->listed, &access->variables[i], i);
     }
-    access->direct = access->number_of_groups == 1 && access->groups[0].type == TYPE_FLOAT64 &&
-                     (access->start_time < 0 || access->start_time == (ptrdiff_t)count - 1);
+    for (size_t i = listing->count; i < all; i++) {
+        Group *group = group_of(access, (Type)access->types[i]);
+        group->rest.positions = group->listed.positions + group->listed.count;
+        group->rest.places = group->listed.places + group->listed.count;
+        add(group, &group->rest, &access->variables[i], i - listing->count);
+    }
+    access->direct = is_direct(access);
+    access->width = width_of(access);
     return true;
 }
 
 void access_close(Access *access) {
+    free(access->variables);
+    free(access->types);
+    free(access->rest);
     free(access->memory);
+    access->variables = NULL;
+    access->types = NULL;
+    access->rest = NULL;
     access->memory = NULL;
 }
 
@@ -97,12 +195,12 @@ static uint64_t to_uint64(double value) {
 }
 
 #define LOAD(type)                                                                                 \
-    for (size_t i = 0; i < group->count; i++) {                                                    \
-        values[group->positions[i]] = (double)((const type *)typed)[i];                            \
+    for (size_t i = 0; i < part->count; i++) {                                                     \
+        values[part->positions[i]] = (double)((const type *)typed)[part->places[i]];               \
     }                                                                                              \
     break
 
-static void load(const Group *group, Type type, const void *typed, double *values) {
+static void load(const Part *part, Type type, const void *typed, double *values) {
     switch (type) {
     case TYPE_FLOAT64: LOAD(double);
     case TYPE_FLOAT32: LOAD(float);
@@ -119,13 +217,13 @@ static void load(const Group *group, Type type, const void *typed, double *value
 }
 
 #define STORE(type, convert)                                                                       \
-    for (size_t i = 0; i < group->count; i++) {                                                    \
-        const double value = values[group->positions[i]];                                          \
-        ((type *)typed)[i] = (type)(convert);                                                      \
+    for (size_t i = 0; i < part->count; i++) {                                                     \
+        const double value = values[part->positions[i]];                                           \
+        ((type *)typed)[part->places[i]] = (type)(convert);                                        \
     }                                                                                              \
     break
 
-static void store(const Group *group, Type type, const double *values, void *typed) {
+static void store(const Part *part, Type type, const double *values, void *typed) {
     switch (type) {
     case TYPE_FLOAT64: STORE(double, value);
     case TYPE_FLOAT32: STORE(float, value);
@@ -157,16 +255,17 @@ Status access_get(const Access *access, const Library *library, void *component,
     Status worst = STATUS_OK;
 
     if (access->direct) {
-        worst = fmi->get(library, component, TYPE_FLOAT64, group->references, group->count, values);
+        worst = fmi->get(library, component, TYPE_FLOAT64, group->references, group->count, values,
+                         group->size);
         floats_restore_if_seen(floats);
         return worst;
     }
     for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
-        const Status status =
-            fmi->get(library, component, group->type, group->references, group->count, typed);
+        const Status status = fmi->get(library, component, group->type, group->references,
+                                       group->count, typed, group->size);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
-        load(group, stored_type(access, group), typed, values);
+        load(&group->listed, stored_type(access, group), typed, values);
     }
     return worst;
 }
@@ -178,14 +277,16 @@ Status access_set(const Access *access, const Library *library, void *component,
     Status worst = STATUS_OK;
 
     if (access->direct) {
-        worst = fmi->set(library, component, TYPE_FLOAT64, group->references, group->count, values);
+        worst = fmi->set(library, component, TYPE_FLOAT64, group->references, group->count, values,
+                         group->size);
         floats_restore_if_seen(floats);
         return worst;
     }
     for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
-        store(group, stored_type(access, group), values, typed);
-        const Status status =
-            fmi->set(library, component, group->type, group->references, group->count, typed);
+        store(&group->listed, stored_type(access, group), values, typed);
+        store(&group->rest, stored_type(access, group), access->rest, typed);
+        const Status status = fmi->set(library, component, group->type, group->references,
+                                       group->count, typed, group->size);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
     }

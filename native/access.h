@@ -9,42 +9,72 @@
  * start time of the episode. */
 enum { START_TIME = 255 };
 
+/* A variable: a scalar, or one element of an array. */
+typedef struct {
+    uint32_t reference;
+    uint32_t place; /* of the element in its array, in row-major order; 0 for a scalar */
+    uint32_t size;  /* of the array; 1 for a scalar */
+} Element;
+
+/* Values of a list, and where they are in the memory that the FMU reads and writes. */
+typedef struct {
+    size_t count;
+    uint32_t *positions; /* in the list */
+    uint32_t *places;    /* in the FMU's memory */
+} Part;
+
+/* The variables of one C type. An array is moved as a whole, so there is one value reference for
+ * all of its elements. */
 typedef struct {
     Type type;
-    size_t count;
-    uint32_t *references;
-    uint32_t *positions; /* positions of the values in the list */
+    size_t count, size; /* of the value references, and of the values */
+    uint32_t *references, *offsets;
+    Part listed, rest; /* rest: of arrays that are not listed as a whole, the other elements */
 } Group;
 
 typedef struct {
     const Fmi *fmi;
     uint64_t id; /* unique in the process */
     size_t count;
+    size_t width; /* the larger of count and the most values of a group */
     size_t number_of_groups;
-    bool direct;      /* all values are doubles: the FMU uses the list's own memory */
+    bool direct;        /* all values are doubles: the FMU uses the list's own memory */
     ptrdiff_t start_time; /* position of the start time, or -1 */
-    uint32_t *memory; /* references and positions of all groups */
+    Element *variables; /* in the order of the list */
+    uint8_t *types;
+    double *rest;     /* the values of the elements that are not listed */
+    uint32_t *memory; /* of all groups */
     Group groups[NUMBER_OF_TYPES];
 } Access;
+
+/* What an access is made of. The variables that follow the list are the elements that are missing
+ * in it: FMI sets whole arrays only. */
+typedef struct {
+    const uint8_t *types;
+    const char *elements; /* of type Element, not aligned */
+    size_t count;         /* of the list */
+    const char *rest;     /* the values of the other elements: doubles, not aligned */
+    size_t number_of_rest;
+} Listing;
 
 /* Whether a byte is a Type or START_TIME. */
 static inline bool is_type(uint8_t type) {
     return type < NUMBER_OF_TYPES || type == START_TIME;
 }
 
+/* Checks blocks of bytes and takes a listing from them, which refers to them. Returns what is wrong
+ * with them, or NULL. */
+const char *listing_take(Listing *listing, const char *types, size_t count, const char *elements,
+                         size_t size, const char *rest, size_t size_of_rest);
+
 /* Groups the variables by type, in the order in which the types first appear. The start time belongs
- * to no group. The references are 32-bit numbers and need not be aligned. Returns whether there was
- * enough memory. */
-bool access_open(Access *access, const Fmi *fmi, const uint8_t *types, const char *references,
-                 size_t count);
+ * to no group. Returns whether there was enough memory. */
+bool access_open(Access *access, const Fmi *fmi, const Listing *listing);
 void access_close(Access *access);
 
-/* Both functions use typed as scratch memory of access_scratch bytes and return the worst
+/* Both functions use typed as scratch memory for width doubles and return the worst
  * status. They stop after the first type whose status is worse than a warning. They restore the
  * floating-point environment after each call into the FMU. */
-static inline size_t access_scratch(const Access *access) {
-    return access->count * sizeof(double);
-}
 Status access_get(const Access *access, const Library *library, void *component, double *values,
                   void *typed, const Floats *floats);
 Status access_set(const Access *access, const Library *library, void *component,

@@ -132,7 +132,7 @@ static Status read_instance(Pool *pool, Instance *me, const Access *access, doub
 }
 
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values) {
-    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    double *memory = malloc((access->count + access->width + 1) * sizeof *memory);
     ptrdiff_t failed = -1;
 
     if (memory == NULL) {
@@ -165,7 +165,7 @@ static Status write_instance(Pool *pool, Instance *me, const Access *access, dou
 }
 
 ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
-    double *memory = malloc((2 * access->count + 1) * sizeof *memory);
+    double *memory = malloc((access->count + access->width + 1) * sizeof *memory);
     ptrdiff_t failed = -1;
 
     if (memory == NULL) {

@@ -80,10 +80,16 @@ void health_count_steps(const Pool *pool, Instance *me) {
     me->counted = me->steps;
 }
 
+static const char *part_that_failed(const Pool *pool, const Instance *me) {
+    const Fmi *fmi = pool->settings.fmi;
+    return fmi->blamed == NULL || me->component == NULL ? NULL : fmi->blamed(me->component);
+}
+
 Status instance_fail(Pool *pool, Instance *me, const char *doing, Status status) {
     Failure *failure = failure_note(me, doing, status);
     if (failure != NULL) {
         failure->said = log_said(&pool->log, index_of(pool, me));
+        failure->part = part_that_failed(pool, me);
     }
     return instance_judge(me, status);
 }

@@ -8,5 +8,8 @@ const Fmi *fmi_table(int64_t version, int64_t manner) {
     };
     const bool sound = version >= 1 && version <= 3 && manner >= 0 && manner < 3;
 
+    if (version == 0 && manner == CO_SIMULATION_ALONE) {
+        return &composite;
+    }
     return sound ? tables[manner][version - 1] : NULL;
 }

@@ -64,7 +64,12 @@ typedef struct {
     void *context;
     Status (*prepare)(void *prepared); /* in initialization mode of FMI 3.0, or NULL */
     void *prepared;
+    Status (*exchange)(void *context); /* with other FMUs in initialization mode, or NULL */
 } StartValues;
+
+static inline Status exchange_in(StartValues start_values) {
+    return start_values.exchange == NULL ? STATUS_OK : start_values.exchange(start_values.context);
+}
 
 typedef enum { SETTING_INPUTS, DOING_STEP, READING_OUTPUTS } Stage;
 
@@ -77,6 +82,7 @@ typedef struct {
  * after. places gives the row of each instance in the inputs and outputs. */
 typedef struct {
     const uint32_t *input_references, *output_references;
+    size_t number_of_input_references, number_of_output_references;
     size_t number_of_inputs, number_of_outputs;
     double step;
     bool no_return; /* see do_step */
@@ -112,10 +118,11 @@ typedef struct Fmi {
     /* Does steps whose inputs and outputs are all FLOAT64. Each version implements it with
      * exchange_by. Returns whether all steps are OK. */
     bool (*exchange)(const Library *library, const Exchange *exchange);
+    /* size is the number of values; in FMI 3.0 a value reference may be that of an array. */
     Status (*get)(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values);
+                  size_t count, void *values, size_t size);
     Status (*set)(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values);
+                  size_t count, const void *values, size_t size);
     Status (*set_string)(const Library *library, void *component, uint32_t reference,
                          const char *text);
     Status (*reset)(const Library *library, void *component);
@@ -132,14 +139,21 @@ typedef struct Fmi {
                         size_t size);
     Status (*deserialize)(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
+
+    /* Of systems only, otherwise NULL: which FMU failed last, or NULL; and freeing what may still be
+     * freed after a fatal error. */
+    const char *(*blamed)(const void *component);
+    void (*drop)(const Library *library, void *component);
 } Fmi;
 
 /* How an FMU is run. fmugym/pool/settings.py has the same numbers. */
 typedef enum { CO_SIMULATION_ALONE, MODEL_EXCHANGE_SOLVED, CO_SIMULATION_WITH_EVENTS } Manner;
 
 extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
+/* Of systems. */
+extern const Fmi composite;
 
-/* NULL if the version has no such manner. */
+/* NULL if the version has no such manner. Version 0 are systems. */
 const Fmi *fmi_table(int64_t version, int64_t manner);
 
 static inline bool has_outputs(Outcome outcome) {
@@ -155,14 +169,15 @@ static inline Outcome exchange_once(const Fmi *fmi, const Library *library, cons
     Outcome outcome = {.stage = SETTING_INPUTS};
 
     outcome.status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
-                              e->number_of_inputs, inputs);
+                              e->number_of_input_references, inputs, e->number_of_inputs);
     if (outcome.status <= STATUS_WARNING) {
         outcome.stage = DOING_STEP;
         outcome.status = fmi->do_step(library, component, e->times[index], e->step, e->no_return);
     }
     if (has_outputs(outcome)) {
         const Status got = fmi->get(library, component, TYPE_FLOAT64, e->output_references,
-                                    e->number_of_outputs, outputs);
+                                    e->number_of_output_references, outputs,
+                                    e->number_of_outputs);
         outcome = got > STATUS_WARNING ? (Outcome){got, READING_OUTPUTS} : outcome;
     }
     return outcome;

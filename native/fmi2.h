@@ -113,6 +113,9 @@ static inline Status initialize(const Library *library, void *component,
         status = sane(f->enter_initialization(component));
     }
     if (status <= STATUS_WARNING) {
+        status = exchange_in(start_values);
+    }
+    if (status <= STATUS_WARNING) {
         *doing = "initialization";
         status = sane(f->exit_initialization(component));
     }

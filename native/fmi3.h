@@ -128,6 +128,9 @@ static inline Status initialize(const Library *library, void *instance,
         status = start_values.prepare(start_values.prepared);
     }
     if (status <= STATUS_WARNING) {
+        status = exchange_in(start_values);
+    }
+    if (status <= STATUS_WARNING) {
         *doing = "initialization";
         status = sane(f->exit_initialization(instance));
     }
@@ -167,21 +170,22 @@ static inline void *instantiate_steps(const Library *library, const Identity *id
 }
 
 static inline Status get3(const Library *library, void *instance, Type type,
-                          const uint32_t *references, size_t count, void *values) {
+                          const uint32_t *references, size_t count, void *values, size_t size) {
     Get3 *function = functions_of(library)->get[type];
     if (function == NULL) {
         return STATUS_ERROR;
     }
-    return sane(function(instance, references, count, values, count));
+    return sane(function(instance, references, count, values, size));
 }
 
 static inline Status set3(const Library *library, void *instance, Type type,
-                          const uint32_t *references, size_t count, const void *values) {
+                          const uint32_t *references, size_t count, const void *values,
+                          size_t size) {
     Set3 *function = functions_of(library)->set[type];
     if (function == NULL) {
         return STATUS_ERROR;
     }
-    return sane(function(instance, references, count, values, count));
+    return sane(function(instance, references, count, values, size));
 }
 
 static inline Status set_string3(const Library *library, void *instance, uint32_t reference,

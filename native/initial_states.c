@@ -84,7 +84,7 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     begin_call(CALL_INITIALIZE);
     experiment.start_time = me->start_time;
     status = s->fmi->initialize(me->library, me->component, &experiment,
-                                (StartValues){set_start_values, &context}, &doing);
+                                (StartValues){.set = set_start_values, .context = &context}, &doing);
     end_call();
     instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);

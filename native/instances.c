@@ -3,9 +3,10 @@
 #include "failures.h"
 #include "floats.h"
 #include "inside.h"
+#include "loading.h"
 
 static const char *name_of(const Pool *pool, size_t index) {
-    return pool->names + index * pool->name_size;
+    return pool->names + index * LOG_NAME;
 }
 
 void instance_begin_turn(Pool *pool) {
@@ -148,6 +149,10 @@ void instance_discard(Pool *pool, Instance *me) {
         mutex_lock(pool->making);
         fmi->free_instance(me->library, me->component);
         mutex_unlock(pool->making);
+    } else if (fmi->drop != NULL && me->component != NULL) {
+        mutex_lock(pool->making);
+        fmi->drop(me->library, me->component);
+        mutex_unlock(pool->making);
     }
     end_call();
     floats_restore_if_seen(&pool->floats);
@@ -168,10 +173,9 @@ static void reload_private_library(Pool *pool, Instance *me) {
 
     begin_call(CALL_LOAD);
     if (s->private_libraries) {
-        library_close(me->library);
-        if (library_open(me->library, s->paths[index_of(pool, me)], unused, sizeof unused) &&
-            !s->fmi->bind(me->library, unused, sizeof unused)) {
-            library_close(me->library);
+        pool_unload(pool, index_of(pool, me));
+        if (!pool_load(pool, index_of(pool, me), unused, sizeof unused)) {
+            pool_unload(pool, index_of(pool, me));
         }
     }
     end_call();

@@ -22,13 +22,14 @@ static struct {
     size_t length;
 } echo;
 
-bool log_open(Log *log, size_t count, bool terse) {
+bool log_open(Log *log, size_t count, size_t parts, bool terse) {
     memset(log, 0, sizeof *log);
-    log->recent = calloc(count, sizeof *log->recent);
+    log->recent = calloc(count * parts, sizeof *log->recent);
     if (log->recent == NULL) {
         return false;
     }
-    log->count = count;
+    log->count = count * parts;
+    log->parts = parts;
     log->terse = terse;
     mutex_lock(&lock);
     log->id = next_id++;
@@ -77,7 +78,12 @@ void log_close(Log *log) {
 }
 
 uint64_t log_environment(const Log *log, size_t index) {
-    return ((uint64_t)log->id << INDEX_BITS) | index;
+    return ((uint64_t)log->id << INDEX_BITS) | (index * log->parts);
+}
+
+void log_name(char *name, const char *model, uint64_t environment) {
+    snprintf(name, LOG_NAME, "%.120s_%u_%u", model, (unsigned)(environment >> INDEX_BITS),
+             (unsigned)(environment & UINT32_MAX));
 }
 
 void message_free(Message *message) {
@@ -245,14 +251,17 @@ static void deliver(uint64_t environment, int status, const char *category, char
 
 /* Recent messages */
 
-static char *join(const Recent *recent) {
-    size_t size = 1;
-    for (size_t i = 0; i < LOG_RECENT; i++) {
+static size_t size_of(const Recent *recent) {
+    size_t size = 0;
+    for (size_t i = 0; i < LOG_RECENT && recent != NULL; i++) {
         size += recent->texts[i] == NULL ? 0 : strlen(recent->texts[i]) + 2;
     }
-    char *joined = calloc(1, size);
-    char *end = joined;
-    for (size_t i = 0; joined != NULL && i < LOG_RECENT; i++) {
+    return size;
+}
+
+/* Returns the end of the text. */
+static char *append_recent(char *end, const Recent *recent) {
+    for (size_t i = 0; i < LOG_RECENT && recent != NULL; i++) {
         const size_t place = (recent->next + i) % LOG_RECENT;
         const int status = recent->statuses[place];
         if (recent->texts[place] != NULL) {
@@ -260,24 +269,42 @@ static char *join(const Recent *recent) {
             end += sprintf(end, "%s" LOG_END, recent->texts[place]);
         }
     }
+    return end;
+}
+
+static char *join(const Log *log, size_t first) {
+    size_t size = 1;
+    for (size_t i = 0; i < log->parts; i++) {
+        size += size_of(recent_of(log, first + i));
+    }
+    char *joined = size == 1 ? NULL : calloc(1, size);
+    char *end = joined;
+    for (size_t i = 0; i < log->parts && joined != NULL; i++) {
+        end = append_recent(end, recent_of(log, first + i));
+    }
     return joined;
 }
 
 char *log_said(Log *log, size_t index) {
     mutex_lock(&lock);
-    const Recent *recent = recent_of(log, index);
-    char *said = recent == NULL ? NULL : join(recent);
+    char *said = join(log, index * log->parts);
     mutex_unlock(&lock);
     return said;
 }
 
 bool log_is_silent(const Log *log, size_t index) {
-    return atomic_get(&log->recent[index]) == 0;
+    bool silent = true;
+    for (size_t i = 0; i < log->parts; i++) {
+        silent &= atomic_get(&log->recent[index * log->parts + i]) == 0;
+    }
+    return silent;
 }
 
 void log_forget(Log *log, size_t index) {
     mutex_lock(&lock);
-    forget(log, index);
+    for (size_t i = 0; i < log->parts; i++) {
+        forget(log, index * log->parts + i);
+    }
     mutex_unlock(&lock);
 }
 

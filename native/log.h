@@ -18,7 +18,7 @@ enum {
 
 typedef struct Message {
     struct Message *next;
-    size_t index; /* index of the instance in its pool */
+    size_t index; /* index of the instance in its pool, times parts, plus that of the part */
     int status;
     char *category;
     char *text;
@@ -36,8 +36,9 @@ typedef struct {
 typedef struct Log {
     struct Log *next;
     uint32_t id;
-    size_t count;
-    Atomic *recent; /* one Recent * per instance, 0 until it logs something */
+    size_t count; /* of instances times parts */
+    size_t parts; /* of each instance: the FMUs of a system, or 1 */
+    Atomic *recent; /* one Recent * per part, 0 until it logs something */
     Message *first, *last;
     size_t queued;
     size_t dropped;
@@ -46,11 +47,15 @@ typedef struct Log {
     Atomic idle;    /* how many messages were not queued because the log is terse */
 } Log;
 
-bool log_open(Log *log, size_t count, bool terse);
+bool log_open(Log *log, size_t count, size_t parts, bool terse);
 void log_close(Log *log);
 
-/* The number that identifies an instance to FMUs: it combines log and instance. */
+/* The number that identifies the first part of an instance to FMUs: it combines log and instance.
+ * Those of the other parts follow. */
 uint64_t log_environment(const Log *log, size_t index);
+/* Writes a name that tells FMI 1.0 and 2.0 the same; it is shorter than LOG_NAME bytes. */
+enum { LOG_NAME = 160 };
+void log_name(char *name, const char *model, uint64_t environment);
 
 /* Takes all queued messages; the caller frees each. Sets dropped to the number that did not fit. */
 Message *log_take(Log *log, size_t *dropped);

@@ -8,6 +8,7 @@
 
 #include "failures.h"
 #include "inside.h"
+#include "loading.h"
 #include "instances.h"
 #include "records.h"
 #include "snapshots.h"
@@ -48,11 +49,10 @@ static void *at_cache_line(void *memory) {
 static bool allocate(Pool *pool) {
     const Settings *s = &pool->settings;
 
-    pool->name_size = strlen(s->model) + sizeof "_4294967295_4294967295";
     pool->libraries = calloc(number_of_libraries(s), sizeof *pool->libraries);
     pool->instance_memory = calloc(s->count + 1, sizeof *pool->instances);
     pool->instances = at_cache_line(pool->instance_memory);
-    pool->names = calloc(s->count, pool->name_size);
+    pool->names = calloc(s->count, LOG_NAME);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
     pool->spares = calloc(s->count, sizeof *pool->spares);
     pool->starts = calloc(1, sizeof *pool->starts); /* the width is still 0 */
@@ -68,8 +68,7 @@ static void prepare_instance(Pool *pool, size_t index) {
     const Settings *s = &pool->settings;
     Instance *me = &pool->instances[index];
 
-    snprintf(pool->names + index * pool->name_size, pool->name_size, "%s_%u_%zu", s->model,
-             (unsigned)pool->log.id, index);
+    log_name(pool->names + index * LOG_NAME, s->model, log_environment(&pool->log, index));
     me->library = &pool->libraries[s->private_libraries ? index : 0];
     me->start_time = s->experiment.start_time;
 }
@@ -80,9 +79,7 @@ static bool load_libraries(Pool *pool, char *error, size_t size) {
 
     begin_call(CALL_LOAD);
     for (size_t i = 0; i < number_of_libraries(s) && loaded; i++) {
-        pool->libraries[i].identifier = s->model;
-        loaded = library_open(&pool->libraries[i], s->paths[i], error, size) &&
-                 s->fmi->bind(&pool->libraries[i], error, size);
+        loaded = pool_load(pool, i, error, size);
     }
     end_call();
     floats_restore(&pool->floats);
@@ -127,7 +124,8 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     pool->floats = floats_now();
     link_pool(pool);
     snprintf(error, size, "out of memory");
-    if (!log_open(&pool->log, settings->count, !settings->logging) || !allocate(pool)) {
+    if (!log_open(&pool->log, settings->count, parts_of(settings), !settings->logging) ||
+        !allocate(pool)) {
         return false;
     }
     for (size_t i = 0; i < settings->count; i++) {
@@ -153,7 +151,7 @@ static void free_instances(Pool *pool) {
     }
     begin_call(CALL_FREE);
     for (size_t i = 0; i < number_of_libraries(s) && pool->libraries != NULL; i++) {
-        library_close(&pool->libraries[i]);
+        pool_unload(pool, i);
     }
     end_call();
     floats_restore(&pool->floats);

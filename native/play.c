@@ -231,14 +231,15 @@ static void add_notes(const Notes *notes, size_t count, Verdict *verdict) {
     }
 }
 
-void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
-                Verdict *verdict) {
+void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
+                PlayScratch *scratch, Verdict *verdict) {
     const Play *play = turn->play;
-    const Source source = source_of(turn);
+    Source source = source_of(turn);
     const uint16_t *results = play->judgement.results;
     const void *const *places = scratch->judgement.places;
     Notes notes = {.outside = false};
 
+    source.fresh = fresh;
     start_episodes(turn, begin, count);
     copy_rows(play, begin, count);
     program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);

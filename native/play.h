@@ -117,8 +117,8 @@ void play_open(const Turn *turn, PlayScratch *scratch);
 /* Both handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
  * are reset or stepped, the second afterwards. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
-void play_judge(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
-                Verdict *verdict);
+void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
+                PlayScratch *scratch, Verdict *verdict);
 
 /* Stores the observations and infos of environments outside of a step or after a start, at most
  * PROGRAM_WIDTH of them. */

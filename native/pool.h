@@ -32,10 +32,12 @@ typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX
  * exists. */
 typedef struct {
     const Fmi *fmi;
+    const struct System *system; /* NULL for one FMU */
     const char *model; /* the model identifier */
     const char *token;
     const char *resources;
-    const char *const *paths; /* path of the library, or of one private copy per instance */
+    const char *const *paths; /* path of the library, or of one private copy per instance; of a
+                               * system, those of all parts each time */
     bool private_libraries;   /* whether each instance has its own library */
     bool logging;             /* whether FMUs are asked to log everything */
     const char *const *categories; /* the log categories of errors and warnings */
@@ -95,6 +97,7 @@ typedef enum {
 /* Why the last status was worse than a warning. */
 typedef struct {
     const char *doing; /* what failed; a whole sentence if the status is -1 */
+    const char *part;  /* the FMU of a system that failed, or NULL */
     int status;
     bool in_warm_up;
     double time;               /* time of the step, NaN for other calls */
@@ -140,7 +143,7 @@ typedef struct Snapshot {
 /* A value that was set before initialization. */
 typedef struct {
     double value;
-    uint32_t reference, type;
+    uint32_t type, reference, place; /* place: see Element */
 } RecordedStart;
 
 /* The episode of an instance so far; see records.h. */
@@ -186,7 +189,6 @@ typedef struct Pool {
     uint64_t *start_ids; /* the list of start variables of that initialization, or 0 */
     double *first_outputs; /* outputs of the start whose state was saved, if it restores */
     char *names;
-    size_t name_size;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
     void **spares;   /* for each instance, a state whose memory is used again, or NULL */

@@ -18,7 +18,8 @@ enum {
 
 /* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
  * that module compares the two. The letters are those of numpy's types: d float64, f float32,
- * q int64. Booleans are bytes, 0 or 1. */
+ * q int64. Booleans are bytes, 0 or 1. Those that move values come first; arithmetic is from ADD_D
+ * to WHERE_1. */
 #define EACH_OPERATION(X)                                                                          \
     X(LOAD_ROW, "load_row")                                                                        \
     X(LOAD_ACTION, "load_action")                                                                  \
@@ -27,6 +28,7 @@ enum {
     X(LOAD_STOPPED, "load_stopped")                                                                \
     X(STORE_ROW, "store_row")                                                                      \
     X(STORE_SEEN, "store_seen")                                                                    \
+    X(STORE_FLOATS, "store_floats")                                                                \
     X(CALL, "call")                                                                                \
     X(CALL_SQUARE, "call_square")                                                                  \
     X(CALL_REMAINDER, "call_remainder")                                                            \
@@ -108,7 +110,8 @@ enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observat
 enum { VALUE_TYPES = 12, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_HALF = 11 };
 
 /* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a
- * slot, a call, a table or a pair of types, as the operation needs it. */
+ * slot, a call, a table or a pair of types, as the operation needs it. In STORE_FLOATS, extra is the
+ * first slot, a the first row, and b how many there are. */
 typedef struct {
     uint16_t operation, extra, to, a, b, c;
 } Instruction;
@@ -145,6 +148,7 @@ typedef struct {
     char *data;
     size_t size;  /* bytes of a value */
     bool changes; /* whether the program stores in it */
+    uint32_t output; /* 1 more than the number of the output whose values these are, or 0 */
 } Row;
 
 /* An element of an array that has the instances on its first axis. */
@@ -174,6 +178,14 @@ typedef struct {
     uint16_t results[PROGRAM_RESULTS];
 } Program;
 
+/* The outputs of a run that are not in their rows yet. */
+typedef struct {
+    const double *columns; /* PROGRAM_WIDTH of each output; 0 after the last in whole blocks */
+    const double *lines;   /* the same numbers, those of each environment after each other */
+    size_t width;          /* the number of outputs */
+    bool fits_floats;      /* whether all are finite as floats */
+} Fresh;
+
 /* What changes from call to call. */
 typedef struct {
     const char *actions, *previous_actions;
@@ -181,6 +193,7 @@ typedef struct {
     const uint8_t *ended;   /* NULL stands for none */
     const int8_t *statuses; /* NULL stands for all OK */
     char *const *seen;      /* the arrays that the slots refer to */
+    const Fresh *fresh;     /* NULL if the outputs are in their rows */
 } Source;
 
 /* What a run notes. */

@@ -12,7 +12,7 @@
  * between 2^-32 and 2^32. Dekker's product gives the error of the rounded square. Where it is less
  * than 0.485 units, no such loop can round in the other direction. Below a power of two the units
  * are half as long; the loop handles those. */
-static inline uint8_t square_one(double x, double *square) {
+static inline int64_t square_one(double x, double *square) {
     const double high = upper_half(x), low = x - high, rounded = x * x;
     const double error = ((high * high - rounded) + 2.0 * high * low) + low * low;
     uint64_t bits, leading;
@@ -27,7 +27,7 @@ static inline uint8_t square_one(double x, double *square) {
 }
 
 WIDE void quick_square(const double *restrict x, size_t blocks, double *restrict to,
-                       uint8_t *restrict doubtful) {
+                       int64_t *restrict doubtful) {
     EACH_LANE(doubtful[j] = square_one(x[j], &to[j]));
 }
 
@@ -35,7 +35,7 @@ WIDE void quick_square(const double *restrict x, size_t blocks, double *restrict
  * differ. A quotient of few digits makes both parts of its product with the divisor exact, and so
  * are their differences from x, if the first one is. The rest after the nearest quotient is at most
  * about half of the divisor; it needs no more digits than x and the divisor have. */
-static inline uint8_t remainder_one(double x, double y, double *remainder) {
+static inline int64_t remainder_one(double x, double y, double *remainder) {
     const double rounder = 0x1.8p52; /* adding it rounds to an integer */
     const double ratio = x / y, quotient = (ratio + rounder) - rounder;
     const double high = upper_half(y), product = quotient * high;
@@ -50,6 +50,6 @@ static inline uint8_t remainder_one(double x, double y, double *remainder) {
 }
 
 WIDE void quick_remainder(const double *restrict x, const double *restrict y, size_t blocks,
-                          double *restrict to, uint8_t *restrict doubtful) {
+                          double *restrict to, int64_t *restrict doubtful) {
     EACH_LANE(doubtful[j] = remainder_one(x[j], y[j], &to[j]));
 }

@@ -24,17 +24,10 @@ void records_close(Pool *pool) {
 }
 
 static void note_starts(Record *record, const Access *start, const double *starts) {
-    for (size_t i = 0; i < start->number_of_groups; i++) {
-        const Group *group = &start->groups[i];
-        for (size_t j = 0; j < group->count; j++) {
-            record->starts[group->positions[j]] =
-                (RecordedStart){starts[group->positions[j]], group->references[j],
-                                (uint32_t)group->type};
-        }
-    }
-    if (start->start_time >= 0) {
-        record->starts[start->start_time] =
-            (RecordedStart){starts[start->start_time], 0, START_TIME};
+    for (size_t i = 0; i < start->count; i++) {
+        const Element *variable = &start->variables[i];
+        record->starts[i] = (RecordedStart){starts[i], start->types[i], variable->reference,
+                                            variable->place};
     }
 }
 

@@ -67,9 +67,8 @@ static size_t step_run(Position *p, size_t first, size_t count, uint8_t *over, S
     uint8_t *ended = p->turn.play->ended + first;
 
     memcpy(ended, over, count);
-    play_prepare(&p->turn, first, count, &p->registers);
-    const size_t troubled = run_step(&p->task, first, count, scratch);
-    play_judge(&p->turn, first, count, &p->registers, &p->verdict);
+    const PlayedRun run = {first, count, &p->registers, &p->verdict};
+    const size_t troubled = run_turn(&p->task, run, scratch);
     for (size_t j = 0; j < count; j++) {
         if (over[j]) {
             repeat_last(p, first + j);

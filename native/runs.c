@@ -250,6 +250,8 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
     const Exchange e = {
         .input_references = in->groups[0].references,
         .output_references = out->groups[0].references,
+        .number_of_input_references = in->groups[0].count,
+        .number_of_output_references = out->groups[0].count,
         .number_of_inputs = in->count,
         .number_of_outputs = out->count,
         .step = pool->step_size,
@@ -297,19 +299,15 @@ static void record_step(Pool *pool, Scratch scratch) {
 }
 
 /* Handles outputs of which some are not finite, or too large for the observations of a float32.
- * The latter are a fault of the episode, and the owner needs the outputs from before it. */
+ * The latter are a fault of the episode. */
 static size_t take_not_small(Task *task, size_t begin, size_t count, double *outputs) {
-    const Turn *turn = task->call->turn;
     const size_t width = task->pool->settings.outputs->count;
     size_t troubled = 0;
 
     if (!all_within(outputs, count * width, DBL_MAX)) {
         troubled += take_not_finite(task, begin, count, outputs);
     }
-    if (turn != NULL && task->call->observations != NULL) {
-        if (!turn->play->keeps_always) {
-            play_keep_outputs(turn->play, begin, count);
-        }
+    if (task->call->turn != NULL && task->call->observations != NULL) {
         troubled += !all_within(outputs, count * width, FLOAT32_LIMIT);
     }
     return troubled;
@@ -325,7 +323,8 @@ static void record_inputs(const Task *task, size_t begin, size_t count, const do
     }
 }
 
-size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) {
+/* Steps or resets a run, and leaves the outputs in the scratch memory. */
+static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
     gather_inputs(task, begin, count, scratch.inputs);
     if (task->pool->records != NULL) {
         record_inputs(task, begin, count, scratch.inputs);
@@ -333,16 +332,64 @@ size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) {
     scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
 
-    if (!all_within(scratch.outputs, count * task->pool->settings.outputs->count, FLOAT32_LIMIT)) {
+    *fits_floats =
+        all_within(scratch.outputs, count * task->pool->settings.outputs->count, FLOAT32_LIMIT);
+    if (!*fits_floats) {
         troubled += take_not_small(task, begin, count, scratch.outputs);
     }
-    keep_outputs(task, begin, count, scratch.outputs);
     if (begin == 0 && task->pool->tape.state == TAPE_RECORDING) {
         record_step(task->pool, scratch);
     }
     if (task->call->observations != NULL) {
         write_observations(task, begin, count, scratch.outputs);
     }
+    return troubled;
+}
+
+static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) {
+    bool fits_floats;
+    const size_t troubled = advance(task, begin, count, scratch, &fits_floats);
+
+    keep_outputs(task, begin, count, scratch.outputs);
+    return troubled;
+}
+
+static void make_columns(const Pool *pool, size_t count, Scratch scratch) {
+    const size_t width = pool->settings.outputs->count;
+    const size_t rest = (PROGRAM_WIDTH - count) % PROGRAM_BLOCK;
+
+    for (size_t i = 0; i < width; i++) {
+        double *column = scratch.columns + i * PROGRAM_WIDTH;
+        take_column(scratch.outputs + i, width, count, column);
+        memset(column + count, 0, rest * sizeof *column);
+    }
+}
+
+static void keep_columns(const Pool *pool, size_t begin, size_t count, const double *columns) {
+    const Settings *s = &pool->settings;
+
+    for (size_t i = 0; i < s->outputs->count; i++) {
+        memcpy(s->output_values + i * s->count + begin, columns + i * PROGRAM_WIDTH,
+               count * sizeof *columns);
+    }
+}
+
+/* The programs read the outputs where they are in the cache. Their rows keep the old ones for so
+ * long: the owner needs them if there is trouble. */
+size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
+    const Pool *pool = task->pool;
+    const Turn *turn = task->call->turn;
+    const size_t before = run.verdict->troubled;
+    Fresh fresh = {scratch.columns, scratch.outputs, pool->settings.outputs->count, true};
+
+    play_prepare(turn, run.begin, run.count, run.registers);
+    const size_t troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
+    make_columns(pool, run.count, scratch);
+    play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
+    if (!turn->play->keeps_always && (troubled > 0 || run.verdict->troubled > before)) {
+        play_keep_outputs(turn->play, run.begin, run.count);
+    }
+    keep_columns(pool, run.begin, run.count, scratch.columns);
     return troubled;
 }
 
@@ -362,12 +409,9 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
 
     play_open(turn, &registers);
     for (size_t first = begin; first < end; first += RUN) {
-        const size_t count = length_of_run(first, end);
-        play_prepare(turn, first, count, &registers);
-        troubled += run_step(task, first, count, scratch);
-        play_judge(turn, first, count, &registers, &verdict);
+        const PlayedRun run = {first, length_of_run(first, end), &registers, &verdict};
+        troubled += run_turn(task, run, scratch);
         if (turn->started != NULL) {
-            const PlayedRun run = {first, count, &registers, &verdict};
             troubled += starts_after_ends(task, run, scratch, &started);
         }
     }

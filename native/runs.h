@@ -4,6 +4,7 @@
 #ifndef FMUGYM_RUNS_H
 #define FMUGYM_RUNS_H
 
+#include "starts.h"
 #include "task.h"
 
 enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
@@ -12,8 +13,8 @@ static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;
 }
 
-/* Steps or resets one run. */
-size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch);
+/* Steps or resets one run, and runs the programs before and after. */
+size_t run_turn(Task *task, PlayedRun run, Scratch scratch);
 
 /* All three work on the items from begin to end and return how many instances have a status
  * worse than a warning. This one resets or restores instances that need not be neighbours: */

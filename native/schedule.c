@@ -14,7 +14,7 @@ static const double LARGEST_CHUNK = 50e3;
 static const double WORTH_A_THREAD = 10e3; /* amount of work that justifies waking another thread */
 
 enum {
-    STACK_VALUES = 512,
+    STACK_VALUES = 4096,
     MANY = 64,         /* with this many instances or more, every call is measured */
     MEASURE_EVERY = 16 /* with fewer instances, one call in this many is measured */
 };
@@ -41,8 +41,8 @@ size_t task_give_up(Task *task, size_t begin, size_t end) {
 
 static size_t most_values(const Task *task) {
     const Settings *s = &task->pool->settings;
-    const size_t in = s->inputs->count, out = s->outputs->count;
-    const size_t start = task->call->start == NULL ? 0 : task->call->start->count;
+    const size_t in = s->inputs->width, out = s->outputs->width;
+    const size_t start = task->call->start == NULL ? 0 : task->call->start->width;
     const size_t most = in > out ? in : out;
     return most > start ? most : start;
 }
@@ -65,15 +65,17 @@ static size_t length_of_longest_run(const Task *task, size_t begin, size_t end) 
 static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     const Settings *s = &task->pool->settings;
     const size_t most = most_values(task), run = length_of_longest_run(task, begin, end);
-    const size_t in = run * s->inputs->count, size = 2 * most + in + run * s->outputs->count;
+    const size_t in = run * s->inputs->count, out = run * s->outputs->count;
+    const size_t columns = task->call->turn == NULL ? 0 : PROGRAM_WIDTH * s->outputs->count;
+    const size_t size = 2 * most + in + out + columns;
     double stack[STACK_VALUES];
     double *memory = size <= STACK_VALUES ? stack : malloc(size * sizeof *memory);
 
     if (memory == NULL) {
         return task_give_up(task, begin, end);
     }
-    const Scratch scratch = {memory, memory + most, memory + 2 * most, memory + 2 * most + in,
-                             true};
+    double *inputs = memory + 2 * most;
+    const Scratch scratch = {memory, memory + most, inputs, inputs + in, inputs + in + out, true};
     const size_t troubled = work_with(task, begin, end, scratch);
     if (memory != stack) {
         free(memory);

@@ -98,13 +98,17 @@ static inline const Older *older_of(const Library *library) {
 }
 
 static inline Status older_get(const Library *library, void *component, Type type,
-                               const uint32_t *references, size_t count, void *values) {
+                               const uint32_t *references, size_t count, void *values,
+                               size_t size) {
+    (void)size;
     Get *function = older_of(library)->get[type];
     return function == NULL ? STATUS_ERROR : sane(function(component, references, count, values));
 }
 
 static inline Status older_set(const Library *library, void *component, Type type,
-                               const uint32_t *references, size_t count, const void *values) {
+                               const uint32_t *references, size_t count, const void *values,
+                               size_t size) {
+    (void)size;
     Set *function = older_of(library)->set[type];
     return function == NULL ? STATUS_ERROR : sane(function(component, references, count, values));
 }

@@ -140,14 +140,14 @@ Status solved_do_step(const Library *library, void *component, double time, doub
 }
 
 Status solved_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values) {
+                  size_t count, void *values, size_t size) {
     const Solver *me = component;
 
     if (type == TYPE_CLOCK) {
         clocks_tell(me, references, count, values);
         return STATUS_OK;
     }
-    return fmi_of(me)->get(library, me->component, type, references, count, values);
+    return fmi_of(me)->get(library, me->component, type, references, count, values, size);
 }
 
 static size_t size_of(const Fmi *fmi, Type type) {
@@ -175,7 +175,7 @@ static bool is_repeated(LastSet *last, const uint32_t *references, const void *v
     return false;
 }
 
-/* Sets some of the values that were last set: those of inputs with this clock, or, if there is no
+/* Sets some of the values that were last set, all of them scalars: those of inputs with this clock, or, if there is no
  * such clock, those of inputs without clocks. */
 static Status set_one_by_one(Solved *me, Type type, size_t clock) {
     const Solving *s = me->solver.solving;
@@ -191,7 +191,7 @@ static Status set_one_by_one(Solved *me, Type type, size_t clock) {
         }
         if (due) {
             status = fmi->set(me->solver.library, me->solver.component, type, &last->references[i],
-                              1, last->bytes + i * size);
+                              1, last->bytes + i * size, 1);
             floats_restore_if_seen(me->solver.floats);
         }
     }
@@ -220,17 +220,16 @@ static Status set_clocks(Solver *me, const uint32_t *references, size_t count,
 
 /* New values of inputs and parameters are an event: they may jump. */
 Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values) {
+                  size_t count, const void *values, size_t size) {
     Solved *me = component;
     const Fmi *fmi = fmi_of(&me->solver);
-    const size_t size = count * size_of(fmi, type);
     Status status = STATUS_OK;
 
     if (type == TYPE_CLOCK) {
         return set_clocks(&me->solver, references, count, values);
     }
     if (me->solver.memory.mode != BEFORE_EVENTS) {
-        if (is_repeated(&me->last[type], references, values, size)) {
+        if (is_repeated(&me->last[type], references, values, size * size_of(fmi, type))) {
             return STATUS_OK;
         }
         if (me->solver.memory.mode == IN_CONTINUOUS_TIME) {
@@ -241,7 +240,7 @@ Status solved_set(const Library *library, void *component, Type type, const uint
         me->solver.memory.mode != BEFORE_EVENTS) {
         status = set_one_by_one(me, type, SIZE_MAX);
     } else if (good(status)) {
-        status = fmi->set(library, me->solver.component, type, references, count, values);
+        status = fmi->set(library, me->solver.component, type, references, count, values, size);
     }
     if (!good(status)) {
         me->last[type].references = NULL;

@@ -19,9 +19,9 @@ Status solved_initialize(const Library *library, void *component, const Experime
 Status solved_do_step(const Library *library, void *component, double time, double step,
                       bool no_return);
 Status solved_get(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, void *values);
+                  size_t count, void *values, size_t size);
 Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
-                  size_t count, const void *values);
+                  size_t count, const void *values, size_t size);
 Status solved_set_string(const Library *library, void *component, uint32_t reference,
                          const char *text);
 Status solved_reset(const Library *library, void *component);

@@ -28,42 +28,34 @@ bool tape_turn(Tape *tape, int64_t steps) {
 
 static void release(Tape *tape) {
     free(tape->start_types);
-    free(tape->start_references);
+    free(tape->start_variables);
     free(tape->starts);
     free(tape->first_outputs);
     free(tape->inputs);
     free(tape->outputs);
     free(tape->statuses);
     tape->start_types = NULL;
-    tape->start_references = NULL;
+    tape->start_variables = NULL;
     tape->starts = tape->first_outputs = tape->inputs = tape->outputs = NULL;
     tape->statuses = NULL;
 }
 
 static bool allocate(Tape *tape) {
     tape->start_types = calloc(tape->number_of_starts + 1, sizeof *tape->start_types);
-    tape->start_references = calloc(tape->number_of_starts + 1, sizeof *tape->start_references);
+    tape->start_variables = calloc(tape->number_of_starts + 1, sizeof *tape->start_variables);
     tape->starts = calloc(tape->number_of_starts + 1, sizeof *tape->starts);
     tape->first_outputs = calloc(tape->width_out + 1, sizeof *tape->first_outputs);
     tape->inputs = calloc(TAPE_ROWS * tape->width_in + 1, sizeof *tape->inputs);
     tape->outputs = calloc(TAPE_ROWS * tape->width_out + 1, sizeof *tape->outputs);
     tape->statuses = calloc(TAPE_ROWS, sizeof *tape->statuses);
-    return tape->start_types != NULL && tape->start_references != NULL && tape->starts != NULL &&
+    return tape->start_types != NULL && tape->start_variables != NULL && tape->starts != NULL &&
            tape->first_outputs != NULL && tape->inputs != NULL && tape->outputs != NULL &&
            tape->statuses != NULL;
 }
 
 static void note_starts(Tape *tape, const Access *start, const double *starts) {
-    for (size_t i = 0; i < start->number_of_groups; i++) {
-        const Group *group = &start->groups[i];
-        for (size_t j = 0; j < group->count; j++) {
-            tape->start_types[group->positions[j]] = (uint8_t)group->type;
-            tape->start_references[group->positions[j]] = group->references[j];
-        }
-    }
-    if (start->start_time >= 0) {
-        tape->start_types[start->start_time] = START_TIME;
-    }
+    memcpy(tape->start_types, start->types, start->count);
+    memcpy(tape->start_variables, start->variables, start->count * sizeof *start->variables);
     memcpy(tape->starts, starts, start->count * sizeof *starts);
 }
 

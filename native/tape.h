@@ -25,7 +25,7 @@ typedef struct {
     size_t rows;        /* steps on the tape */
     size_t width_in, width_out, number_of_starts;
     uint8_t *start_types;
-    uint32_t *start_references;
+    Element *start_variables;
     double *starts;        /* the values of the start variables */
     double *first_outputs; /* the outputs before the first step */
     double *inputs, *outputs;

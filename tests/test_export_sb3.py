@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from export_tools import compiled, plant_of
+from fmpy.validation import validate_fmu
 
 from fmugym import ConfigError
 from fmugym.export import Scaling, agent_of, network_of
@@ -214,6 +215,19 @@ class TestCommand:
         assert facts["sample_time"] == 0.02
         assert main(command) == 1  # the files are there
         assert "agent.h exists" in capsys.readouterr().err
+
+    def test_to_an_fmu(self, tmp_path, capsys):
+        env = made("fmugym/House-v0")
+        model_of("PPO", env).save(tmp_path / "model.zip")
+        env.close()
+        output = tmp_path / "heater.fmu"
+        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/House-v0"]
+        assert main([*command, "--output", str(output), "--fmi", "3.0", "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert [one["name"] for one in facts["parameters"]] == ["clock"]
+        assert validate_fmu(str(output)) == []
+        assert main(["info", str(output)]) == 0
+        assert "heater" in capsys.readouterr().out
 
     def test_of_a_model_file(self, tmp_path, capsys):
         env = made("fmugym/Pendulum-v0")

@@ -13,6 +13,7 @@ STOREYS = [
     {"errors", "caching", "lazy", "signals", "_native"},
     {"checks", "wine"},
     {"archive", "distributions", "rendering"},
+    {"systems"},
     {"fmi"},
     {"pool"},
     {"trial"},

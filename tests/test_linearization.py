@@ -3,6 +3,7 @@
 import logging
 from contextlib import closing
 
+import exchange_tools
 import foreign_tank
 import numpy as np
 import pytest
@@ -161,7 +162,7 @@ def test_fmi_1_has_no_derivatives():
 
 def test_an_fmu_of_another_exporter_without_derivatives(tmp_path):
     path = FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path)
-    with pytest.raises(fmugym.ConfigError, match="it provides no directional derivatives"):
+    with pytest.raises(fmugym.ConfigError, match="it provides neither directional derivatives"):
         fmugym.linearize(path)
 
 
@@ -192,3 +193,16 @@ def test_an_fmu_that_fails(tmp_path, temp_root):
     with pytest.raises(fmugym.SimulationError, match="initialization returned Error"):
         fmugym.linearize(path, at={"init_status": 3})
     assert list(temp_root.iterdir()) == []
+
+
+@pytest.mark.parametrize("interface", ["ModelExchange", "CoSimulation"])
+def test_adjoint_derivatives_where_there_are_no_others(tmp_path, interface):
+    flags = 'providesAdjointDerivatives="true"'
+    path = exchange_tools.exchange_fmu(
+        tmp_path / "model.fmu", "van_der_pol", 3, (interface,), flags
+    )
+    assert not fmugym.FMU(path).description.capabilities.provides_directional_derivatives
+    model = fmugym.linearize(path, at={"x1": 1.5, "x2": -0.5, "mu": 3.0})
+    assert model.A.tolist() == [[0.0, 1.0], [2 * 3.0 * 1.5 * 0.5 - 1.0, 3.0 * (1.0 - 1.5**2)]]
+    assert model.f.tolist() == [-0.5, 3.0 * (1.0 - 1.5**2) * -0.5 - 1.5]
+    assert fmugym.linearize(path, states="x2").A.shape == (1, 1)

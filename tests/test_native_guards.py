@@ -212,6 +212,7 @@ class TestPrograms:
             ("load_row", 0, 1),
             ("store_row", 0, 0, 1),
             ("store_seen", 0, 0, 1),
+            ("store_floats", 0, 0, 0, 1),
             ("call", 0, 1),
             ("cast", 144, 1),
             ("take", 0, 1),

@@ -19,7 +19,7 @@ def cast(source, target):
     return TYPES.index(source) * len(TYPES) + TYPES.index(target)
 
 
-def evaluate(code, rows, actions, results=(), seen=(), constants=(), slots=(), calls=()):
+def evaluate(code, rows, actions, results=(), seen=(), constants=(), slots=(), calls=(), tables=()):
     """Run a program whose first registers hold the constants."""
     from fmugym import _native
 
@@ -31,7 +31,7 @@ def evaluate(code, rows, actions, results=(), seen=(), constants=(), slots=(), c
         np.array(list(slots), SLOT).tobytes(),
         calls,
         tuple(rows),
-        (),
+        tuple(tables),
         16,
         len(seen),
         tuple(range(len(constants), len(constants) + len(results))),
@@ -88,6 +88,67 @@ def test_rows_that_a_program_both_reads_and_writes(n):
     evaluate(code, (first, second), np.zeros(n))
     np.testing.assert_array_equal(first, before[1])
     np.testing.assert_array_equal(second, before[0])
+
+
+@pytest.mark.parametrize("n", LENGTHS)
+def test_neighbouring_rows_become_neighbouring_elements(n):
+    rows = np.random.default_rng(n).normal(size=(4, n)) * [[1.0], [1e30], [1e-50], [3.0]]
+    seen = np.zeros((n, 5), np.float32)
+    slots = [(0, element, 5, TYPES.index("f")) for element in (1, 2, 3)]
+    evaluate((("store_floats", 0, 0, 1, 3),), rows, np.zeros(n), (), (seen,), (), slots)
+    expected = np.zeros((n, 5), np.float32)
+    expected[:, 1:4] = rows[1:].T
+    np.testing.assert_array_equal(seen, expected)
+
+
+FLOAT = TYPES.index("f")
+
+
+@pytest.mark.parametrize(
+    ("line", "slots"),
+    [
+        (("store_floats", 0, 0, 0, 0), [(0, 0, 3, FLOAT)]),
+        (("store_floats", 0, 0, 0, 2), [(0, 0, 3, FLOAT)]),
+        (("store_floats", 0, 0, 1, 2), [(0, 0, 3, FLOAT), (0, 1, 3, FLOAT)]),
+        (("store_floats", 0, 0, 0, 2), [(0, 0, 3, FLOAT), (0, 2, 3, FLOAT)]),
+        (("store_floats", 0, 0, 0, 2), [(0, 0, 3, FLOAT), (0, 1, 3, TYPES.index("d"))]),
+        (("store_floats", 0, 0, 2, 1), [(0, 0, 3, FLOAT)]),
+    ],
+    ids=str,
+)
+def test_neighbours_that_do_not_exist(line, slots):
+    rows = np.zeros(3), np.zeros(3), np.zeros(3, np.float32)
+    seen = np.zeros((3, 3), np.float32)
+    with pytest.raises(ValueError, match="a program is not sound"):
+        evaluate((line,), rows, np.zeros(3), (), (seen,), (), slots)
+
+
+def points(count, rng):
+    xs = np.sort(rng.integers(-3, 4, count).astype(float))  # some are the same
+    return xs, rng.normal(size=count)
+
+
+@pytest.mark.parametrize(
+    ("xs", "ys"),
+    [
+        *(points(count, np.random.default_rng(count)) for count in (1, 2, 3, 6, 16, 17, 40)),
+        ([0.0, 1.0, 2.0], [0.0, np.inf, 1.0]),
+        ([0.0, 1.0, 2.0], [np.nan, 3.0, 3.0]),
+        ([-np.inf, 0.0, np.inf], [1.0, 2.0, 2.0]),
+        ([0.0, 1.0, 1.0, 1.0, 2.0], [-np.inf, 1.0, 2.0, np.inf, np.inf]),
+    ],
+    ids=str,
+)
+def test_interpolation_is_that_of_numpy(xs, ys):
+    rng = np.random.default_rng(0)
+    special = [np.nan, np.inf, -np.inf, 0.0, -0.0, *xs]
+    x = np.concatenate([special, rng.uniform(-4.0, 4.0, 1000), rng.integers(-4, 5, 100)])
+    stored = np.zeros(len(x))
+    table = np.array([*xs, *ys, -7.0, 7.0])
+    code = ("load_row", 0, 0), ("interpolate", 0, 1, 0), ("store_row", 1, 0, 1)
+    evaluate(code, (x, stored), np.zeros(len(x)), tables=(table,))
+    expected = [np.interp(value, xs, ys, left=-7.0, right=7.0) for value in x.tolist()]
+    np.testing.assert_array_equal(stored, expected)
 
 
 @pytest.mark.parametrize(

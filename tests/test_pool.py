@@ -14,6 +14,8 @@ from fmugym import pool as pools
 from fmugym.archive.bundled import BUNDLED, MODELS, is_bundled
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
+from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.plan import Component, Group, SystemPlan
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -36,21 +38,26 @@ OPTIONS = {
 }
 """Of ``make_pool``, by implementation."""
 
+OPTIONS |= {f"system in {name}": OPTIONS[name] for name in ("python", "native", "process")}
+"""With the FMU as a component of a system."""
+
 
 @pytest.fixture(params=OPTIONS)
 def make_pool(request, tmp_path):
     """Make pools of one implementation that are closed after the test."""
-    if request.param == "native" and not pools.has_native_pool():
+    if "native" in request.param and not pools.has_native_pool():
         pytest.skip("the C extension was not built")
     in_wine = request.param == "wine"
     if in_wine:
         request.getfixturevalue("wine")
         monkeypatch = request.getfixturevalue("monkeypatch")
-        monkeypatch.setattr(opening, "is_bundled", is_bundled_or_copy)
+        monkeypatch.setattr("fmugym.archive.fmu.is_bundled", is_bundled_or_copy)
     made = []
 
     def make(path, inputs, outputs, num_instances=1, time_step=0.1, strings=None, **spec):
         fmu = FMU(for_windows(path, tmp_path) if in_wine else path)
+        if "system" in request.param:
+            fmu = system_of(path)
         spec = PoolSpec(
             inputs=tuple(map(fmu.variable, inputs)),
             outputs=tuple(map(fmu.variable, outputs)),
@@ -60,13 +67,22 @@ def make_pool(request, tmp_path):
         )
         options = OPTIONS[request.param]
         pool = opening.make_pool(fmu, spec, num_instances, LOG, private_libraries=False, **options)
-        pool.variable = fmu.variable
+        pool.variable, pool.is_system = fmu.variable, "system" in request.param
         made.append(pool)
         return pool
 
     yield make
     for pool in made:
         pool.close()
+
+
+def system_of(path):
+    """A system of an FMU and a pendulum, whose variables can be looked up by the FMU's names."""
+    components = Component("plant", path), Component("other", bundled_fmu("Pendulum"))
+    groups = tuple(Group((part.name,)) for part in components)
+    system = SystemFMU(SystemPlan("both", components, groups=groups))
+    system.variable = lambda name: system.description.variable(f"plant.{name}")
+    return system
 
 
 def is_bundled_or_copy(path):
@@ -455,7 +471,10 @@ class TestFaults:
         set_up(pool, **{name: 3})
         doing = {"set_status": "setting the inputs", "get_status": "reading the outputs"}[name]
         assert step(pool)[1].tolist() == [Status.ERROR]
-        assert f"{doing} returned Error" in pool.failure(0)
+        if pool.is_system:  # its step sets and reads
+            assert "the step at t = 0 s returned Error in component 'plant'" in pool.failure(0)
+        else:
+            assert f"{doing} returned Error" in pool.failure(0)
         self.assert_sound(pool)
 
     @all_versions
@@ -480,7 +499,8 @@ class TestFaults:
         pool = pool(version, warm_up_steps=2)
         _, status = set_up(pool, fault=3, fault_step=2)
         assert status.tolist() == [Status.ERROR]
-        assert "the warm-up failed: Probe_" in pool.failure(0)
+        name = "both_" if pool.is_system else "Probe_"
+        assert f"the warm-up failed: {name}" in pool.failure(0)
         assert set_up(pool)[1].tolist() == [Status.OK]
 
     @all_versions

@@ -10,13 +10,16 @@ SLOW_MODULES = {
     "test_call_order",
     "test_cli_docs",
     "test_cli_tuning",
+    "test_compile",
     "test_copies",
+    "test_events",
     "test_examples",
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
     "test_examples_train_house",
     "test_export",
+    "test_export_fmu",
     "test_export_sb3",
     "test_fuzz",
     "test_fuzz_face",
@@ -25,6 +28,7 @@ SLOW_MODULES = {
     "test_fuzz_tasks",
     "test_lab_fuzz",
     "test_lab_programs",
+    "test_nested_fmus",
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
@@ -32,6 +36,8 @@ SLOW_MODULES = {
     "test_soak",
     "test_stand_in",
     "test_start_times",
+    "test_value_types",
+    "test_systems",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -61,6 +67,8 @@ EVERY_IN_CI = {
     "test_quirks": 4,
     "test_snapshot_machine": 4,
     "test_start_times": 5,
+    "test_value_types": 3,
+    "test_systems": 5,
     "test_words": 5,
     "test_zoo": 5,
 }
@@ -69,6 +77,9 @@ EVERY_IN_CI = {
 The numbers have no factor in common with those of FMI versions and ways of running, so that each of
 these occurs with others in turn.
 """
+
+EVERY_IN_SYSTEMS = 17
+"""The same for the contract of pools with the FMU as a component of a system."""
 
 SLOW_TESTS = (
     "test_baselines_tuning.py::test_it_finds",
@@ -176,6 +187,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )
@@ -212,4 +224,5 @@ def is_exhaustive(node_id, number):
     module = node_id.partition(".py")[0]
     if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
-    return is_slow(node_id, number) and number % EVERY_IN_CI.get(module, 1) > 0
+    every = EVERY_IN_SYSTEMS if "[system in " in node_id else EVERY_IN_CI.get(module, 1)
+    return is_slow(node_id, number) and number % every > 0

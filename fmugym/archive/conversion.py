@@ -223,16 +223,17 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         interface == "model_exchange" or offer.canHandleVariableCommunicationStepSize,
         offer.canGetAndSetFMUstate,
         offer.canSerializeFMUstate,
-        _provides_directional_derivatives(root, _ELEMENTS[interface]),
+        _provides(root, _ELEMENTS[interface], "Directional"),
         offer.canBeInstantiatedOnlyOncePerProcess,
         offer.needsExecutionTool,
+        _provides(root, _ELEMENTS[interface], "Adjoint"),
     )
 
 
-def _provides_directional_derivatives(root: Any, element: str) -> bool:
-    """Read the flag. FMI 3.0 spells it in the plural, which FMPy does not read."""
+def _provides(root: Any, element: str, kind: str) -> bool:
+    """Read a flag for derivatives. FMI 3.0 spells it in the plural, which FMPy does not read."""
     attributes = root.find(element).attrib
-    names = ("providesDirectionalDerivative", "providesDirectionalDerivatives")
+    names = (f"provides{kind}Derivative", f"provides{kind}Derivatives")
     return any(attributes.get(name) in {"true", "1"} for name in names)
 
 

@@ -7,9 +7,12 @@ from an FMU's XML.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
+from typing import Any, Final
 
 import fmpy
 
@@ -43,6 +46,12 @@ _KINDS = {
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 
 
+MOST_ELEMENTS: Final = 100_000
+"""How many elements an array may have of which elements are named."""
+
+_ELEMENT: Final = re.compile(r"(.+)\[(\d{1,9}(?:, ?\d{1,9})*)\]")
+"""The name of an element: that of its array, and its indices."""
+
 CLOCK_KINDS = (
     "constant",
     "fixed",
@@ -66,6 +75,8 @@ class Variable:
         nominal: None where neither the variable nor its declared type gives a finite number.
         items: Names and values of an enumeration.
         shape: The shape of an array (FMI 3.0); () for a scalar.
+        array: Of an element of an array, the array; None for other variables.
+        place: Of an element, its place in the array, in row-major order.
         clocks: The value references of the clocks that must tick whenever the value changes.
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
         interval, shift: Of a clock: the time between its ticks and that before the first one in
@@ -86,6 +97,8 @@ class Variable:
     description: str = ""
     items: tuple[tuple[str, int], ...] = ()
     shape: tuple[int, ...] = ()
+    array: Variable | None = None
+    place: int = 0
     clocks: tuple[int, ...] = ()
     ticking: str = ""
     interval: float = math.nan
@@ -102,7 +115,12 @@ class Variable:
     @property
     def numeric(self) -> bool:
         """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration."""
-        return self.kind in {"real", "integer", "boolean", "enumeration"} and not self.shape
+        return self.is_number and not self.shape
+
+    @property
+    def is_number(self) -> bool:
+        """Whether float64 can hold its value, or those of its elements."""
+        return self.kind in {"real", "integer", "boolean", "enumeration"}
 
     @property
     def settable_at_start(self) -> bool:
@@ -127,21 +145,59 @@ class Variable:
 
     @property
     def start_number(self) -> float:
-        """The start value of a numeric variable; 0 if the FMU gives none.
+        """The start value of a numeric scalar or element; 0 if the FMU gives none.
 
         Raises:
             ConfigError: If it is not a finite number.
         """
-        text = "0" if self.start is None else self.start
-        try:
-            number = float({"true": "1", "false": "0"}.get(text, text))
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
+        if self.array is not None:
+            return self.array.start_numbers[self.place]
+        return _number(self.name, "0" if self.start is None else self.start)
+
+    @cached_property
+    def start_numbers(self) -> tuple[float, ...]:
+        """The start values of the elements of a numeric array, in row-major order.
+
+        A single start value is that of all elements; without any they are 0.
+
+        Raises:
+            ConfigError: If their number is neither, or one is not a finite number.
+        """
+        texts = (self.start or "0").split()
+        if len(texts) == 1:
+            texts *= self.size
+        if len(texts) != self.size:
             raise ConfigError(
-                f"the start value of {self.name!r} is {text!r}, expected a finite number"
+                f"{self.name!r} is an array of {self.size} elements and has {len(texts)} start "
+                "values in the FMU"
             )
-        return number
+        return tuple(_number(self.name, text) for text in texts)
+
+    @property
+    def size(self) -> int:
+        """The number of values that FMI moves when it moves this variable; 1 for a scalar."""
+        return math.prod(self.shape if self.array is None else self.array.shape)
+
+    @cached_property
+    def elements(self) -> tuple[Variable, ...]:
+        """The elements of an array in row-major order: ``y[1,1]``, ``y[1,2]``, ...
+
+        A scalar is its own only element.
+
+        Raises:
+            ConfigError: If there are too many to name each.
+        """
+        if not self.shape:
+            return (self,)
+        if self.size > MOST_ELEMENTS:
+            raise ConfigError(
+                f"{self.name!r} is an array of {self.size} elements, at most {MOST_ELEMENTS} can "
+                "be used"
+            )
+        return tuple(
+            replace(self, name=f"{self.name}[{_index(place)}]", shape=(), array=self, place=number)
+            for number, place in enumerate(product(*map(range, self.shape)))
+        )
 
     @property
     def integer_limits(self) -> tuple[int, int]:
@@ -150,6 +206,33 @@ class Variable:
             return 0, 2 ** int(self.type[4:]) - 1
         bits = _INTEGER_BITS[self.type]
         return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        number = float({"true": "1", "false": "0"}.get(text, text))
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ConfigError(f"the start value of {name!r} is {text!r}, expected a finite number")
+    return number
+
+
+def _place(array: Variable, index: str) -> int | None:
+    """The place of an element in row-major order; None if the array has no such element."""
+    numbers = [int(number) - 1 for number in index.split(",")]
+    fits = len(numbers) == len(array.shape)
+    if not fits or not all(0 <= n < size for n, size in zip(numbers, array.shape, strict=True)):
+        return None
+    place = 0
+    for number, size in zip(numbers, array.shape, strict=True):
+        place = place * size + number
+    return place
+
+
+def _index(place: tuple[int, ...]) -> str:
+    """The index of an element as Modelica writes it: the first one is 1."""
+    return ",".join(str(number + 1) for number in place)
 
 
 @dataclass(frozen=True)
@@ -162,6 +245,12 @@ class Capabilities:
     provides_directional_derivatives: bool = False
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
+    provides_adjoint_derivatives: bool = False
+
+    @property
+    def provides_derivatives(self) -> bool:
+        """Whether the FMU differentiates itself, in one way or the other."""
+        return self.provides_directional_derivatives or self.provides_adjoint_derivatives
 
 
 @dataclass(frozen=True)
@@ -288,7 +377,7 @@ class ModelDescription:
         return str(fmpy.platform_tuple if self.fmi_major_version == 3 else fmpy.platform)
 
     def variable(self, name: str) -> Variable:
-        """Look a variable up by its name.
+        """Look a variable, or an element of an array as ``y[2]`` or ``y[1,3]``, up by its name.
 
         Raises:
             ConfigError: If there is no such variable; the message suggests the nearest name.
@@ -296,6 +385,57 @@ class ModelDescription:
         try:
             return self.variables[name]
         except Exception:  # a KeyError; or something that is no key at all
-            raise unknown_name(
-                f"variable of {self.model_name}", name, list(self.variables)
-            ) from None
+            known = list(self.variables)
+        array, index = self._array_and_index(name)
+        if array is None:
+            raise unknown_name(f"variable of {self.model_name}", name, known)
+        place = _place(array, index)
+        if place is None:
+            raise ConfigError(
+                f"{name!r} is no element of {array.name!r}, an array of shape {array.shape}; its "
+                f"indices begin with 1"
+            )
+        return array.elements[place]
+
+    def _array_and_index(self, name: Any) -> tuple[Variable | None, str]:
+        """Take the name of an element apart; no array if it is not the name of one."""
+        match = _ELEMENT.fullmatch(name) if isinstance(name, str) else None
+        array = None if match is None else self.variables.get(match[1])
+        return (array, match[2]) if array and match and array.shape else (None, "")
+
+    def find(self, name: str) -> Variable | None:
+        """Do what ``variable`` does, but return None if there is no such variable."""
+        try:
+            return self.variable(name)
+        except ConfigError:
+            return None
+
+    def scalars(self, name: str) -> tuple[Variable, ...]:
+        """Look up the scalars that a name stands for.
+
+        The name of an array stands for its elements in row-major order. FMI 1.0 and 2.0 have no
+        arrays: there ``y`` stands for the variables ``y[1]``, ``y[2]``, ... unless a variable has
+        this name.
+
+        Raises:
+            ConfigError: If there is no such variable, or an array has too many elements.
+        """
+        if isinstance(name, str) and name not in self.variables:
+            named = self._named_arrays.get(name)
+            if named is not None:
+                return named
+        return self.variable(name).elements
+
+    @cached_property
+    def _named_arrays(self) -> Mapping[str, tuple[Variable, ...]]:
+        """The scalars that are elements of an array by their names only, by the array's name."""
+        found: dict[str, list[tuple[tuple[int, ...], Variable]]] = {}
+        for name, variable in self.variables.items():
+            match = _ELEMENT.fullmatch(name)
+            if match is not None and not variable.shape:
+                index = tuple(int(number) for number in match[2].split(","))
+                found.setdefault(match[1], []).append((index, variable))
+        return {
+            name: tuple(variable for _, variable in sorted(elements, key=lambda e: e[0]))
+            for name, elements in found.items()
+        }

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import shlex
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from typing import Final
 
 import fmpy
 
+from fmugym.archive.bundled import is_bundled
 from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
 from fmugym.archive.description import INTERFACES, ModelDescription, Variable
 from fmugym.archive.executable import check_library
@@ -64,6 +66,24 @@ class LoadableFMU(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.path)!r})"
+
+    @property
+    def parts(self) -> tuple[LoadableFMU, ...]:
+        """The FMUs of a system; none otherwise."""
+        return ()
+
+    @property
+    def bundled(self) -> bool:
+        """Whether it comes with the package."""
+        return all(part.bundled for part in self.parts) if self.parts else is_bundled(self.path)
+
+    def prepare_libraries(self) -> list[Path]:
+        """Make the libraries of all parts ready; see ``prepare_library``.
+
+        Returns:
+            Their paths; one where there are no parts.
+        """
+        return [part.prepare_library() for part in self.parts or (self,)]
 
     @property
     def platform(self) -> str:
@@ -216,14 +236,16 @@ class FMU(LoadableFMU):
     @classmethod
     def of(cls, source: FMU | str | os.PathLike[str]) -> FMU:
         """Open an FMU by its path, or open a second one with the arguments of the first."""
-        if not isinstance(source, FMU):
-            return cls(source)
-        return cls(
-            source.path,
-            limits=source.limits,
-            preload=source.preload,
-            probe_timeout=source.probe_timeout,
-            interface=source.interface,
+        return source.again() if isinstance(source, FMU) else cls(source)
+
+    def again(self) -> FMU:
+        """Open the same FMU once more, with a temporary folder of its own."""
+        return FMU(
+            self.path,
+            limits=self.limits,
+            preload=self.preload,
+            probe_timeout=self.probe_timeout,
+            interface=self.interface,
         )
 
     def variable(self, name: str) -> Variable:
@@ -333,6 +355,8 @@ class FMU(LoadableFMU):
             f"{self.path.name} has no library for this platform ({self.library}); it was built "
             f"for: {', '.join(self.platforms) or 'no platform at all'}"
         )
+        if any(place.startswith("sources/") for place in self._archive.files):
+            text += f". It has its source code: fmugym compile {shlex.quote(self.path.name)}"
         if can_run_windows() and {p.casefold() for p in self.platforms} & _WINDOWS_32:
             text += ". Those for 32-bit Windows cannot run in Wine here; export for 64-bit Windows"
         return text

@@ -129,9 +129,10 @@ class Records:
 
     def get(self, alias: str) -> Record | None:
         """The record of an alias or of a variable of the FMU; None if there is none."""
-        if alias not in self._records and alias in self._description.variables:
+        variable = None if alias in self._records else self._description.find(alias)
+        if variable is not None:
             entry = Entry(None, ("variables", alias), self._root.sources)
-            self._records[alias] = self._record(alias, entry, self._description.variables[alias])
+            self._records[alias] = self._record(alias, entry, variable)
         return self._records.get(alias)
 
     def __getitem__(self, alias: str) -> Record:
@@ -201,7 +202,7 @@ class Records:
     def _declared(self, entry: Entry) -> Record:
         table, alias = entry.table(VARIABLE_KEYS), entry.name
         if "name" not in table:
-            return self._record(alias, entry, self._description.variables.get(alias))
+            return self._record(alias, entry, self._description.find(alias))
         with table["name"].placing():
             return self._record(alias, entry, self._description.variable(table["name"].text()))
 

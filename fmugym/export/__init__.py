@@ -5,6 +5,7 @@ and ``write_onnx`` write it. See ``docs/deploy.md``.
 """
 
 from fmugym.export.agent import Agent, agent_of
+from fmugym.export.fmus import write_fmu
 from fmugym.export.network import Activation, Layer, Network, Scaling, network_of
 from fmugym.export.writing import write_c
 
@@ -17,4 +18,5 @@ __all__ = [
     "agent_of",
     "network_of",
     "write_c",
+    "write_fmu",
 ]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
+from fmugym.archive.description import Unit
 from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
@@ -26,12 +28,14 @@ class Agent:
         logic: What surrounds the network.
         network: The network.
         notes: Lines that tell a reader what it is.
+        units: The units of the plant by name.
     """
 
     name: str
     logic: Logic
     network: Network
     notes: tuple[str, ...] = ()
+    units: Mapping[str, Unit] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.logic.observation)
@@ -78,7 +82,7 @@ def agent_of(
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     with without_imperfections(env) as ideal:
         logic = logic_of(ideal, all_inputs=all_inputs)
-    return Agent(name, logic, network, _notes(env, model))
+    return Agent(name, logic, network, _notes(env, model), env.fmu.description.units)
 
 
 def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:

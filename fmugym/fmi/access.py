@@ -13,7 +13,44 @@ from fmugym.archive.description import Variable
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status, sane
 
-__all__ = ["Access"]
+__all__ = ["Access", "unlisted"]
+
+_Group = tuple[list[int], list[int], npt.NDArray[Any], Any]
+"""The places of variables in the list and in the FMU's memory, this memory, and the calls."""
+
+
+def unlisted(variables: Sequence[Variable]) -> list[Variable]:
+    """Find what is missing of arrays of which only some elements are listed.
+
+    FMI moves whole arrays only. Elements that are not listed keep their start values.
+    """
+    listed = {variable.name for variable in variables}
+    arrays = dict.fromkeys(v.array for v in variables if v.array is not None)
+    return [one for array in arrays for one in array.elements if one.name not in listed]
+
+
+def _by_type(instance: Instance, variables: Sequence[Variable]) -> dict[str, list[int]]:
+    by_type: dict[str, list[int]] = {}
+    for index, variable in enumerate(variables):
+        by_type.setdefault(instance.c_type(variable), []).append(index)
+    return by_type
+
+
+def _memory_of(variable: Variable, index: int) -> tuple[int, int]:
+    """What variables with the same memory have in common: an array has one, each scalar its own."""
+    return variable.value_reference, -1 if variable.array is not None else index
+
+
+def _offsets(variables: Sequence[Variable]) -> tuple[dict[tuple[int, int], int], int]:
+    """Where the memory of each array and scalar begins, and the size of all."""
+    offsets: dict[tuple[int, int], int] = {}
+    size = 0
+    for index, variable in enumerate(variables):
+        memory = _memory_of(variable, index)
+        if memory not in offsets:
+            offsets[memory] = size
+            size += variable.size
+    return offsets, size
 
 
 class Access:
@@ -36,43 +73,55 @@ class Access:
         values: npt.NDArray[np.float64] | None = None,
     ) -> None:
         self.values = np.zeros(len(variables)) if values is None else values
-        by_type: dict[str, list[int]] = {}
-        for index, variable in enumerate(variables):
-            by_type.setdefault(instance.c_type(variable), []).append(index)
-        references = np.array([v.value_reference for v in variables], np.uint32)
-        self._groups: list[tuple[list[int], npt.NDArray[Any], Any]] = []
-        for c_type, indices in by_type.items():
-            dtype = instance.dtypes[c_type]
-            shares = dtype == np.float64 and len(indices) == len(variables)
-            buffer = self.values if shares else np.zeros(len(indices), dtype)
-            calls = instance.prepare_access(c_type, references[indices], buffer)
-            self._groups.append((indices, buffer, calls))
+        self._groups = [
+            self._group(instance, c_type, indices, variables)
+            for c_type, indices in _by_type(instance, variables).items()
+        ]
         self._use_single_call()
+
+    def _group(
+        self,
+        instance: Instance,
+        c_type: str,
+        indices: list[int],
+        variables: Sequence[Variable],
+    ) -> _Group:
+        """Prepare the calls for the variables of one C type."""
+        own = [variables[index] for index in indices]
+        offsets, size = _offsets(own)
+        places = [offsets[_memory_of(v, i)] + v.place for i, v in enumerate(own)]
+        dtype = instance.dtypes[c_type]
+        shares = dtype == np.float64 and places == indices and size == len(variables)
+        buffer = self.values if shares else np.zeros(size, dtype)
+        for variable in unlisted(own):
+            buffer[offsets[_memory_of(variable, 0)] + variable.place] = variable.start_number
+        references = np.array([reference for reference, _ in offsets], np.uint32)
+        return indices, places, buffer, instance.prepare_access(c_type, references, buffer)
 
     def _use_single_call(self) -> None:
         """Replace the methods with the FMU's functions if one call moves all values, as usual."""
-        if len(self._groups) == 1 and self._groups[0][1] is self.values:
-            get, set_, arguments = self._groups[0][2]
+        if len(self._groups) == 1 and self._groups[0][2] is self.values:
+            get, set_, arguments = self._groups[0][3]
             self.get = functools.partial(get, *arguments)  # type: ignore[method-assign]  # faster
             self.set = functools.partial(set_, *arguments)  # type: ignore[method-assign]  # faster
 
     def get(self) -> int:
         """Read all values from the FMU; return the worst status."""
         worst = 0
-        for indices, buffer, (get, _, arguments) in self._groups:
+        for indices, places, buffer, (get, _, arguments) in self._groups:
             worst = max(worst, sane(get(*arguments)))
             if worst > Status.WARNING:
                 break
             if buffer is not self.values:
-                self.values[indices] = buffer
+                self.values[indices] = buffer[places]
         return worst
 
     def set(self) -> int:
         """Write all values to the FMU; return the worst status."""
         worst = 0
-        for indices, buffer, (_, set_, arguments) in self._groups:
+        for indices, places, buffer, (_, set_, arguments) in self._groups:
             if buffer is not self.values:
-                np.copyto(buffer, self.values[indices], casting="unsafe")
+                buffer[places] = self.values[indices].astype(buffer.dtype)
             worst = max(worst, sane(set_(*arguments)))
             if worst > Status.WARNING:
                 break

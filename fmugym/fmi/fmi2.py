@@ -105,6 +105,7 @@ class FMI2Instance(Instance):
             check("setting up the experiment", setup(component, *span.tolerances, *span.times))
             set_start_values()
             check("entering initialization", enter(component))
+            self.exchange_values()
             check("initialization", leave(component))
 
         return run

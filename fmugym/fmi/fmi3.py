@@ -120,6 +120,7 @@ class FMI3Instance(Instance):
             set_start_values()
             check("entering initialization", enter(component, *span.tolerances, *span.times))
             self._in_initialization(span)
+            self.exchange_values()
             check("initialization", leave(component))
 
         return run

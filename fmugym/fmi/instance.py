@@ -68,6 +68,9 @@ class Instance(ABC):
     """The C type of enumerations in this FMI version."""
     _deserialize: ClassVar = "Deserialize"
 
+    exchange: Callable[[], None] | None = None
+    """Called in Initialization Mode, to exchange values with other FMUs. FMI 1.0 has none."""
+
     def __init__(
         self,
         description: ModelDescription,
@@ -210,7 +213,7 @@ class Instance(ABC):
             references.ctypes.data_as(ctypes.c_void_p),
             ctypes.c_size_t(len(references)),
             buffer.ctypes.data_as(ctypes.c_void_p),
-            *self._trailing_arguments(len(references)),
+            *self._trailing_arguments(len(buffer)),
         )
         return self._function(f"Get{c_type}"), self._function(f"Set{c_type}"), arguments
 
@@ -281,6 +284,11 @@ class Instance(ABC):
         self.check("reset", self._reset_function(self._component))
         self.phase = Phase.INSTANTIATED
 
+    def exchange_values(self) -> None:
+        """Exchange values with other FMUs in Initialization Mode."""
+        if self.exchange is not None:
+            self.exchange()
+
     def free(self) -> None:
         """Terminate and free the instance. It may be called more than once."""
         if not self._slave.component:
@@ -345,7 +353,7 @@ class Instance(ABC):
                 f"{self._log.instance_name}: cannot {doing} while {self.phase.name.lower()}"
             )
 
-    # Directional derivatives, where the FMU offers them (FMI 2.0 and 3.0).
+    # Directional or adjoint derivatives, where the FMU offers them (FMI 2.0 and 3.0).
 
     def jacobian(
         self, unknowns: Sequence[Variable], knowns: Sequence[Variable]
@@ -360,35 +368,41 @@ class Instance(ABC):
             The partial derivatives, shape (len(unknowns), len(knowns)), in the variables' units.
 
         Raises:
-            SimulationError: If the FMU provides no directional derivatives, or fails.
+            SimulationError: If the FMU provides no derivatives, or fails.
         """
-        if not self._description.capabilities.provides_directional_derivatives:
-            raise SimulationError(
-                f"{self._description.model_name} provides no directional derivatives"
-            )
+        capabilities = self._description.capabilities
+        if not capabilities.provides_derivatives:
+            raise SimulationError(f"{self._description.model_name} provides no derivatives")
         self._require(Phase.STEPPING, "differentiate")
         result = np.zeros((len(unknowns), len(knowns)))
-        for column, known in zip(result.T, knowns, strict=True):
-            column[:] = self._partial_derivatives(unknowns, known)
+        if capabilities.provides_directional_derivatives:
+            for column, known in zip(result.T, knowns, strict=True):
+                column[:] = self._derivatives("Directional", unknowns, [known])
+        else:
+            for row, unknown in zip(result, unknowns, strict=True):
+                row[:] = self._derivatives("Adjoint", [unknown], knowns)
         return result
 
-    def _partial_derivatives(
-        self, unknowns: Sequence[Variable], known: Variable
+    def _derivatives(
+        self, kind: str, unknowns: Sequence[Variable], knowns: Sequence[Variable]
     ) -> npt.NDArray[np.float64]:
-        count, reference, seed = len(unknowns), known.value_reference, ctypes.c_double(1.0)
-        sensitivity = np.zeros(count)
-        status = self._function("GetDirectionalDerivative")(
+        """Differentiate all unknowns by one known, or, adjoint, one unknown by all knowns."""
+        seeded, other = (unknowns, knowns) if kind == "Adjoint" else (knowns, unknowns)
+        sensitivity, seed = np.zeros(len(other)), ctypes.c_double(1.0)
+        references = [
+            ((ctypes.c_uint32 * len(some))(*(v.value_reference for v in some)), len(some))
+            for some in (unknowns, knowns)
+        ]
+        status = self._function(f"Get{kind}Derivative")(
             self._component,
-            (ctypes.c_uint32 * count)(*(v.value_reference for v in unknowns)),
-            ctypes.c_size_t(count),
-            ctypes.byref(ctypes.c_uint32(reference)),
-            ctypes.c_size_t(1),
+            *(part for array, n in references for part in (array, ctypes.c_size_t(n))),
             ctypes.byref(seed),
             *self._trailing_arguments(1),
             sensitivity.ctypes.data_as(ctypes.c_void_p),
-            *self._trailing_arguments(count),
+            *self._trailing_arguments(len(other)),
         )
-        self.check(f"the derivative by {known.name!r}", status)
+        word = "of" if kind == "Adjoint" else "by"
+        self.check(f"the derivative {word} {seeded[0].name!r}", status)
         return sensitivity
 
     # FMU state, where the FMU offers it (FMI 2.0 and 3.0).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 
-__all__ = ["Phase", "Status", "sane"]
+__all__ = ["Phase", "Status", "failed_call", "sane"]
 
 
 class Status(enum.IntEnum):
@@ -37,3 +37,16 @@ class Phase(enum.Enum):
 def sane(status: int) -> int:
     """Turn codes that no call here may return into an error, Pending included."""
     return status if 0 <= status <= Status.FATAL else Status.ERROR
+
+
+def failed_call(doing: str, status: int, where: str) -> str:
+    """Say what a call returned.
+
+    Args:
+        doing: The call.
+        status: A ``Status``.
+        where: The component of a system; "" for a lone FMU.
+    """
+    known = Status(status)
+    result = "failed" if known is Status.NOT_FINITE else f"returned {known.name.capitalize()}"
+    return f"{doing} {result}" + (f" in {where}" if where else "")

@@ -22,7 +22,6 @@ import math
 from collections.abc import Callable
 from typing import Final, ParamSpec, TypeVar
 
-from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.health import Column, HealthArray
@@ -333,6 +332,6 @@ def watch_leaks(
         recycle: See ``LeakWatch``.
         log: See ``LeakWatch``.
     """
-    if spec.leak_limit is None or not memory_is_known() or is_bundled(fmu.path):
+    if spec.leak_limit is None or not memory_is_known() or fmu.bundled:
         return None
     return LeakWatch(spec.leak_limit, counts, recycle, log, fmu.path.name)

@@ -50,15 +50,18 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     manner_of,
     record_from,
     solving_settings,
-    types_and_references,
+    table_of,
     variable_settings,
     variables_of,
 )
 from fmugym.pool.spec import ResetMethod, start_variables
+from fmugym.pool.systems import system_settings
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
+from fmugym.systems.description import SystemDescription
 
 __all__ = ["NativePool"]
 
@@ -144,10 +147,10 @@ class NativePool(SavingPool):
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
-        paths = [fmu.prepare_library()]
+        paths = fmu.prepare_libraries()
         folder = fmu.extract()
         if private_libraries:
-            paths = _copy_library(folder, Path(fmu.library), self.num_instances)
+            paths = _copy_libraries(fmu, folder, self.num_instances)
         place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
         try:
             return _native.Pool(
@@ -159,6 +162,7 @@ class NativePool(SavingPool):
                         "logging": log.isEnabledFor(logging.INFO),
                         "mark": None if self._mark is None else self._mark.page,
                         "solving": solving_settings(description, spec),
+                        "system": system_settings(description, spec, folder),
                     },
                 ),
                 experiment=cast("_native.Experiment", experiment_settings(spec)),
@@ -177,7 +181,7 @@ class NativePool(SavingPool):
                 },
                 count=self.num_instances,
                 threads=self.threads,
-                callback=_Receiver(log, description.model_identifier, self._first_index),
+                callback=_Receiver(log, description, self._first_index),
                 listener=self._listener,
             )
         except OSError as error:
@@ -189,9 +193,9 @@ class NativePool(SavingPool):
         if access is None:
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
-            version = self._fmu.description.fmi_major_version
-            parts = types_and_references(variables, version)
-            access = _native.Access(version, *parts, manner_of(self._fmu.description))
+            version = table_of(self._fmu.description)
+            manner = manner_of(self._fmu.description)
+            access = _native.Access(version, *listing(variables, version), manner)
             self._accesses[variables] = access
         return access
 
@@ -316,7 +320,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(start_variables(self._variables, record.names))
+        access = self._access(start_variables(self._variable, record.names))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
@@ -599,11 +603,15 @@ class NativePool(SavingPool):
 class _Receiver:
     """Passes on the FMU's messages; it must not refer to the pool."""
 
-    def __init__(self, log: logging.Logger, model: str, first_index: int) -> None:
-        self._log, self._model, self._first_index = log, model, first_index
+    def __init__(self, log: logging.Logger, description: ModelDescription, first: int) -> None:
+        self._log, self._model, self._first_index = log, description.model_identifier, first
+        self._parts = [""]
+        if isinstance(description, SystemDescription):
+            self._parts = [f".{component.name}" for component in description.plan.components]
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
-        name = f"{self._model}_{self._first_index + index}"
+        instance, part = divmod(index, len(self._parts))
+        name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
         level, text = as_record(name, status, category, message)
         self._log.log(level, "%s", text)
 
@@ -623,7 +631,7 @@ class _Listener:
     def _tape(
         self,
         types: bytes,
-        references: bytes,
+        elements: bytes,
         starts: bytes,
         first_outputs: bytes,
         inputs: bytes,
@@ -631,8 +639,9 @@ class _Listener:
         statuses: bytes,
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
+        references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
         return Tape(
-            variables_of(self._description, types, np.frombuffer(references, np.uint32).tolist()),
+            variables_of(self._description, types, references, places),
             np.frombuffer(starts),
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),
@@ -643,6 +652,17 @@ class _Listener:
 
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:
     return None if mask is None else np.asarray(mask, np.bool_)
+
+
+def _copy_libraries(fmu: LoadableFMU, folder: Path, count: int) -> list[Path]:
+    """Copy the libraries of all parts for each instance; see ``_copy_library``."""
+    parts = fmu.parts or (fmu,)
+    folders = [part.extract() for part in fmu.parts] or [folder]
+    copies = [
+        _copy_library(place, Path(part.library), count)
+        for part, place in zip(parts, folders, strict=True)
+    ]
+    return [path for paths in zip(*copies, strict=True) for path in paths]
 
 
 def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import SimulationError
-from fmugym.fmi.library import Library
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
+from fmugym.fmi.system import open_library
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
@@ -73,7 +73,7 @@ class PythonPool(SavingPool):
         self._mark = mark
         self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
         with self._resetting:
-            self._library = Library(fmu, log, spec.solving)
+            self._library = open_library(fmu, log, spec.solving, spec.inputs, spec.outputs)
         pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:

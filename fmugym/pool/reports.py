@@ -10,7 +10,7 @@ import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.errors import printable
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import failed_call
 from fmugym.fmi.words import quoted, unpacked
 from fmugym.pool.spec import PoolSpec
 
@@ -38,6 +38,7 @@ class Failure(NamedTuple):
     string: int
     said: str
     values: bytes | None
+    part: str | None = None
 
 
 def describe_failure(failure: Failure, spec: PoolSpec, name: str) -> str:
@@ -57,7 +58,7 @@ def _sentence(failure: Failure, spec: PoolSpec, name: str) -> str:
         doing = f"setting {_string_name(spec, failure.string)!r}"
     if failure.status < 0:  # the call was refused, and the text is a whole sentence
         return doing
-    return f"{name}: {doing} returned {Status(failure.status).name.capitalize()}"
+    return f"{name}: {failed_call(doing, failure.status, failure.part or '')}"
 
 
 def _string_name(spec: PoolSpec, reference: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import weakref
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,14 +45,14 @@ class SavingPool(AttendedPool):
     A subclass calls ``_prepare_saving`` in its constructor.
     """
 
-    _variables: Mapping[str, Variable]
+    _variable: Callable[[str], Variable]
     _start_time = 0.0
     _offered = SaveMethod.REPLAY
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
         """Take over what saving needs; returns whether the pool must keep records."""
-        self._variables, self._start_time = description.variables, spec.start_time
+        self._variable, self._start_time = description.variable, spec.start_time
         self._offered = offered_method(description, spec)
         return spec.records or self._offered is not SaveMethod.STATE
 
@@ -202,7 +202,7 @@ class SavingPool(AttendedPool):
             mask = np.zeros(self.num_instances, np.bool_)
             for record, index in group:
                 values[:, index], mask[index] = record.starts, True
-            self.reset(start_variables(self._variables, names), values, mask)
+            self.reset(start_variables(self._variable, names), values, mask)
 
     def _step_again(self, records: Sequence[tuple[Record, int]]) -> None:
         inputs, skip = self.inputs.copy(), np.ones(self.num_instances, np.bool_)

@@ -17,18 +17,21 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
+from fmugym.fmi.access import unlisted
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
+from fmugym.systems.description import SystemDescription
 from fmugym.wine.loader import windows_path, windows_uri
 
 __all__ = [
     "PlaceOfFMU",
     "experiment_settings",
     "library_settings",
+    "listing",
     "manner_of",
     "record_from",
     "solving_settings",
-    "types_and_references",
+    "table_of",
     "variable_settings",
     "variables_of",
 ]
@@ -102,7 +105,7 @@ def _place_of_resources(folder: Path, version: int) -> Path:
 def library_settings(description: ModelDescription, place: PlaceOfFMU) -> dict[str, Any]:
     """What to load, and what is known of it."""
     return {
-        "version": description.fmi_major_version,
+        "version": table_of(description),
         "manner": manner_of(description),
         "model": description.model_identifier.encode(),
         "token": description.instantiation_token.encode(),
@@ -188,39 +191,65 @@ def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
     )
 
 
-def types_and_references(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes]:
-    """The C types of variables, a byte each, and their value references, four bytes each."""
-    types = bytes(_type_number(variable, version) for variable in variables)
-    references = np.array([v.value_reference for v in variables], np.uint32)
-    return types, references.tobytes()
+def table_of(description: ModelDescription) -> int:
+    """The table of functions in C: the major FMI version, or 0 for systems."""
+    is_system = isinstance(description, SystemDescription)
+    return 0 if is_system else description.fmi_major_version
+
+
+def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, bytes]:
+    """What ``listing_take`` of ``native/access.h`` takes.
+
+    Args:
+        variables: The variables.
+        version: See ``table_of``; the values of systems are all of type Float64.
+
+    Returns:
+        The C types of the variables, a byte each; their value references, places in their arrays,
+        and the sizes of these, three times four bytes each; and the values of the elements that
+        FMI needs besides, float64. The others come first.
+    """
+    rest = unlisted(variables)
+    both = [*variables, *rest]
+    types = bytes(_type_number(variable, version) for variable in both)
+    elements = np.array([(v.value_reference, v.place, v.size) for v in both], np.uint32)
+    return types, elements.tobytes(), np.array([v.start_number for v in rest]).tobytes()
 
 
 def _type_number(variable: Variable, version: int) -> int:
     if is_start_time(variable):
         return _START_TIME
+    if version == 0:
+        return _TYPES.index("Float64")
     if variable.kind == "enumeration":
         return _TYPES.index("Int64" if version == 3 else "Int32")
     return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
 
 
 def variables_of(
-    description: ModelDescription, types: Sequence[int], references: Sequence[int]
+    description: ModelDescription,
+    types: Sequence[int],
+    references: Sequence[int],
+    places: Sequence[int],
 ) -> tuple[Variable, ...]:
-    """Find variables by C type and value reference; aliases are as good."""
-    version = description.fmi_major_version
+    """Find variables by C type, value reference and place in an array; aliases are as good."""
+    version = table_of(description)
     known = {
         (_type_number(v, version), v.value_reference): v
         for v in description.variables.values()
-        if v.numeric
+        if v.is_number
     }
     known[_START_TIME, START_TIME.value_reference] = START_TIME
-    return tuple(known[pair] for pair in zip(types, references, strict=True))
+    return tuple(
+        known[type_, reference].elements[place]
+        for type_, reference, place in zip(types, references, places, strict=True)
+    )
 
 
 def record_from(
     description: ModelDescription,
     spec: PoolSpec,
-    starts: Sequence[tuple[int, int, float]],
+    starts: Sequence[tuple[int, int, int, float]],
     steps: int,
     inputs: bytes,
 ) -> Record:
@@ -229,13 +258,13 @@ def record_from(
     Args:
         description: That of the FMU.
         spec: That of the pool.
-        starts: The C type, value reference and value of each start value.
+        starts: The C type, value reference, place in an array and value of each start value.
         steps: The number of steps.
         inputs: Those of each step, float64.
     """
-    types, references, values = zip(*starts, strict=True) if starts else ((), (), ())
+    *identities, values = zip(*starts, strict=True) if starts else ((), (), (), ())
     return Record(
-        tuple(variable.name for variable in variables_of(description, types, references)),
+        tuple(variable.name for variable in variables_of(description, *identities)),
         np.array(values, np.float64),
         np.frombuffer(inputs).reshape(steps, len(spec.inputs)),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
@@ -72,14 +72,14 @@ def is_start_time(variable: Variable) -> bool:
     return variable.type == START_TIME.type
 
 
-def start_variables(known: Mapping[str, Variable], names: Iterable[str]) -> tuple[Variable, ...]:
+def start_variables(find: Callable[[str], Variable], names: Iterable[str]) -> tuple[Variable, ...]:
     """Find start variables by name, ``START_TIME`` included.
 
     Args:
-        known: The variables of the FMU.
+        find: Finds a variable of the FMU.
         names: The names.
     """
-    return tuple(START_TIME if n == START_TIME.name else known[n] for n in names)
+    return tuple(START_TIME if n == START_TIME.name else find(n) for n in names)
 
 
 class ResetMethod(StrEnum):

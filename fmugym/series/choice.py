@@ -111,12 +111,20 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
 
 
 def _found(pattern: str, known: Sequence[str], others: Iterable[str]) -> list[str]:
-    """The names that a glob finds; constants and parameters must be named in full."""
-    found = [name for name in known if matches(pattern, name)]
-    found += [name for name in others if name == pattern and name not in found]
+    """The names that a glob finds; constants and parameters must be named in full.
+
+    The name of an array stands for its elements.
+    """
+    found = [name for name in known if matches(pattern, name) or _array_of(name) == pattern]
+    found += [n for n in others if pattern in {n, _array_of(n)} and n not in found]
     if not found:
         raise unknown_name("variable to record", pattern, [*known, *others])
     return found
+
+
+def _array_of(name: str) -> str:
+    """The name of the array of which this is an element; "" if it is none."""
+    return name.rpartition("[")[0] if name.endswith("]") else ""
 
 
 def _varies(variable: Variable) -> bool:
@@ -130,10 +138,10 @@ def quantities_of(env: FMUEnv) -> Quantities:
 
 
 def _of_config(env: FMUEnv) -> Quantities:
-    config, find = env.config, env.fmu.variable
-    inputs, outputs = config.model_input_names, tuple(env.out)
-    episode = [n for n, value in config.episode_variables.items() if np.ndim(value) == 0]
-    parameters = tuple(config.model_parameters)
+    find, interface = env.fmu.variable, env._interface
+    inputs, outputs = interface.input_names, tuple(env.out)
+    episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
+    parameters = tuple(interface.parameters)
 
     def read(env: Any) -> Sequence[Any]:
         drawn, variables = env.parameters, env.variables
@@ -158,11 +166,10 @@ def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
     """The numeric variables of the FMU for which the task has no name of its own."""
-    config = env.config
-    known = {*config.model_input_names, *env.out, *(one.name for one in quantities)}
+    known = {*env._interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
-        if variable.numeric and variable.name not in known:
-            yield variable
+        if variable.is_number:
+            yield from (one for one in variable.elements if one.name not in known)
 
 
 def _observation_names(env: FMUEnv) -> Sequence[str]:

@@ -16,7 +16,7 @@ from fmugym.single.purity import unchanged_globals
 from fmugym.single.watch import Watched, noting_reads, watched_in
 from fmugym.task.readings import Readings, reading
 from fmugym.task.results import FLOAT32_LIMIT
-from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive, numpy_of
@@ -359,12 +359,12 @@ class _Tracer:
         return array_of(graph, kind, names, action.dtype)
 
     def _symbolic_parameters(self) -> dict[str, Any]:
-        return {
-            name: scalar_of(self._graph, "row", ("parameter", name, i), np.float64, float)
+        return ParameterValues(
+            (name, scalar_of(self._graph, "row", ("parameter", name, i), np.float64, float))
             if type(value) is float
-            else value
+            else (name, value)
             for i, (name, value) in enumerate(self._parameters.items())
-        }
+        )
 
     def _symbolic_variables(self, head: str) -> EpisodeVariables:
         variables = EpisodeVariables(self._variables)

@@ -20,13 +20,12 @@ from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, highest_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool import Pool, PoolSpec
-from fmugym.pool.spec import is_start_time
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import OwnHooks
 from fmugym.task.inputs import InputWriter
-from fmugym.task.interface import checked, resolve, start_variable
+from fmugym.task.interface import resolve
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
@@ -263,19 +262,14 @@ class Constructed(Pictured):
     def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
         """Prepare the draws of episodes in which these parameters replace the config's."""
         parameters = dict(self._interface.parameters)
-        for name, value in overrides.items():
-            value = as_distribution(repr(name), value)
-            variable = self._interface.parameter(name)
-            if not is_start_time(variable):
-                variable = start_variable(self.fmu.description, name, value)
-            if not variable.numeric:
-                raise ConfigError(f"{name!r} is a String: it can be set in the config only")
-            parameters[name] = checked(variable, value)
+        given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
+        own = self._interface.start_values(given)
+        parameters |= own
         return EpisodePlan(
             tuple(map(self._interface.parameter, parameters)),
             parameters,
             self.config.episode_variables,
-            overrides.keys(),
+            own.keys(),
         )
 
 

@@ -15,6 +15,7 @@ from fmugym.checks import check_number
 from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
 from fmugym.task.interface import checked_value
+from fmugym.task.values import ParameterValues
 from fmugym.trial.rehearsal import Starts
 
 __all__ = ["Draw", "Episode", "EpisodePlan", "Sampler"]
@@ -75,7 +76,7 @@ class EpisodePlan:
         overridden: Collection[str] = (),
     ) -> None:
         self.model_variables = model_variables
-        self._parameters = dict(parameters)
+        self._parameters = ParameterValues(parameters)
         self._variables = dict(episode_variables)
         self.constants = np.array(
             [0.0 if is_distribution(value) else value for value in parameters.values()],

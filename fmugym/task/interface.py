@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.checks import LARGEST_COUNT, check_number
+from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
 from fmugym.config import EnvConfig
-from fmugym.distributions import is_distribution
+from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import (
     FIXED_STEP_SOLVERS,
@@ -26,10 +26,13 @@ __all__ = [
     "checked_value",
     "input_variable",
     "output_variable",
+    "outputs_named",
     "resolve",
+    "start_values",
     "start_variable",
 ]
 
+_Value = TypeVar("_Value")
 _LARGEST_FLOAT32: Final = float(np.finfo(np.float32).max)
 _LARGEST_EXACT_INTEGER: Final = 2.0**53
 
@@ -55,6 +58,13 @@ class Interface:
     config: EnvConfig
     description: ModelDescription
 
+    limits: Mapping[str, tuple[float, float]]
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """The names of the inputs; arrays are inputs by the names of their elements."""
+        return tuple(variable.name for variable in self.inputs)
+
     @property
     def time_step(self) -> float:
         """Length of one step in seconds."""
@@ -76,6 +86,24 @@ class Interface:
             return START_TIME
         return self.description.variable(name)
 
+    def start_values(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Check the parameters of episodes, by the names of scalars and elements.
+
+        Raises:
+            ConfigError: If a name is unknown, or its variable cannot start with the value, or is a
+                String.
+        """
+        own = {n: v for n, v in given.items() if n == "start_time" and self.config.draws_start_time}
+        values = {name: checked(START_TIME, value) for name, value in own.items()}
+        rest = {name: value for name, value in given.items() if name not in own}
+        for variable, value in start_values(self.description, rest):
+            if not variable.numeric:
+                raise ConfigError(
+                    f"{variable.name!r} is a String: it can be set in the config only"
+                )
+            values[variable.name] = value
+        return values
+
     def bounds(self, variable: Variable) -> tuple[float, float]:
         """The limits of a variable: the config's, or else the FMU's.
 
@@ -90,7 +118,7 @@ class Interface:
         return low, high
 
     def _limits(self, variable: Variable) -> tuple[float, float]:
-        low, high = self.config.bounds.get(variable.name, (variable.minimum, variable.maximum))
+        low, high = self.limits.get(variable.name, (variable.minimum, variable.maximum))
         return float(low), float(high)
 
     def pool_spec(self) -> PoolSpec:
@@ -133,10 +161,11 @@ class Interface:
 
     def _samplings(self) -> tuple[str, ...]:
         """One for each output; none if a step gives the last value of all."""
-        given = self.config.samplings
+        read = self.outputs + self.monitors
+        given = _by_scalar(self.description, self.config.samplings, read, "output in 'samplings'")
         if set(given.values()) <= {"last"}:
             return ()
-        return tuple(given.get(v.name, "last") for v in self.outputs + self.monitors)
+        return tuple(given.get(v.name, "last") for v in read)
 
     def _warm_up_steps(self) -> int:
         duration, step = self.config.warm_up, self.time_step
@@ -169,28 +198,143 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     Raises:
         ConfigError: If a name is unknown, or its variable cannot be used in that role.
     """
-    given = [
-        (start_variable(description, name, value), value)
-        for name, value in config.model_parameters.items()
-    ]
+    given = start_values(description, config.model_parameters)
     drawn = {"start_time": config.start_time} if config.draws_start_time else {}
-    interface = Interface(
-        inputs=tuple(input_variable(description, n) for n in config.model_input_names),
-        outputs=tuple(output_variable(description, n) for n in config.model_output_names),
-        monitors=tuple(output_variable(description, n) for n in config.monitor_names),
-        parameters={v.name: checked(v, value) for v, value in given if v.numeric} | drawn,
-        strings=tuple((v, str.__str__(value)) for v, value in given if not v.numeric),
+    inputs = _resolved(description, config.model_input_names, _check_input)
+    read = outputs_named(description, config.model_output_names + config.monitor_names)
+    monitors = outputs_named(description, config.monitor_names)
+    outputs = read[: len(read) - len(monitors)]
+    bounded = inputs + outputs
+    _check_inputs_are_whole(inputs, [variable for variable, _ in given])
+    return Interface(
+        inputs=inputs,
+        outputs=outputs,
+        monitors=monitors,
+        parameters={v.name: value for v, value in given if v.numeric} | drawn,
+        strings=tuple((v, value) for v, value in given if not v.numeric),
         config=config,
         description=description,
+        limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
     )
-    for name in config.bounds:
-        if name not in config.model_input_names + config.model_output_names:
-            raise unknown_name(
-                "input or output in 'bounds'",
-                name,
-                config.model_input_names + config.model_output_names,
+
+
+def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
+    """Find the variables that can be read after every step: scalars, and all elements of arrays.
+
+    Raises:
+        ConfigError: If there is no variable of a name, one is named twice, or a float cannot hold
+            its value.
+    """
+    return _resolved(description, names, _check_output)
+
+
+def _resolved(
+    description: ModelDescription,
+    names: Sequence[str],
+    check: Callable[[ModelDescription, Variable], None],
+) -> tuple[Variable, ...]:
+    """Look up the scalars that names stand for, each at most once."""
+    found: dict[Variable, str] = {}
+    for name in names:
+        for variable in description.scalars(name):
+            if variable in found:
+                raise ConfigError(f"{variable.name!r} is named twice: it is in {found[variable]!r}")
+            check(description, variable)
+            found[variable] = name
+    return tuple(found)
+
+
+def _by_scalar(
+    description: ModelDescription,
+    given: Mapping[str, _Value],
+    allowed: Sequence[Variable],
+    kind: str,
+) -> dict[str, _Value]:
+    """Spread what is given for arrays and elements; what is given for an element counts more.
+
+    Raises:
+        ConfigError: If a name is not that of any of the allowed variables.
+    """
+    names = {variable.name for variable in allowed}
+    arrays: dict[str, _Value] = {}
+    scalars: dict[str, _Value] = {}
+    for name, value in given.items():
+        meant = [v.name for v in _known_scalars(description, name) if v.name in names]
+        if not meant:
+            raise unknown_name(kind, name, names)
+        (scalars if meant == [name] else arrays).update(dict.fromkeys(meant, value))
+    return arrays | scalars
+
+
+def _known_scalars(description: ModelDescription, name: str) -> tuple[Variable, ...]:
+    try:
+        return description.scalars(name)
+    except ConfigError:  # the caller says which names it knows
+        return ()
+
+
+def _check_inputs_are_whole(inputs: Sequence[Variable], started: Sequence[Variable]) -> None:
+    """An array is set as a whole, so elements that are no inputs would lose their start values."""
+    names = {variable.name for variable in inputs}
+    arrays = {variable.array for variable in inputs}
+    for variable in started:
+        array = variable.array
+        if array is not None and array in arrays and variable.name not in names:
+            raise ConfigError(
+                f"{variable.name!r} cannot be given a start value while other elements of "
+                f"{array.name!r} are inputs; let all of {array.name!r} be inputs"
             )
-    return interface
+
+
+def start_values(
+    description: ModelDescription, given: Mapping[str, Any]
+) -> list[tuple[Variable, Any]]:
+    """Check start values by name: numbers, distributions, texts, and lists of them for arrays.
+
+    Returns:
+        The scalars and what each starts with; an element that is named itself comes in its place in
+        the array, and counts more than what is given for the array.
+
+    Raises:
+        ConfigError: If a name is unknown, or its variable cannot start with the value.
+    """
+    found: dict[str, tuple[Variable, Any]] = {}
+    elements = {}
+    for name, value in given.items():
+        scalars = description.scalars(name)
+        for variable, own in zip(scalars, spread(name, scalars, value), strict=True):
+            _check_start(variable, own)
+            pair = variable, (checked(variable, own) if variable.numeric else str.__str__(own))
+            found.setdefault(variable.name, pair)
+            if variable.name == name:
+                elements[name] = pair
+    return [elements.get(name, pair) for name, pair in found.items()]
+
+
+def spread(name: str, scalars: Sequence[Variable], value: Any) -> list[Any]:
+    """Give each of the scalars that a name stands for its part of a value.
+
+    Args:
+        name: The name.
+        scalars: The variables.
+        value: For an array nested lists of its shape, a flat list in row-major order, or one value
+            for all elements, a distribution from which each is drawn for itself.
+
+    Raises:
+        ConfigError: If the shape of the value is not that of the array.
+    """
+    array = scalars[0].array if scalars else None
+    is_array = len(scalars) != 1 or (array is not None and array.name == name)
+    if not is_array:
+        return [value]
+    shape, parts = flattened(value)
+    if shape == ():
+        return parts * len(scalars)
+    expected = (len(scalars),) if array is None else array.shape
+    if shape not in {expected, (len(scalars),)}:
+        found = "lists of different lengths" if shape is None else f"the shape {shape}"
+        raise ConfigError(f"{name!r} is an array of shape {expected}, got {found}: {shown(value)}")
+    return [as_distribution(repr(name), part) for part in parts]
 
 
 def _interval(frequency: float | None) -> float:
@@ -204,14 +348,23 @@ def input_variable(description: ModelDescription, name: str) -> Variable:
         ConfigError: If no variable has this name, or it must not be written before a step.
     """
     variable = description.variable(name)
+    _check_input(description, variable)
+    return variable
+
+
+def _check_input(description: ModelDescription, variable: Variable) -> None:
     _require_numeric(variable, "an input")
     _require_known_clock(description, variable, "an input")
     if not variable.settable_in_step:
         raise ConfigError(
-            f"{name!r} cannot be an input: it is a {variable.variability} {variable.causality}; "
-            "only inputs and tunable parameters may be set between steps"
+            f"{variable.name!r} cannot be an input: it is a {variable.variability} "
+            f"{variable.causality}; only inputs and tunable parameters may be set between steps"
         )
-    return variable
+    if variable.array is not None and description.clocks:
+        raise ConfigError(
+            f"{variable.name!r} cannot be an input: it is an element of an array, and inputs of "
+            f"FMUs with clocks must be scalars, as in {description.model_name}"
+        )
 
 
 def output_variable(description: ModelDescription, name: str) -> Variable:
@@ -221,9 +374,13 @@ def output_variable(description: ModelDescription, name: str) -> Variable:
         ConfigError: If no variable has this name, or a float cannot hold its value.
     """
     variable = description.variable(name)
+    _check_output(description, variable)
+    return variable
+
+
+def _check_output(description: ModelDescription, variable: Variable) -> None:
     _require_numeric(variable, "an output")
     _require_known_clock(description, variable, "an output")
-    return variable
 
 
 def _require_known_clock(description: ModelDescription, variable: Variable, role: str) -> None:
@@ -259,6 +416,12 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
             value.
     """
     variable = description.variable(name)
+    _check_start(variable, value)
+    return variable
+
+
+def _check_start(variable: Variable, value: Any) -> None:
+    name = variable.name
     if variable.ticking:
         raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
     if not variable.settable_at_start:
@@ -268,9 +431,8 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
         )
     if variable.kind == "string" and not variable.shape:
         _require_text(name, value)
-        return variable
-    _require_numeric(variable, "given a start value")
-    return variable
+    else:
+        _require_numeric(variable, "given a start value")
 
 
 def _require_text(name: str, value: Any) -> None:
@@ -304,7 +466,8 @@ def checked_value(variable: Variable, value: Any) -> float:
     if variable.kind == "boolean" and number not in {0.0, 1.0}:
         raise ConfigError(f"{variable.name!r} is a Boolean, got {number}")
     if variable.kind in {"integer", "enumeration"}:
-        _check_integer(variable, number)
+        whole = integer_of(value)  # which no float has rounded
+        _check_integer(variable, number if whole is None else whole)
     return number
 
 
@@ -317,7 +480,7 @@ def _item_value(variable: Variable, name: str) -> float:
 
 def _check_integer(variable: Variable, number: float) -> None:
     low, high = variable.integer_limits
-    if not number.is_integer() or not low <= number <= high:
+    if not float(number).is_integer() or not low <= number <= high:
         raise ConfigError(
             f"{variable.name!r} is of type {variable.type}: expected an integer from {low} to "
             f"{high}, got {number}"

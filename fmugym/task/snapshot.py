@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-from fmugym.trial.trial import content_of
+from fmugym.trial.trial import Candidate, content_of
 
 if TYPE_CHECKING:
     from fmugym.task.construction import Constructed
@@ -262,7 +262,8 @@ def scope_of(env: Constructed) -> Scope:
     """What a snapshot's environment must have in common with this one."""
     config, fmu = env.config, env.fmu.description
     scope = {
-        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} (SHA-256 {content_of(env.fmu.path)})",
+        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} "
+        f"(SHA-256 {content_of(Candidate.of(env.fmu))})",
         "action space": str(env.action_space),
     }
     names = [f.name for f in fields(config) if f.name not in _OPERATION]

@@ -3,16 +3,35 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
+
+import numpy as np
 
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["EpisodeVariables", "LateDict", "NamedValues"]
+__all__ = ["EpisodeVariables", "LateDict", "NamedValues", "ParameterValues"]
+
+
+def array_places(names: Iterable[str]) -> dict[str, list[int]]:
+    """The places of the elements of each array among names such as ``y[1]``, by its name."""
+    places: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        if name.endswith("]"):
+            places.setdefault(name.rpartition("[")[0], []).append(place)
+    return places
+
+
+def stacked(values: Sequence[Any]) -> Any:
+    """Make an array of the elements: numbers, rows of numbers, or symbols in their place."""
+    return np.array(values) if type(values[0]) is float else np.stack(values)
 
 
 class NamedValues(Mapping[str, Any]):
     """A read-only mapping from names to values in a fixed order.
+
+    Of arrays it has the elements by their names, as ``y[1]``. ``["y"]`` returns an array of those
+    elements of ``y`` that it has, in their order; the elements are on the first axis.
 
     Args:
         kind: What the names refer to, for error texts.
@@ -28,23 +47,31 @@ class NamedValues(Mapping[str, Any]):
     ) -> None:
         self._kind = kind
         self._index = {name: index for index, name in enumerate(names)}
+        self._arrays = array_places(names)
         self._get_values = get_values
 
     def __getitem__(self, name: str) -> Any:
         try:
             index = self._index[name]
         except Exception:  # a KeyError, or an object that cannot be a key
-            raise unknown_name(self._kind, name, self._index) from None
+            return self._array(name)
         return self._get_values()[index]
 
+    def _array(self, name: Any) -> Any:
+        places = self._arrays.get(name) if isinstance(name, str) else None
+        if places is None:
+            raise unknown_name(self._kind, name, self._index)
+        values = self._get_values()
+        return stacked([values[place] for place in places])
+
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and str.__str__(name) in self._index
+        return isinstance(name, str) and (name in self._index or name in self._arrays)
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the value of a name, or the default if the name is unknown."""
         if name not in self:
             return default
-        return self._get_values()[self._index[name]]
+        return self[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._index)
@@ -54,6 +81,24 @@ class NamedValues(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({dict(self)})"
+
+
+class ParameterValues(dict[str, Any]):
+    """Parameters by name, with the elements of arrays as ``A[1,2]``.
+
+    ``["A"]`` returns a new array of those elements of ``A`` that it has, as ``NamedValues`` does.
+    """
+
+    def __missing__(self, name: Any) -> Any:
+        places = array_places(self).get(name) if isinstance(name, str) else None
+        if places is None:
+            raise KeyError(name)
+        values = list(self.values())
+        return stacked([values[place] for place in places])
+
+    def copy(self) -> ParameterValues:
+        """A copy of the same kind."""
+        return ParameterValues(self)
 
 
 class EpisodeVariables(dict[str, Any]):

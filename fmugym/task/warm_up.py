@@ -25,7 +25,7 @@ from fmugym.pool.patience import failed_reset
 from fmugym.pool.states import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.trial.trial import state_files
 
@@ -374,7 +374,9 @@ def rows_of_one(env: Any) -> Readings:
         readings,
         **rows,
         state=rows["values"][: env._output_count],
-        parameters=MappingProxyType({n: _row(v) for n, v in readings.parameters.items()}),
+        parameters=MappingProxyType(
+            ParameterValues((n, _row(v)) for n, v in readings.parameters.items())
+        ),
         variables=variables,
         step_count=np.zeros(1, np.int64),
         done=np.zeros(1, np.bool_),

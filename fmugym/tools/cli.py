@@ -12,7 +12,8 @@
         [KEY=VALUE ...]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
-    fmugym export AGENT --task TASK --output agent.c [--algorithm PPO] [--all-inputs]
+    fmugym export AGENT --task TASK --output agent.c|agent.fmu [--algorithm PPO] [--all-inputs]
+        [--fmi 2.0|3.0] [--platform NAME ...]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
@@ -20,15 +21,16 @@
     fmugym demo [--seed N] [--output picture.png]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
+    fmugym compile model.fmu [--output new.fmu]
 
 TASK is a task file, a registered id or ``module:Class``. WHO is ``--action random|NUMBERS``,
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
 ``--steps N``. All commands take ``--json``.
 
-``info``, ``new``, ``skeleton`` and ``stand-in`` execute nothing of the FMU, the others do. Output
-is printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the error stream
-says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments are wrong;
-130 after Ctrl-C, which keeps what was written until then.
+``info``, ``new``, ``skeleton``, ``stand-in`` and ``compile`` execute nothing of the FMU, the others
+do. Output is printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the
+error stream says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments
+are wrong; 130 after Ctrl-C, which keeps what was written until then.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -74,7 +76,14 @@ from typing import Final
 from fmugym.errors import FMUGymError
 from fmugym.tools.exporting import add_export
 from fmugym.tools.gains import add_tune
-from fmugym.tools.inspecting import add_info, add_new, add_skeleton, add_stand_in, add_validate
+from fmugym.tools.inspecting import (
+    add_compile,
+    add_info,
+    add_new,
+    add_skeleton,
+    add_stand_in,
+    add_validate,
+)
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import note
 from fmugym.tools.playing import add_bench, add_evaluate, add_record, add_simulate
@@ -86,7 +95,7 @@ _INTERRUPTED: Final = 130
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
-    *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in),
+    *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in, add_compile),
 )
 
 

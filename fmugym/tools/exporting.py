@@ -10,7 +10,9 @@ from typing import Any, Final
 
 from fmugym.archive.description import Variable
 from fmugym.errors import ConfigError, shown
-from fmugym.export import Agent, agent_of, write_c
+from fmugym.export import Agent, agent_of, write_c, write_fmu
+from fmugym.export.building import PLATFORMS
+from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.tools.agents import load_agent
 from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say, say_json
 from fmugym.tools.targets import maker_of
@@ -20,14 +22,14 @@ __all__ = ["add_export"]
 
 def add_export(commands: Commands) -> None:
     """Add ``export``."""
-    text = "write a trained agent as C, with everything around its network"
+    text = "write a trained agent as C or as an FMU, with everything around its network"
     command = add_command(commands, "export", _export, text)
     command.add_argument(
         "agent", type=Path, metavar="AGENT", help="a folder of train, or a zip file of a model"
     )
     command.add_argument("--task", required=True, metavar="TASK", help=HELP_OF_TASK)
     command.add_argument(
-        "--output", type=Path, required=True, metavar="FILE", help="a new file: agent.c"
+        "--output", type=Path, required=True, metavar="FILE", help="a new file: agent.c, agent.fmu"
     )
     command.add_argument(
         "--algorithm", default="PPO", help="of a zip file: PPO (default), A2C, SAC, TD3, DQN ..."
@@ -36,6 +38,15 @@ def add_export(commands: Commands) -> None:
         "--all-inputs",
         action="store_true",
         help="also write inputs that no action changes, such as weather from data",
+    )
+    command.add_argument(
+        "--fmi", choices=FMI_VERSIONS, default="2.0", help="version of an FMU; default 2.0"
+    )
+    command.add_argument(
+        "--platform",
+        action="append",
+        choices=[*PLATFORMS, "all"],
+        help="that an FMU is built for; default this one",
     )
     add_json(command)
 
@@ -61,8 +72,17 @@ def _as_c(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Pat
     return write_c(agent, output.parent)
 
 
+def _as_fmu(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+    platforms = arguments.platform
+    if platforms is not None and "all" in platforms:
+        is_new = arguments.fmi != "2.0"
+        platforms = [name for name, one in PLATFORMS.items() if is_new or one.folder]
+    return [write_fmu(agent, output, fmi_version=arguments.fmi, platforms=platforms)]
+
+
 _WRITERS: Final[dict[str, Callable[[Agent, Path, argparse.Namespace], list[Path]]]] = {
     ".c": _as_c,
+    ".fmu": _as_fmu,
 }
 
 

@@ -1,4 +1,4 @@
-"""The commands that look at an FMU or a task: info, new, skeleton, validate, stand-in."""
+"""The commands for an FMU or a task itself: info, new, skeleton, validate, stand-in, compile."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 from fmugym.archive.fmu import FMU
+from fmugym.tools.compiling import compile_fmu
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -24,7 +25,7 @@ from fmugym.tools.stand_in import build_stand_in
 from fmugym.tools.targets import maker_of
 from fmugym.tools.validation import validate
 
-__all__ = ["add_info", "add_new", "add_skeleton", "add_stand_in", "add_validate"]
+__all__ = ["add_compile", "add_info", "add_new", "add_skeleton", "add_stand_in", "add_validate"]
 
 
 def add_info(commands: Commands) -> None:
@@ -116,6 +117,25 @@ def _validate(arguments: argparse.Namespace) -> int:
     else:
         say(report.as_text())
     return int(report.verdict == "error")
+
+
+def add_compile(commands: Commands) -> None:
+    """Add ``compile``."""
+    text = "compile the source code in an FMU for this machine, into a new FMU"
+    command = add_command(commands, "compile", _compile, text)
+    _add_fmu(command)
+    command.add_argument(
+        "--output", type=Path, metavar="FILE", help="by default beside the FMU, with the platform"
+    )
+    add_json(command)
+
+
+def _compile(arguments: argparse.Namespace) -> None:
+    made = compile_fmu(arguments.fmu, arguments.output)
+    if arguments.json:
+        say_json({"output": made})
+    else:
+        say(plain(f"{made}: compiled for {FMU(made).platform}"))
 
 
 def add_stand_in(commands: Commands) -> None:

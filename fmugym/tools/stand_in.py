@@ -8,11 +8,9 @@ end the process with a message when they are called: nothing is ever computed wr
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -23,13 +21,12 @@ from fmugym.archive.dependencies import libraries_of
 from fmugym.archive.elf import opened
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError
+from fmugym.tools.compilers import find_compiler
 
 __all__ = ["LIBRARIES", "StandIn", "build_stand_in", "replaceable"]
 
 LIBRARIES: Final = {"libgfortran.so.3": "GFORTRAN_1.0", "libgfortran.so.4": "GFORTRAN_7"}
 """The libraries that can be replaced, each with its first symbol version."""
-
-_COMPILERS: Final = ("cc", "gcc", "clang")
 
 
 class StandIn:
@@ -105,7 +102,7 @@ def _compile(path: Path, symbols: Mapping[str, str]) -> None:
         (folder / "lacking.c").write_text(_lacking(set(symbols) - _served()))
         (folder / "versions").write_text(_versions(symbols, LIBRARIES[path.name]))
         command = [
-            *_compiler(),
+            *find_compiler("a stand-in"),
             *("-shared", "-fPIC", "-O1", "-w", "stand_in.c", "lacking.c", "-o", "library"),
             *(f"-Wl,-soname,{path.name}", "-Wl,--version-script=versions"),
         ]
@@ -113,18 +110,6 @@ def _compile(path: Path, symbols: Mapping[str, str]) -> None:
         if done.returncode:
             raise FMULoadError(f"{path.name} cannot be built: {done.stderr[-500:]}")
         shutil.copyfile(folder / "library", path)
-
-
-def _compiler() -> list[str]:
-    found = next(filter(None, map(shutil.which, _COMPILERS)), None)
-    if found is not None:
-        return [found]
-    if importlib.util.find_spec("ziglang") is None:
-        raise ConfigError(
-            "a stand-in needs a C compiler: install gcc (Debian: apt install gcc), or ziglang "
-            "(pip install ziglang)"
-        )
-    return [sys.executable, "-m", "ziglang", "cc"]
 
 
 def _source() -> str:

@@ -263,7 +263,7 @@ def _of_actions(env: FMUEnv) -> Iterator[Finding]:
     """Compare episodes in which one action is at its lowest and its highest value."""
     space = env.action_space
     useless = []
-    for name, low, high in _extremes(space, env.config.model_input_names):
+    for name, low, high in _extremes(space, env._interface.input_names):
         episodes = [_play(env, _always(value)) for value in (low, high)]
         if not _differ(*episodes):
             useless.append(name)
@@ -353,11 +353,14 @@ def _two_values(env: FMUEnv, name: str, value: Any) -> list[Any]:
 
 def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
     """Tell the inputs of the FMU that nobody writes."""
-    written = {*env.config.model_input_names, *env.config.model_parameters}
+    interface = env._interface
+    written = {*interface.input_names, *interface.parameters}
     idle = [
         variable.name
         for variable in env.fmu.description.variables.values()
-        if variable.causality == "input" and variable.numeric and variable.name not in written
+        if variable.causality == "input"
+        and variable.is_number
+        and written.isdisjoint(one.name for one in variable.elements)
     ]
     if idle:
         yield Finding(

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
-from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import FMU
 from fmugym.errors import (
     ConfigError,
@@ -291,7 +290,7 @@ class _Trust:
         if method is SaveMethod.REPLAY:
             return cls(spec, lambda: method)
         known: SaveMethod | None = SaveMethod.REPLAY
-        if is_bundled(fmu.path):
+        if fmu.bundled:
             known = method
         elif not candidate.exempt:
             known = known_resuming(candidate, tried, starts)
@@ -485,7 +484,7 @@ def _verdict(
     """Get the verdict on an FMU from a trial, or from this process if trials are turned off."""
     candidate = Candidate.of(fmu)
     spec = _tried(spec)
-    if is_bundled(fmu.path):
+    if fmu.bundled:
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
     several = num_instances > 1 and plan.private_libraries is None and not plan.has_own_workers
     several = several and not _is_alone(fmu)

@@ -42,6 +42,8 @@ from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
+from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.plan import SystemPlan
 from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -102,15 +104,18 @@ class Candidate:
     preload: tuple[str, ...]
     timeout: float | None
     interface: str = "co_simulation"
+    plan: SystemPlan | None = None
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
-        interface = fmu.description.interface
-        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface)
+        interface, plan = fmu.description.interface, getattr(fmu, "plan", None)
+        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, plan)
 
     def open(self) -> FMU:
         """Open the FMU without another trial."""
+        if self.plan is not None:
+            return SystemFMU(self.plan, probe_timeout=None)
         return FMU(
             self.path,
             limits=self.limits,
@@ -126,7 +131,8 @@ class Candidate:
         Raises:
             ConfigError: If the environment variable ``FMUGYM_PROBE`` has an unknown value.
         """
-        return _trials_are_off() or self.timeout is None or is_bundled(self.path)
+        files = [self.path] if self.plan is None else [c.path for c in self.plan.components]
+        return _trials_are_off() or self.timeout is None or all(map(is_bundled, files))
 
 
 def _trials_are_off() -> bool:
@@ -236,13 +242,13 @@ def meet(fmu: FMU) -> None:
 
 def known_verdict(fmu: FMU) -> Verdict | None:
     """The verdict of the last trial of an FMU on this machine; None if there was none."""
-    return Verdict.from_text(recall(_content_key(fmu.path, fmu.description.interface)))
+    return Verdict.from_text(recall(_content_key(Candidate.of(fmu))))
 
 
 def state_files(fmu: FMU) -> str:
     """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
-        return str(cache_folder() / "states" / _content_key(fmu.path, fmu.description.interface))
+        return str(cache_folder() / "states" / _content_key(Candidate.of(fmu)))
     except RuntimeError:  # there is no folder for caches
         return ""
 
@@ -253,7 +259,7 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
     Raises:
         RuntimeError: If there is no folder for caches.
     """
-    return cache_folder() / "marks", _content_key(candidate.path, candidate.interface)
+    return cache_folder() / "marks", _content_key(candidate)
 
 
 def locks_of(candidate: Candidate) -> str:
@@ -277,7 +283,7 @@ def locks_of(candidate: Candidate) -> str:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         raise ConfigError(f"the limits of a licence need the folder {folder}: {error}") from None
-    return str(folder / content_of(candidate.path))
+    return str(folder / content_of(candidate))
 
 
 def examine(
@@ -329,13 +335,13 @@ def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
 
 def is_known_to_harm(candidate: Candidate) -> bool:
     """Whether the cache says that an FMU harms its process."""
-    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
+    known = Verdict.from_text(recall(_content_key(candidate)))
     return known is not None and known.isolate
 
 
 def _with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
     """Add the harm to its process that the FMU has done with any other config."""
-    known = Verdict.from_text(recall(_content_key(candidate.path, candidate.interface)))
+    known = Verdict.from_text(recall(_content_key(candidate)))
     if known is None or not known.isolate or verdict.isolate:
         return verdict
     reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
@@ -367,7 +373,7 @@ def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> No
     verdict = _with_harm(verdict, candidate)
     for key in (
         _verdict_key(candidate, spec, starts),
-        _content_key(candidate.path, candidate.interface),
+        _content_key(candidate),
     ):
         remember(key, verdict.to_text())
 
@@ -426,9 +432,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         *(name, verdict.instances, verdict.initializations),
     )
     if verdict.complete:
-        remember(
-            _content_key(request.candidate.path, request.candidate.interface), verdict.to_text()
-        )
+        remember(_content_key(request.candidate), verdict.to_text())
     return verdict
 
 
@@ -684,18 +688,30 @@ def _verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
         keep_states=False,
     )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
-    return f"{_content_key(candidate.path, candidate.interface)}-{asked}"
+    return f"{_content_key(candidate)}-{asked}"
 
 
-def content_of(path: Path) -> str:
+def content_of(candidate: Candidate) -> str:
+    """The SHA-256 of a file, or that of a system: of its plan and its files."""
+    plan = candidate.plan
+    if plan is None:
+        return _content_of_file(candidate.path)
+    names = tuple(replace(part, path=Path(part.path.name)) for part in plan.components)
+    texts = [repr(replace(plan, components=names, file=None))]
+    texts += [_content_of_file(part.path) for part in plan.components]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def _content_of_file(path: Path) -> str:
     """The SHA-256 of a file; it is read again only when it has changed."""
     status = path.stat()
     return _file_digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
 
-def _content_key(path: Path, interface: str) -> str:
+def _content_key(candidate: Candidate) -> str:
     """The scope of a verdict: content, interface, platform, and version of the package."""
-    scope = f"{content_of(path)} {fmpy.platform_tuple} {_version()}"
+    scope = f"{content_of(candidate)} {fmpy.platform_tuple} {_version()}"
+    interface = candidate.interface
     return _digest(
         f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode()
     )

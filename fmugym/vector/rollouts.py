@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.description import Variable
 from fmugym.checks import check_mapping
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.fmi.access import unlisted
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.interface import checked_value
 from fmugym.vector.actions import checked_actions, is_array_space
@@ -133,7 +135,8 @@ def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.ND
 
     Args:
         env: Its FMU has the parameters.
-        parameters: An array of shape (n,), or one number for all, by name; None for none.
+        parameters: By name an array of shape (n,), of an array of shape (n, ...), or one number for
+            all; None for none.
         count: n.
 
     Returns:
@@ -144,20 +147,45 @@ def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.ND
             not fit.
     """
     given = {} if parameters is None else check_mapping("'parameters'", parameters)
-    found = {}
+    found: dict[Variable, npt.NDArray[np.float64]] = {}
     for name, values in given.items():
-        variable = env.fmu.variable(name)
-        if (variable.causality, variable.variability) != ("parameter", "tunable"):
-            raise ConfigError(
-                f"{name!r} is a {variable.variability} {variable.causality}: an FMU lets only "
-                "tunable parameters be set between two steps. Let the candidates begin with "
-                "episodes of their own, whose resets have drawn it"
-            )
-        each = [values] * count if np.ndim(values) == 0 else values
-        if len(each) != count:
-            raise ConfigError(f"there are {len(each)} values of {name!r}, expected {count}")
-        found[name] = np.array([checked_value(variable, value) for value in each])
-    return found
+        variables = env.fmu.description.scalars(name)
+        for variable, own in zip(variables, _spread(name, values, variables, count), strict=True):
+            _require_tunable(variable)
+            found[variable] = np.array([checked_value(variable, value) for value in own])
+    missing = unlisted(list(found))
+    if missing:
+        raise ConfigError(
+            f"there are no values of {missing[0].name!r}: FMI sets arrays as a whole, so the "
+            "candidates need values of all elements"
+        )
+    return {variable.name: values for variable, values in found.items()}
+
+
+def _require_tunable(variable: Variable) -> None:
+    if (variable.causality, variable.variability) != ("parameter", "tunable"):
+        raise ConfigError(
+            f"{variable.name!r} is a {variable.variability} {variable.causality}: an FMU lets only "
+            "tunable parameters be set between two steps. Let the candidates begin with "
+            "episodes of their own, whose resets have drawn it"
+        )
+
+
+def _spread(name: str, values: Any, variables: Sequence[Variable], count: int) -> list[Any]:
+    """The values of each scalar that a name stands for, count of each."""
+    if np.ndim(values) == 0:
+        return [[values] * count] * len(variables)
+    if len(values) != count:
+        raise ConfigError(f"there are {len(values)} values of {name!r}, expected {count}")
+    if len(variables) == 1:
+        return [np.reshape(values, -1).tolist() if np.ndim(values) > 1 else values]
+    array = np.asarray(values)
+    if array.size != count * len(variables):
+        raise ConfigError(
+            f"the values of {name!r} have the shape {array.shape}, expected ({count}, ...) with "
+            f"{len(variables)} elements"
+        )
+    return list(array.reshape(count, -1).T)
 
 
 def _checked_array(space: Any, actions: Any) -> npt.NDArray[Any]:

@@ -185,7 +185,7 @@ def _states(env: FMUEnv, given: Any) -> dict[str, str]:
 def _obstacle(env: FMUEnv, states: States) -> str:
     """Why the FMU offers no directional derivatives for a trajectory; empty if it does."""
     description, spec = env.fmu.description, env._spec
-    if not description.capabilities.provides_directional_derivatives:
+    if not description.capabilities.provides_derivatives:
         return "the FMU does not offer any"
     declared = set(description.state_derivatives)
     if set(states) != declared:

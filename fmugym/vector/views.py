@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
-from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
 
 __all__ = ["batched", "column", "copied", "parts", "take"]
 
@@ -64,7 +64,7 @@ def some(batch: Readings, indices: npt.NDArray[np.intp]) -> Readings:
         step_count=batch.step_count[indices],
         done=batch.done[indices],
         after_end=batch.after_end[indices],
-        parameters={name: row[indices] for name, row in batch.parameters.items()},
+        parameters=ParameterValues((n, row[indices]) for n, row in batch.parameters.items()),
         variables=variables,
     )
 
@@ -85,7 +85,7 @@ def column(batch: Readings, index: int) -> Readings:
         step_count=int(batch.step_count[index]),
         done=bool(batch.done[index]),
         after_end=bool(batch.after_end[index]),
-        parameters=MappingProxyType(_taken(batch.parameters, index)),
+        parameters=MappingProxyType(ParameterValues(_taken(batch.parameters, index))),
         variables=variables,
     )
 
@@ -112,7 +112,7 @@ def parts(batch: Readings, indices: Any) -> Readings:
         batch,
         values=outputs,
         out=NamedValues("output", list(batch.out), lambda: outputs),
-        parameters=MappingProxyType(parameters),
+        parameters=MappingProxyType(ParameterValues(parameters)),
         variables=variables,
         **rows,
     )

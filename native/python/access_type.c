@@ -22,38 +22,31 @@ bool is_access(const PyPool *self, PyObject *object) {
     return true;
 }
 
-static bool check_types(const uint8_t *types, Py_ssize_t count, Py_ssize_t size) {
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (!is_type(types[i])) {
-            PyErr_SetString(PyExc_ValueError, "unknown C type");
-            return false;
-        }
-    }
-    if (size != count * (Py_ssize_t)sizeof(uint32_t)) {
-        PyErr_SetString(PyExc_ValueError, "types and references differ in length");
-        return false;
-    }
-    return true;
-}
-
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
-    const char *types, *references;
-    Py_ssize_t count, size;
+    const char *types, *elements, *rest;
+    Py_ssize_t count, size, size_of_rest;
     int version, manner = CO_SIMULATION_ALONE;
+    Listing listing;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "iy#y#|i", &version, &types, &count, &references, &size,
-                          &manner)) {
+    if (!PyArg_ParseTuple(args, "iy#y#y#|i", &version, &types, &count, &elements, &size, &rest,
+                          &size_of_rest, &manner)) {
         return NULL;
     }
     const Fmi *fmi = fmi_of(version, manner);
-    if (fmi == NULL || !check_types((const uint8_t *)types, count, size)) {
+    if (fmi == NULL) {
+        return NULL;
+    }
+    const char *fault = listing_take(&listing, types, (size_t)count, elements, (size_t)size, rest,
+                                     (size_t)size_of_rest);
+    if (fault != NULL) {
+        PyErr_SetString(PyExc_ValueError, fault);
         return NULL;
     }
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     PyAccess *self = (PyAccess *)allocate(type, 0);
     if (self != NULL &&
-        !access_open(&self->access, fmi, (const uint8_t *)types, references, (size_t)count)) {
+        !access_open(&self->access, fmi, &listing)) {
         Py_DECREF(self);
         return PyErr_NoMemory();
     }

@@ -305,7 +305,8 @@ static PyObject *starts_of(const Record *record) {
 
     for (Py_ssize_t i = 0; starts != NULL && i < count; i++) {
         const RecordedStart *start = &record->starts[i];
-        PyObject *item = Py_BuildValue("(IId)", start->type, start->reference, start->value);
+        PyObject *item =
+            Py_BuildValue("(IIId)", start->type, start->reference, start->place, start->value);
         if (item == NULL || PyTuple_SetItem(starts, i, item) < 0) {
             Py_CLEAR(starts);
         }
@@ -313,7 +314,7 @@ static PyObject *starts_of(const Record *record) {
     return starts;
 }
 
-/* Returns the starts as (type, value reference, value), the number of steps, and their inputs as
+/* Returns the starts as (type, value reference, place, value), the number of steps, and their inputs as
  * bytes. */
 PyObject *py_record_of(PyObject *object, PyObject *index) {
     PyPool *self = (PyPool *)object;

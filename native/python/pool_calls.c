@@ -257,8 +257,8 @@ PyObject *py_failure(PyObject *object, PyObject *argument) {
     }
     const Failure *f = &asking.failure;
     PyObject *result =
-        Py_BuildValue("sOidINN", f->doing, f->in_warm_up ? Py_True : Py_False, f->status, f->time,
-                      (unsigned)f->string_reference, decode(f->said), values_of(f));
+        Py_BuildValue("sOidINNz", f->doing, f->in_warm_up ? Py_True : Py_False, f->status, f->time,
+                      (unsigned)f->string_reference, decode(f->said), values_of(f), f->part);
     free(f->said);
     free(f->values);
     return result;

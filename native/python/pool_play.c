@@ -191,7 +191,7 @@ static bool take_row(PyPool *self, Playing *playing, PyObject *object, Row *row)
                       (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    *row = (Row){buffer->buf, (size_t)buffer->itemsize, false};
+    *row = (Row){.data = buffer->buf, .size = (size_t)buffer->itemsize};
     return true;
 }
 
@@ -308,11 +308,24 @@ static bool take_input_starts(PyPool *self, Playing *playing, PyObject *starts) 
     return true;
 }
 
+/* Notes which rows are those of the outputs, as long as the program only reads them. */
+static void note_outputs(const Settings *s, PyProgram *p) {
+    for (size_t i = 0; i < p->program.number_of_rows; i++) {
+        Row *row = &p->rows[i];
+        for (uint32_t k = 0; k < s->outputs->count && !row->changes; k++) {
+            if (row->data == (char *)(s->output_values + k * s->count)) {
+                row->output = k + 1;
+            }
+        }
+    }
+}
+
 static void settle_play(PyPool *self, Playing *playing) {
     const Py_buffer *b = playing->buffers;
     const Settings *s = &self->pool.settings;
     Play *play = &playing->play;
 
+    note_outputs(s, &playing->judgement);
     play->count = s->count;
     play->inputs = playing->inputs.program;
     play->judgement = playing->judgement.program;

@@ -65,7 +65,7 @@ static PyObject *tape_as_tuple(const Tape *t) {
     const Py_ssize_t number = sizeof(double);
 
     return Py_BuildValue("y#y#y#y#y#y#y#", (const char *)t->start_types, starts,
-                         (const char *)t->start_references, starts * (Py_ssize_t)sizeof(uint32_t),
+                         (const char *)t->start_variables, starts * (Py_ssize_t)sizeof(Element),
                          (const char *)t->starts, starts * number, (const char *)t->first_outputs,
                          out * number, (const char *)t->inputs, rows * in * number,
                          (const char *)t->outputs, rows * out * number, (const char *)t->statuses,
@@ -181,6 +181,7 @@ static void pool_dealloc(PyObject *object) {
     for (int i = 0; i < BUFFERS; i++) {
         release_buffer(&self->buffers[i]);
     }
+    drop_system(self->system);
     free(self->paths);
     free(self->categories);
     free(self->strings);
@@ -196,7 +197,7 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *categories, *mark, *solving, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
     Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, manner, private_libraries, logging, can_save;
@@ -221,11 +222,11 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "manner",  "model",  "token",      "resources", "paths",
-                            "private", "logging", "states", "categories", "mark", "solving", NULL};
+                            "private", "logging", "states", "categories", "mark", "solving", "system", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iiyyyO!pppO!OO:library", names, &a->version, &a->manner, &s->model,
+    return parse_group(group, "$iiyyyO!pppO!OOO:library", names, &a->version, &a->manner, &s->model,
                        &s->token, &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving);
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -313,8 +314,7 @@ static bool take_optional(PyObject *object, bool *given, double *value) {
     return !PyErr_Occurred();
 }
 
-/* Returns the texts of a tuple of bytes. Returns NULL with an exception if it holds others. */
-static const char **take_texts(PyObject *tuple) {
+const char **take_texts(PyObject *tuple) {
     const Py_ssize_t count = PyTuple_Size(tuple);
     const char **texts = calloc((size_t)count + 1, sizeof *texts);
 
@@ -381,8 +381,8 @@ static bool take_method(const char *name, Solving *solving) {
     return solving->method != NULL;
 }
 
-/* Takes the tuple that fmugym/pool/settings.py makes. The references stay in the pool's arguments. */
-static bool take_solving(PyObject *tuple, Solving *solving) {
+/* The references stay in the pool's arguments. */
+bool take_solving(PyObject *tuple, Solving *solving) {
     const char *method, *states, *rates, *clocks, *clocked;
     Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size;
     int completes;
@@ -437,6 +437,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     Settings *s = &self->pool.settings;
 
     s->fmi = fmi_of(a->version, a->manner);
+    s->system = self->system;
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;
     s->can_save = a->can_save && s->fmi->get_state != NULL;
@@ -501,6 +502,19 @@ static PyObject *copy_of_groups(PyObject *kwargs) {
     return copy;
 }
 
+static bool check_system(const PyPool *self, const Arguments *a) {
+    const bool sound = (a->version == 0) == (self->system != NULL);
+    if (!sound) {
+        PyErr_SetString(PyExc_ValueError, "version 0 is that of systems");
+    }
+    return sound;
+}
+
+static Py_ssize_t number_of_paths(const PyPool *self, const Arguments *a) {
+    const Py_ssize_t parts = self->system == NULL ? 1 : (Py_ssize_t)self->system->count;
+    return parts * (a->private_libraries ? a->count : 1);
+}
+
 static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     PyPool *self = (PyPool *)allocate(type, 0);
@@ -511,7 +525,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     }
     self->arguments = copy_of_groups(kwargs);
     if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
-        check_start_outputs(self, &a) && check_accesses(&a) && take_paths(self, a.paths, a.private_libraries ? a.count : 1) &&
+        check_start_outputs(self, &a) && check_accesses(&a) && take_system(a.system, &self->system) && check_system(self, &a) && take_paths(self, a.paths, number_of_paths(self, &a)) &&
         take_categories(self, a.categories) && take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
         open_pool(self)) {
         return (PyObject *)self;

@@ -83,7 +83,7 @@ static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count) {
             PyErr_SetString(PyExc_ValueError, "a row of a program is not aligned");
             return false;
         }
-        p->rows[i] = (Row){buffer->buf, (size_t)buffer->itemsize, false};
+        p->rows[i] = (Row){.data = buffer->buf, .size = (size_t)buffer->itemsize};
     }
     return true;
 }
@@ -277,22 +277,37 @@ static bool take_one_seen(const PyProgram *program, size_t i, PyObject *array, P
     return true;
 }
 
-bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen) {
-    const size_t count = program->program.number_of_seen;
+/* Takes the arrays in a tuple or a dict. Its values come in the order in which they were set. */
+static bool take_each_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers,
+                           char **seen) {
+    const bool is_dict = PyDict_Check(arrays);
+    PyObject *array = NULL;
+    Py_ssize_t place = 0;
     bool good = true;
 
-    if (count == 1 && !PyTuple_Check(arrays)) {
-        return take_one_seen(program, 0, arrays, buffers, seen);
-    }
-    if (!PyTuple_Check(arrays) || (size_t)PyTuple_Size(arrays) != count) {
-        PyErr_Format(PyExc_TypeError, "there must be a tuple of %zu arrays of observations", count);
-        return false;
-    }
-    for (size_t i = 0; good && i < count; i++) {
-        PyObject *array = PyTuple_GetItem(arrays, (Py_ssize_t)i);
+    for (size_t i = 0; good && i < program->program.number_of_seen; i++) {
+        if (!is_dict) {
+            array = PyTuple_GetItem(arrays, (Py_ssize_t)i);
+        } else if (!PyDict_Next(arrays, &place, NULL, &array)) {
+            return false; /* its size has been checked */
+        }
         good = take_one_seen(program, i, array, buffers, seen);
     }
     return good;
+}
+
+bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen) {
+    const size_t count = program->program.number_of_seen;
+    const bool is_dict = PyDict_Check(arrays), is_tuple = PyTuple_Check(arrays);
+
+    if (count == 1 && !is_tuple && !is_dict) {
+        return take_one_seen(program, 0, arrays, buffers, seen);
+    }
+    if ((!is_dict && !is_tuple) || (size_t)PyObject_Size(arrays) != count) {
+        PyErr_Format(PyExc_TypeError, "there must be a tuple of %zu arrays of observations", count);
+        return false;
+    }
+    return take_each_seen(program, arrays, buffers, seen);
 }
 
 /* Evaluating a program alone */

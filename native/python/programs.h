@@ -23,8 +23,8 @@ typedef struct {
 bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *program);
 void release_program(PyProgram *program);
 
-/* Takes the arrays that a program stores observations in: a tuple, or the only one. There is room
- * for MOST_SEEN. */
+/* Takes the arrays that a program stores observations in: a tuple, the values of a dict, or the only
+ * one. There is room for MOST_SEEN. */
 bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen);
 
 /* Takes a vector with any type of numbers. */

@@ -12,6 +12,7 @@
 
 #include "buffers.h"
 #include "pool.h"
+#include "system.h"
 
 enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, LAST_INITIALIZATION, BUFFERS };
 
@@ -42,6 +43,7 @@ typedef struct {
     PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
     const char **paths, **categories;
+    System *system;
     StringValue *strings;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
     PyObject *single;  /* another one */
@@ -62,6 +64,14 @@ bool is_access(const PyPool *self, PyObject *object);
 bool take_mark(PyObject *object, const Mark **mark);
 
 PyObject *decode(const char *text);
+/* The texts of a tuple of bytes, to be freed; NULL with an exception if it holds others. */
+const char **take_texts(PyObject *tuple);
+/* Takes the tuple that fmugym/pool/settings.py makes, or None. */
+bool take_solving(PyObject *tuple, Solving *solving);
+/* Takes the tuple that fmugym/pool/systems.py makes, or None. The caller drops the system whether
+ * or not this returns false with an exception. */
+bool take_system(PyObject *tuple, System **system);
+void drop_system(System *system);
 /* Parses the values of a dict by name, as PyArg_ParseTupleAndKeywords does. */
 bool parse_group(PyObject *group, const char *format, char **names, ...);
 bool has_arguments(Py_ssize_t given, Py_ssize_t expected);

@@ -8,15 +8,15 @@
 #include "worker.h"
 
 bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
-    size_t count, size;
+    size_t count, size, size_of_rest;
     const char *types = read_block(reader, &count);
-    const char *references = read_block(reader, &size);
-    bool sound = reader->sound && size == count * sizeof(uint32_t);
+    const char *elements = read_block(reader, &size);
+    const char *rest = read_block(reader, &size_of_rest);
+    Listing listing;
 
-    for (size_t i = 0; sound && i < count; i++) {
-        sound = is_type((uint8_t)types[i]);
-    }
-    return sound && access_open(access, fmi, (const uint8_t *)types, references, count);
+    return reader->sound &&
+           listing_take(&listing, types, count, elements, size, rest, size_of_rest) == NULL &&
+           access_open(access, fmi, &listing);
 }
 
 /* Shared memory */

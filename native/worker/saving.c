@@ -171,6 +171,7 @@ void answer_record_of(Worker *w, Reader *reader) {
         for (size_t i = 0; i < record->number_of_starts; i++) {
             write_integer(&writer, record->starts[i].type);
             write_integer(&writer, record->starts[i].reference);
+            write_integer(&writer, record->starts[i].place);
             write_number(&writer, record->starts[i].value);
         }
         write_integer(&writer, (int64_t)record->rows);

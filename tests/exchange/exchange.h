@@ -4,6 +4,8 @@
    the other files. Its variables are numbered by their value references: first the states, then
    their derivatives. */
 
+#pragma once
+
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>

@@ -119,6 +119,18 @@ int fmi3GetDirectionalDerivative(Model *me, const unsigned *unknowns, size_t cou
     return core_differentiate(me, unknowns, count, knowns, number_of_knowns, seed, result);
 }
 
+int fmi3GetAdjointDerivative(Model *me, const unsigned *unknowns, size_t count,
+                             const unsigned *knowns, size_t number_of_knowns, const double *seed,
+                             size_t number_of_seeds, double *result, size_t number_of_results) {
+    for (size_t j = 0; j < number_of_knowns; j++) {
+        result[j] = 0.0;
+        for (size_t i = 0; i < count; i++) {
+            result[j] += seed[i] * model_partial(me, unknowns[i], knowns[j]);
+        }
+    }
+    return number_of_seeds == count && number_of_results == number_of_knowns ? OK : ERROR;
+}
+
 int fmi3GetFMUState(Model *me, void **state) {
     return core_get_state(me, state);
 }

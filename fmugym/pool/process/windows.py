@@ -30,10 +30,10 @@ from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
+    listing,
     manner_of,
     record_from,
     solving_settings,
-    types_and_references,
     variable_settings,
 )
 from fmugym.pool.spec import ResetMethod, start_variables
@@ -94,7 +94,7 @@ class _Writer:
         self.parts.append(np.ascontiguousarray(array, dtype).tobytes())
 
     def access(self, variables: Sequence[Variable], version: int) -> None:
-        for part in types_and_references(variables, version):
+        for part in listing(variables, version):
             self.block(part)
 
     def optional(self, number: float | None) -> None:
@@ -310,14 +310,15 @@ class ProgramCoding:
         if reader.is_done:
             return None
         starts = [
-            (reader.integer(), reader.integer(), reader.number()) for _ in range(reader.integer())
+            (reader.integer(), reader.integer(), reader.integer(), reader.number())
+            for _ in range(reader.integer())
         ]
         steps = reader.integer()
         setup = self._setup
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
 
     def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
-        variables = start_variables(self._setup.description.variables, record.names)
+        variables = start_variables(self._setup.description.variable, record.names)
         writer.integers(index, len(record.inputs))
         writer.access(variables, self._version)
         for values in (record.starts, record.inputs):

@@ -36,6 +36,8 @@ from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
+from fmugym.systems.description import SystemDescription
+from fmugym.systems.fmu import ExtractedSystem
 from fmugym.wine.prefix import Wine
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
@@ -341,9 +343,16 @@ def _native_echo_to(memory: npt.NDArray[np.uint8]) -> None:
     _native.echo_to(memory)
 
 
+def _extracted(setup: Setup) -> ExtractedFMU:
+    path, description, folder = setup.path, setup.description, setup.folder
+    if isinstance(description, SystemDescription):
+        return ExtractedSystem(path, description, folder)
+    return ExtractedFMU(path, description, setup.preload, folder)
+
+
 def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> SavingPool:
     return local_pool(
-        ExtractedFMU(setup.path, setup.description, setup.preload, setup.folder),
+        _extracted(setup),
         setup.spec,
         setup.block.stop - setup.block.start,
         log,

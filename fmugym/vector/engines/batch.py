@@ -24,6 +24,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
+from fmugym.task.values import ParameterValues
 from fmugym.task.warm_up import WarmUps, grouped
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
@@ -72,7 +73,9 @@ class BatchEngine(Engine):
     def _make_parameters(self, plan: EpisodePlan) -> None:
         self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
         self._drawn_rows = np.array(plan.drawn_rows, np.intp)[:, None]
-        self._parameters = dict(zip(plan.parameter_names, self._start_values, strict=True))
+        self._parameters = ParameterValues(
+            zip(plan.parameter_names, self._start_values, strict=True)
+        )
         self.env.parameters = MappingProxyType(self._parameters)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:

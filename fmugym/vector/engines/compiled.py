@@ -430,8 +430,9 @@ class CompiledEngine(BatchEngine):
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
         seen = self._arrays_of_steps(horizon)
         self.has_moved = True
+        arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
         troubled = self._pool.roll_out(
-            np.ascontiguousarray(actions), seen, *judged, np.zeros(self._drawn_shape)
+            np.ascontiguousarray(actions), arrays, *judged, np.zeros(self._drawn_shape)
         )
         if troubled:
             return None
@@ -441,8 +442,10 @@ class CompiledEngine(BatchEngine):
         """Make the arrays of many steps, with a first axis for the steps."""
         arrays = self._new_arrays()
         if isinstance(arrays, tuple):
-            return tuple([np.empty((horizon, *array.shape), array.dtype) for array in arrays])
-        return np.empty((horizon, *arrays.shape), arrays.dtype)
+            return tuple(_for_steps(array, horizon) for array in arrays)
+        if isinstance(arrays, dict):
+            return {name: _for_steps(array, horizon) for name, array in arrays.items()}
+        return _for_steps(arrays, horizon)
 
     def _completed(
         self,
@@ -573,6 +576,10 @@ class CompiledEngine(BatchEngine):
         self._require_finite_inputs(resetting)
 
 
+def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
+    return np.empty((horizon, *array.shape), array.dtype)
+
+
 def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
     """Whether all variables that are drawn have kept the type of a draw."""
     types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
@@ -587,16 +594,19 @@ class _Layout:
         env: The environment, with the arrays of N.
 
     Attributes:
-        new_arrays: Makes the arrays of a step: one, or a tuple of those that the program stores in.
+        new_arrays: Makes the arrays of a step: one, or a tuple or dict of those that the program
+            stores in.
         divided: Returns the observations and a new dict of infos that such arrays hold. None if
-            there is one array, that of the observations.
+            what ``new_arrays`` makes are the observations.
     """
 
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
         self._n = len(env.step_count)
         self._paths = [array.path for array in task.seen]
-        self._names = [path[-1] for path in self._paths]
         self._shapes = [((self._n, *array.shape), array.dtype) for array in task.seen]
+        self._named_shapes = [
+            (path[-1], *shape) for path, shape in zip(self._paths, self._shapes, strict=True)
+        ]
         self.new_arrays: Callable[[], Any] = self._stored
         self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
         if not task.seen and env._pool_observes:
@@ -604,14 +614,14 @@ class _Layout:
             self.divided = None
         elif self._paths == [("observation",)]:
             self.new_arrays, self.divided = partial(np.empty, *self._shapes[0]), None
-        elif all(len(path) == 2 and path[0] == "observation" for path in self._paths):
-            self.divided = self._named
+        elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
+            self.new_arrays, self.divided = self._named, None
 
     def _stored(self) -> tuple[npt.NDArray[Any], ...]:
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
 
-    def _named(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
-        return dict(zip(self._names, arrays, strict=True)), {}
+    def _named(self) -> dict[str, npt.NDArray[Any]]:
+        return {name: np.empty(shape, dtype) for name, shape, dtype in self._named_shapes}
 
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""

@@ -19,6 +19,7 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import ORDER
+from fmugym.task.values import ParameterValues
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
 from fmugym.vector.views import batched, column, copied
@@ -123,7 +124,8 @@ def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> Readings:
     for name, values in rows.items():
         if name in batch.variables:
             batch.variables[name] = np.moveaxis(np.array(values), 0, -1)
-    batch.parameters = {n: np.array(v) for n, v in rows.items() if n not in batch.variables}
+    own = ((n, np.array(v)) for n, v in rows.items() if n not in batch.variables)
+    batch.parameters = ParameterValues(own)
     return batch
 
 

@@ -75,21 +75,26 @@ def compile_graph(
         UntraceableError: If there are too many operations, or the pool does not have one of them.
     """
     compiler = _Compiler(graph)
+    compiler.number_outputs(stores)
     for store in stores:
-        compiler.evaluate(store.node)
-        compiler.store(store)
+        if compiler.observes_output(store):
+            compiler.store_output(store)
+        else:
+            compiler.evaluate(store.node)
+            compiler.store(store)
     for node in results:
         compiler.evaluate(node)
     return compiler.program(results, seen)
 
 
 class _Step(NamedTuple):
-    """An instruction before values have registers: operands are nodes."""
+    """An instruction before values have registers: operands are nodes, others are numbers."""
 
     operation: str
     extra: int
     node: int | None
     operands: tuple[int, ...]
+    others: tuple[int, ...] = ()
 
 
 class _Compiler:
@@ -136,6 +141,40 @@ class _Compiler:
         number = self._graph.find(node._replace(what=ufunc))
         if number is not None and number not in self._known:
             self.evaluate(number)
+
+    def observes_output(self, store: Store) -> bool:
+        """Whether it stores an output of the FMU as a float32, as most observations do."""
+        node = self._graph.nodes[store.node]
+        if store.row is not None or node.kind != "cast" or node.dtype != np.float32:
+            return False
+        source = self._graph.nodes[node.operands[0]]
+        what: Any = source.what
+        return source.kind == "row" and what[0] == "output"
+
+    def _output_row(self, store: Store) -> int:
+        node = self._graph.nodes[self._graph.nodes[store.node].operands[0]]
+        return self._place(self._rows, node.what)
+
+    def number_outputs(self, stores: Sequence[Store]) -> None:
+        """Let the rows of outputs that are observed side by side follow each other."""
+        for store in filter(self.observes_output, stores):
+            self._output_row(store)
+
+    def store_output(self, store: Store) -> None:
+        """Store an output in the same instruction as the one before, if they are neighbours."""
+        row, slot = self._output_row(store), len(self._slots)
+        self._slots.append((*store.slot, TYPES.index("f")))
+        last = self._steps[-1] if self._steps else None
+        if last is not None and last.operation == "store_floats":
+            first, count = last.others
+            array, element, _ = store.slot
+            if (first + count, last.extra + count) == (row, slot) and self._slots[-2][:2] == (
+                array,
+                element - 1,
+            ):
+                self._steps[-1] = last._replace(others=(first, count + 1))
+                return
+        self._steps.append(_Step("store_floats", slot, None, (), (row, 1)))
 
     def store(self, store: Store) -> None:
         """Add the instruction that stores a value."""
@@ -223,7 +262,7 @@ class _Compiler:
         for line, step in zip(code, self._steps, strict=True):
             line[:2] = OPERATIONS.index(step.operation), step.extra
             line[2] = 0 if step.node is None else registers[step.node]
-            operands = [registers[operand] for operand in step.operands]
+            operands = [*(registers[operand] for operand in step.operands), *step.others]
             line[3 : 3 + len(operands)] = operands
         return Program(
             code,

@@ -20,7 +20,7 @@ __all__ = ["OPERATIONS", "TYPES", "Program", "UntraceableError", "evaluate", "le
 
 OPERATIONS: Final = (
     *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
-    *("store_row", "store_seen", "call", "call_square", "call_remainder"),
+    *("store_row", "store_seen", "store_floats", "call", "call_square", "call_remainder"),
     *("call_sine", "call_cosine"),
     *("cast", "take", "interpolate"),
     *("add d", "subtract d", "multiply d", "divide d", "square d", "negative d", "absolute d"),

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Graph
@@ -473,7 +473,7 @@ def symbolic_readings(
         done=loaded(graph, "missing", missing, np.bool_),
         after_end=lift(graph, np.zeros(LANES, np.bool_)),
         parameters=MappingProxyType(
-            {name: rows((), "parameter", name) for name in env._interface.parameters}
+            ParameterValues((n, rows((), "parameter", n)) for n in env._interface.parameters)
         ),
         variables=names,
     )

@@ -1,0 +1,253 @@
+"""The model descriptions of exported agents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+from xml.etree import ElementTree
+
+from fmugym.archive.description import Unit, Variable
+from fmugym.export.agent import Agent
+
+__all__ = ["Port", "kind_of", "model_description", "ports_of"]
+
+_KINDS: Final[Mapping[str, str]] = {
+    "Float64": "d",
+    "Float32": "f",
+    "Int8": "b",
+    "UInt8": "B",
+    "Int16": "h",
+    "UInt16": "H",
+    "Int32": "i",
+    "UInt32": "I",
+    "Int64": "q",
+    "UInt64": "Q",
+    "Boolean": "?",
+    "Real": "d",
+    "Integer": "i",
+}
+"""Types of FMI 2.0 and 3.0, and their letters in the C sources."""
+
+_OF_FMI_2: Final = {"real": "Real", "boolean": "Boolean"}
+_OF_FMI_3: Final = {"Real": "Float64", "Integer": "Int32", "Enumeration": "Int64"}
+_BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+@dataclass(frozen=True)
+class Port:
+    """A variable of an exported agent.
+
+    Attributes:
+        name: Its name, that of the plant's variable.
+        causality: ``input``, ``output`` or ``parameter``.
+        variability: In the words of FMI.
+        type: In the words of the FMI version.
+        start: The start value; None for outputs.
+        variable: The plant's variable; None for a parameter that the plant does not have.
+    """
+
+    name: str
+    causality: str
+    variability: str
+    type: str
+    start: float | None
+    variable: Variable | None
+
+
+def kind_of(port: Port) -> str:
+    """The letter of a port's type."""
+    return _KINDS[port.type]
+
+
+def ports_of(agent: Agent, fmi_version: str) -> list[Port]:
+    """The variables of an agent, in the order of their value references from 1 on."""
+    logic = agent.logic
+    ports = [
+        _port(one, "input", fmi_version, _finite(one.start_number)) for one in logic.measurements
+    ]
+    ports += [_port(one, "output", fmi_version, None) for one in logic.inputs]
+    taken = {port.name for port in ports} | {"time"}
+    number = "Real" if fmi_version == "2.0" else "Float64"
+    for one in logic.parameters:
+        name = one.name if one.name not in taken else f"{one.name}_parameter"
+        variability = "fixed" if logic.kept[one.field].updates else "tunable"
+        ports.append(Port(name, "parameter", variability, number, one.start, one.variable))
+    return ports
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
+def _port(variable: Variable, causality: str, fmi_version: str, start: float | None) -> Port:
+    if fmi_version == "2.0":
+        kind = _OF_FMI_2.get(variable.kind, "Integer")
+    else:
+        kind = _OF_FMI_3.get(variable.type, variable.type)
+    is_continuous = kind in {"Real", "Float64", "Float32"} and causality == "input"
+    variability = "continuous" if is_continuous else "discrete"
+    return Port(variable.name, causality, variability, kind, start, variable)
+
+
+def model_description(
+    agent: Agent, fmi_version: str, token: str, units: Mapping[str, Unit]
+) -> bytes:
+    """Write a model description.
+
+    Args:
+        agent: The agent.
+        fmi_version: ``"2.0"`` or ``"3.0"``.
+        token: The GUID or instantiation token.
+        units: The units of the plant.
+    """
+    ports = ports_of(agent, fmi_version)
+    writer = _Writer2() if fmi_version == "2.0" else _Writer3()
+    root = writer.root(agent, token)
+    _add_units(root, ports, units)
+    categories = ElementTree.SubElement(root, "LogCategories")
+    ElementTree.SubElement(categories, "Category", name="logStatusError")
+    step = repr(agent.logic.time_step)
+    ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)
+    writer.add_variables(ElementTree.SubElement(root, "ModelVariables"), ports)
+    writer.add_structure(ElementTree.SubElement(root, "ModelStructure"), ports)
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, "unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
+
+
+def _add_units(root: Any, ports: Sequence[Port], units: Mapping[str, Unit]) -> None:
+    used = dict.fromkeys(one.variable.unit for one in ports if one.variable is not None)
+    names = [name for name in used if name]
+    if not names:
+        return
+    section = ElementTree.SubElement(root, "UnitDefinitions")
+    for name in names:
+        element = ElementTree.SubElement(section, "Unit", name=name)
+        unit = units.get(name)
+        if unit is None or unit.dimension is None:
+            continue
+        exponents = zip(_BASE_UNITS, unit.dimension, strict=True)
+        facts = {base: str(power) for base, power in exponents if power}
+        facts |= {} if unit.factor == 1.0 else {"factor": repr(unit.factor)}
+        facts |= {} if unit.offset == 0.0 else {"offset": repr(unit.offset)}
+        ElementTree.SubElement(element, "BaseUnit", facts)
+
+
+class _Writer2:
+    """FMI 2.0."""
+
+    def root(self, agent: Agent, token: str) -> Any:
+        facts = {
+            "fmiVersion": "2.0",
+            "modelName": agent.name,
+            "guid": token,
+            "description": agent.notes[0] if agent.notes else "",
+            "generationTool": f"fmugym {agent.version}",
+            "variableNamingConvention": "flat",
+            "numberOfEventIndicators": "0",
+        }
+        root = ElementTree.Element("fmiModelDescription", facts)
+        abilities = {
+            "modelIdentifier": agent.name,
+            "canHandleVariableCommunicationStepSize": "true",
+            "canNotUseMemoryManagementFunctions": "true",
+            "canGetAndSetFMUstate": "true",
+            "canSerializeFMUstate": "true",
+        }
+        interface = ElementTree.SubElement(root, "CoSimulation", abilities)
+        files = ElementTree.SubElement(interface, "SourceFiles")
+        for name in (f"{agent.name}.c", "fmi2.c"):
+            ElementTree.SubElement(files, "File", name=name)
+        return root
+
+    def add_variables(self, section: Any, ports: Sequence[Port]) -> None:
+        clock = {"name": "time", "valueReference": "0", "causality": "independent"}
+        first = ElementTree.SubElement(
+            section, "ScalarVariable", {**clock, "variability": "continuous"}
+        )
+        ElementTree.SubElement(first, "Real")
+        for reference, port in enumerate(ports, 1):
+            facts = _facts(port, reference)
+            element = ElementTree.SubElement(section, "ScalarVariable", facts)
+            ElementTree.SubElement(element, port.type, _of_type(port))
+
+    def add_structure(self, section: Any, ports: Sequence[Port]) -> None:
+        for name in ("Outputs", "InitialUnknowns"):
+            group = ElementTree.SubElement(section, name)
+            for index in _outputs(ports):  # the time is the first variable
+                ElementTree.SubElement(group, "Unknown", index=str(index + 1))
+
+
+class _Writer3:
+    """FMI 3.0."""
+
+    def root(self, agent: Agent, token: str) -> Any:
+        facts = {
+            "fmiVersion": "3.0",
+            "modelName": agent.name,
+            "instantiationToken": token,
+            "description": agent.notes[0] if agent.notes else "",
+            "generationTool": f"fmugym {agent.version}",
+            "variableNamingConvention": "flat",
+        }
+        root = ElementTree.Element("fmiModelDescription", facts)
+        abilities = {
+            "modelIdentifier": agent.name,
+            "canHandleVariableCommunicationStepSize": "true",
+            "canGetAndSetFMUState": "true",
+            "canSerializeFMUState": "true",
+        }
+        ElementTree.SubElement(root, "CoSimulation", abilities)
+        return root
+
+    def add_variables(self, section: Any, ports: Sequence[Port]) -> None:
+        clock = {"name": "time", "valueReference": "0", "causality": "independent"}
+        ElementTree.SubElement(section, "Float64", {**clock, "variability": "continuous"})
+        for reference, port in enumerate(ports, 1):
+            facts = _facts(port, reference) | _of_type(port)
+            ElementTree.SubElement(section, port.type, facts)
+
+    def add_structure(self, section: Any, ports: Sequence[Port]) -> None:
+        for name in ("Output", "InitialUnknown"):
+            for reference in _outputs(ports):
+                ElementTree.SubElement(section, name, valueReference=str(reference))
+
+
+def _outputs(ports: Sequence[Port]) -> Iterator[int]:
+    """The value references of the outputs; each depends on all inputs."""
+    return (number for number, port in enumerate(ports, 1) if port.causality == "output")
+
+
+def _facts(port: Port, reference: int) -> dict[str, str]:
+    facts = {
+        "name": port.name,
+        "valueReference": str(reference),
+        "causality": port.causality,
+        "variability": port.variability,
+    }
+    if port.causality == "output":
+        facts["initial"] = "calculated"
+    if port.variable is not None and port.variable.description:
+        facts["description"] = port.variable.description
+    return facts
+
+
+def _of_type(port: Port) -> dict[str, str]:
+    """The attributes that depend on the type."""
+    facts = {} if port.start is None else {"start": _written(port.start, port.type)}
+    if port.variable is None or port.type == "Boolean":
+        return facts
+    low, high = port.variable.minimum, port.variable.maximum
+    limits = {"min": low, "max": high} if low < high else {}
+    facts |= {k: _written(v, port.type) for k, v in limits.items() if math.isfinite(v)}
+    if port.type in {"Real", "Float64", "Float32"} and port.variable.unit:
+        facts["unit"] = port.variable.unit
+    return facts
+
+
+def _written(value: float, kind: str) -> str:
+    if kind == "Boolean":
+        return "true" if value else "false"
+    return repr(float(value)) if kind in {"Real", "Float64", "Float32"} else str(int(value))

@@ -1,0 +1,198 @@
+/* An agent as the instance of an FMU, for all FMI versions.
+ *
+ * A sample is taken at the beginning of a communication step, with the inputs that the importer has
+ * set before. Its actions hold until the next sample. A communication step may be shorter or longer
+ * than the time between two samples. Before the first one, the outputs show what it would be. */
+
+#ifndef CONTROLLER_H
+#define CONTROLLER_H
+
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "model.h"
+
+/* A sample is due if it lies this part of its time before the end of a step: times are rounded. */
+#define TOLERANCE 1e-6
+
+typedef enum { INSTANTIATED, INITIALIZATION, STEPPING, TERMINATED } Mode;
+
+/* All that the state of the FMU consists of. */
+typedef struct {
+    AGENT_STATE agent;
+    double measurements[MEASUREMENTS + 1]; /* one more: an array has an element at least */
+    double actions[ACTIONS + 1];
+    double start, time;
+    long long samples;
+    Mode mode;
+} Memory;
+
+typedef struct {
+    Memory memory;
+    char *name;
+    void *logger, *environment;
+    void (*emit)(const void *instance, const char *message);
+} Controller;
+
+static bool fail(const Controller *controller, const char *message) {
+    if (controller->emit != NULL) {
+        controller->emit(controller, message);
+    }
+    return false;
+}
+
+static void begin(Controller *controller) {
+    Memory *memory = &controller->memory;
+    memset(memory, 0, sizeof *memory); /* padding, too: states are compared as bytes */
+    AGENT_INIT(&memory->agent);
+    for (size_t i = 0; i < MEASUREMENTS; i++) {
+        memory->measurements[i] = first_measurements[i];
+    }
+}
+
+static Controller *create(const char *name, const char *token) {
+    if (token == NULL || strcmp(token, TOKEN) != 0) {
+        return NULL;
+    }
+    Controller *controller = (Controller *)calloc(1, sizeof *controller);
+    if (controller == NULL) {
+        return NULL;
+    }
+    name = name == NULL ? "" : name;
+    controller->name = (char *)malloc(strlen(name) + 1);
+    if (controller->name == NULL) {
+        free(controller);
+        return NULL;
+    }
+    strcpy(controller->name, name);
+    begin(controller);
+    return controller;
+}
+
+static void destroy(Controller *controller) {
+    if (controller != NULL) {
+        free(controller->name);
+        free(controller);
+    }
+}
+
+/* Variables. The reference 0 is the time; measurements, actions and parameters follow. */
+
+static bool has_kind(const Controller *controller, unsigned reference, char kind) {
+    if (reference < sizeof kinds - 1 && kinds[reference] == kind) {
+        return true;
+    }
+    return fail(controller, "there is no variable of this type with this value reference");
+}
+
+static bool sample(const Controller *controller, AGENT_STATE *agent, double *actions) {
+    if (AGENT_STEP(agent, controller->memory.measurements, actions) == 0) {
+        return true;
+    }
+    return fail(controller, "a measurement is not finite, or outside of a table");
+}
+
+static bool get_action(const Controller *controller, unsigned place, double *value) {
+    double actions[ACTIONS + 1];
+    if (controller->memory.samples > 0) {
+        *value = controller->memory.actions[place];
+        return true;
+    }
+    AGENT_STATE agent = controller->memory.agent;
+    if (!sample(controller, &agent, actions)) {
+        return false;
+    }
+    *value = actions[place];
+    return true;
+}
+
+static bool get_value(const Controller *controller, unsigned reference, char kind, double *value) {
+    if (!has_kind(controller, reference, kind)) {
+        return false;
+    }
+    if (reference > MEASUREMENTS + ACTIONS) {
+        *value = get_parameter(&controller->memory.agent, reference - 1 - MEASUREMENTS - ACTIONS);
+    } else if (reference > MEASUREMENTS) {
+        return get_action(controller, reference - 1 - MEASUREMENTS, value);
+    } else {
+        const Memory *memory = &controller->memory;
+        *value = reference == 0 ? memory->time : memory->measurements[reference - 1];
+    }
+    return true;
+}
+
+static bool set_value(Controller *controller, unsigned reference, char kind, double value) {
+    if (!has_kind(controller, reference, kind)) {
+        return false;
+    }
+    if (reference >= 1 && reference <= MEASUREMENTS) {
+        controller->memory.measurements[reference - 1] = value;
+        return true;
+    }
+    if (reference <= MEASUREMENTS + ACTIONS) {
+        return fail(controller, "time and outputs cannot be set");
+    }
+    const unsigned place = reference - 1 - MEASUREMENTS - ACTIONS;
+    if (is_fixed[place] && controller->memory.mode == STEPPING) {
+        return fail(controller, "a fixed parameter cannot be set after the initialization");
+    }
+    set_parameter(&controller->memory.agent, place, value);
+    return true;
+}
+
+/* Steps */
+
+static bool step(Controller *controller, double time, double size) {
+    Memory *memory = &controller->memory;
+    const double end = time + size;
+
+    if (memory->mode != STEPPING) {
+        return fail(controller, "a step needs an initialized instance");
+    }
+    if (!(size > 0) || !isfinite(end)) {
+        return fail(controller, "the communication step size must be positive");
+    }
+    while (memory->start + (double)memory->samples * SAMPLE_TIME < end - TOLERANCE * SAMPLE_TIME) {
+        if (!sample(controller, &memory->agent, memory->actions)) {
+            return false;
+        }
+        memory->samples++;
+    }
+    memory->time = end;
+    return true;
+}
+
+/* States */
+
+static bool get_state(const Controller *controller, void **state) {
+    if (*state == NULL) {
+        *state = malloc(sizeof(Memory));
+    }
+    if (*state == NULL) {
+        return fail(controller, "there is no memory for a state");
+    }
+    memcpy(*state, &controller->memory, sizeof(Memory));
+    return true;
+}
+
+static bool set_state(Controller *controller, const void *state) {
+    if (state == NULL) {
+        return fail(controller, "there is no such state");
+    }
+    memcpy(&controller->memory, state, sizeof(Memory));
+    return true;
+}
+
+static bool copy_bytes(const Controller *controller, void *to, const void *from, size_t size) {
+    if (to == NULL || from == NULL || size != sizeof(Memory)) {
+        return fail(controller, "the bytes of a state have another size");
+    }
+    memcpy(to, from, size);
+    return true;
+}
+
+#endif

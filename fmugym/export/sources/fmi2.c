@@ -1,0 +1,191 @@
+/* The functions of FMI 2.0 for co-simulation. */
+
+#include "fmi2Functions.h"
+
+#include "controller.h"
+
+#define OR_ERROR(done) ((done) ? fmi2OK : fmi2Error)
+
+static void emit(const void *instance, const char *message) {
+    const Controller *controller = (const Controller *)instance;
+    fmi2CallbackLogger logger;
+    memcpy(&logger, &controller->logger, sizeof logger); /* ISO C has no cast between the two */
+    logger(controller->environment, controller->name, fmi2Error, "logStatusError", message);
+}
+
+const char *fmi2GetTypesPlatform(void) {
+    return fmi2TypesPlatform;
+}
+
+const char *fmi2GetVersion(void) {
+    return "2.0";
+}
+
+fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String names[]) {
+    return fmi2OK;
+}
+
+fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, fmi2String folder,
+                              const fmi2CallbackFunctions *functions, fmi2Boolean visible,
+                              fmi2Boolean on) {
+    Controller *controller = type == fmi2CoSimulation ? create(name, token) : NULL;
+    if (controller != NULL && functions != NULL && functions->logger != NULL) {
+        memcpy(&controller->logger, &functions->logger, sizeof controller->logger);
+        controller->environment = functions->componentEnvironment;
+        controller->emit = emit;
+    }
+    return controller;
+}
+
+void fmi2FreeInstance(fmi2Component c) {
+    destroy((Controller *)c);
+}
+
+fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance,
+                               fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
+    Memory *memory = &((Controller *)c)->memory;
+    memory->start = memory->time = start;
+    return fmi2OK;
+}
+
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
+    ((Controller *)c)->memory.mode = INITIALIZATION;
+    return fmi2OK;
+}
+
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    ((Controller *)c)->memory.mode = STEPPING;
+    return fmi2OK;
+}
+
+fmi2Status fmi2Terminate(fmi2Component c) {
+    ((Controller *)c)->memory.mode = TERMINATED;
+    return fmi2OK;
+}
+
+fmi2Status fmi2Reset(fmi2Component c) {
+    begin((Controller *)c);
+    return fmi2OK;
+}
+
+#define ACCESS(Type, kind, converted)                                                              \
+    fmi2Status fmi2Get##Type(fmi2Component c, const fmi2ValueReference references[], size_t n,     \
+                             fmi2##Type values[]) {                                                \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            double value = 0.0;                                                                    \
+            if (!get_value((Controller *)c, references[i], kind, &value)) {                        \
+                return fmi2Error;                                                                  \
+            }                                                                                      \
+            values[i] = (fmi2##Type)(converted);                                                   \
+        }                                                                                          \
+        return fmi2OK;                                                                             \
+    }                                                                                              \
+    fmi2Status fmi2Set##Type(fmi2Component c, const fmi2ValueReference references[], size_t n,     \
+                             const fmi2##Type values[]) {                                          \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            if (!set_value((Controller *)c, references[i], kind, (double)values[i])) {             \
+                return fmi2Error;                                                                  \
+            }                                                                                      \
+        }                                                                                          \
+        return fmi2OK;                                                                             \
+    }
+
+ACCESS(Real, 'd', value)
+ACCESS(Integer, 'i', value)
+ACCESS(Boolean, '?', value != 0.0)
+
+fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference references[], size_t n,
+                         fmi2String values[]) {
+    return OR_ERROR(n == 0);
+}
+
+fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference references[], size_t n,
+                         const fmi2String values[]) {
+    return OR_ERROR(n == 0);
+}
+
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
+    return OR_ERROR(get_state((Controller *)c, state));
+}
+
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
+    return OR_ERROR(set_state((Controller *)c, state));
+}
+
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
+    free(*state);
+    *state = NULL;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
+    *size = sizeof(Memory);
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[],
+                                 size_t size) {
+    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
+}
+
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
+                                   fmi2FMUstate *state) {
+    *state = NULL;
+    if (!get_state((Controller *)c, state)) {
+        return fmi2Error;
+    }
+    return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));
+}
+
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[],
+                                        size_t n, const fmi2ValueReference knowns[], size_t m,
+                                        const fmi2Real seed[], fmi2Real sensitivity[]) {
+    return fmi2Error;
+}
+
+fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference references[],
+                                       size_t n, const fmi2Integer orders[],
+                                       const fmi2Real values[]) {
+    return OR_ERROR(n == 0);
+}
+
+fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference references[],
+                                        size_t n, const fmi2Integer orders[], fmi2Real values[]) {
+    return OR_ERROR(n == 0);
+}
+
+fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_set_state) {
+    return OR_ERROR(step((Controller *)c, time, size));
+}
+
+fmi2Status fmi2CancelStep(fmi2Component c) {
+    return fmi2Error;
+}
+
+fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value) {
+    return fmi2Discard; /* steps are never pending */
+}
+
+fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {
+    if (kind != fmi2LastSuccessfulTime) {
+        return fmi2Discard;
+    }
+    *value = ((Controller *)c)->memory.time;
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Integer *value) {
+    return fmi2Discard;
+}
+
+fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *value) {
+    if (kind != fmi2Terminated) {
+        return fmi2Discard;
+    }
+    *value = fmi2False;
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind kind, fmi2String *value) {
+    return fmi2Discard;
+}

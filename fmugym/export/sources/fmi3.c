@@ -1,0 +1,355 @@
+/* The functions of FMI 3.0 for co-simulation. */
+
+#include "fmi3Functions.h"
+
+#include "controller.h"
+
+#define OR_ERROR(done) ((done) ? fmi3OK : fmi3Error)
+
+static void emit(const void *instance, const char *message) {
+    const Controller *controller = (const Controller *)instance;
+    fmi3LogMessageCallback log_message;
+    memcpy(&log_message, &controller->logger, sizeof log_message); /* C has no cast between them */
+    log_message(controller->environment, fmi3Error, "logStatusError", message);
+}
+
+const char *fmi3GetVersion(void) {
+    return "3.0";
+}
+
+fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n,
+                               const fmi3String categories[]) {
+    return fmi3OK;
+}
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String folder,
+                                          fmi3Boolean visible, fmi3Boolean on,
+                                          fmi3InstanceEnvironment environment,
+                                          fmi3LogMessageCallback log_message) {
+    return NULL;
+}
+
+fmi3Instance fmi3InstantiateCoSimulation(
+    fmi3String name, fmi3String token, fmi3String folder, fmi3Boolean visible, fmi3Boolean on,
+    fmi3Boolean uses_events, fmi3Boolean may_return_early,
+    const fmi3ValueReference intermediate_variables[], size_t n,
+    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log_message,
+    fmi3IntermediateUpdateCallback intermediate_update) {
+    Controller *controller = create(name, token);
+    if (controller != NULL && log_message != NULL) {
+        memcpy(&controller->logger, &log_message, sizeof controller->logger);
+        controller->environment = environment;
+        controller->emit = emit;
+    }
+    return controller;
+}
+
+fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String folder,
+                                               fmi3Boolean visible, fmi3Boolean on,
+                                               fmi3InstanceEnvironment environment,
+                                               fmi3LogMessageCallback log_message,
+                                               fmi3ClockUpdateCallback clock_update,
+                                               fmi3LockPreemptionCallback lock,
+                                               fmi3UnlockPreemptionCallback unlock) {
+    return NULL;
+}
+
+void fmi3FreeInstance(fmi3Instance c) {
+    destroy((Controller *)c);
+}
+
+fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance,
+                                       fmi3Float64 tolerance, fmi3Float64 start,
+                                       fmi3Boolean has_stop, fmi3Float64 stop) {
+    Memory *memory = &((Controller *)c)->memory;
+    memory->start = memory->time = start;
+    memory->mode = INITIALIZATION;
+    return fmi3OK;
+}
+
+fmi3Status fmi3ExitInitializationMode(fmi3Instance c) {
+    ((Controller *)c)->memory.mode = STEPPING;
+    return fmi3OK;
+}
+
+fmi3Status fmi3Terminate(fmi3Instance c) {
+    ((Controller *)c)->memory.mode = TERMINATED;
+    return fmi3OK;
+}
+
+fmi3Status fmi3Reset(fmi3Instance c) {
+    begin((Controller *)c);
+    return fmi3OK;
+}
+
+#define ACCESS(Type, kind)                                                                         \
+    fmi3Status fmi3Get##Type(fmi3Instance c, const fmi3ValueReference references[], size_t n,      \
+                             fmi3##Type values[], size_t n_values) {                               \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            double value = 0.0;                                                                    \
+            if (n != n_values || !get_value((Controller *)c, references[i], kind, &value)) {       \
+                return fmi3Error;                                                                  \
+            }                                                                                      \
+            values[i] = (fmi3##Type)value;                                                         \
+        }                                                                                          \
+        return fmi3OK;                                                                             \
+    }                                                                                              \
+    fmi3Status fmi3Set##Type(fmi3Instance c, const fmi3ValueReference references[], size_t n,      \
+                             const fmi3##Type values[], size_t n_values) {                         \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            if (n != n_values ||                                                                   \
+                !set_value((Controller *)c, references[i], kind, (double)values[i])) {             \
+                return fmi3Error;                                                                  \
+            }                                                                                      \
+        }                                                                                          \
+        return fmi3OK;                                                                             \
+    }
+
+ACCESS(Float32, 'f')
+ACCESS(Float64, 'd')
+ACCESS(Int8, 'b')
+ACCESS(UInt8, 'B')
+ACCESS(Int16, 'h')
+ACCESS(UInt16, 'H')
+ACCESS(Int32, 'i')
+ACCESS(UInt32, 'I')
+ACCESS(Int64, 'q')
+ACCESS(UInt64, 'Q')
+ACCESS(Boolean, '?')
+
+fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
+    return OR_ERROR(get_state((Controller *)c, state));
+}
+
+fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
+    return OR_ERROR(set_state((Controller *)c, state));
+}
+
+fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
+    free(*state);
+    *state = NULL;
+    return fmi3OK;
+}
+
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) {
+    *size = sizeof(Memory);
+    return fmi3OK;
+}
+
+fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[],
+                                 size_t size) {
+    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
+}
+
+fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
+                                   fmi3FMUState *state) {
+    *state = NULL;
+    if (!get_state((Controller *)c, state)) {
+        return fmi3Error;
+    }
+    return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));
+}
+
+fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 size, fmi3Boolean no_set_state,
+                      fmi3Boolean *needs_events, fmi3Boolean *terminates, fmi3Boolean *is_early,
+                      fmi3Float64 *last_time) {
+    const bool done = step((Controller *)c, time, size);
+    *needs_events = *terminates = *is_early = false;
+    *last_time = ((Controller *)c)->memory.time;
+    return OR_ERROR(done);
+}
+
+/* What a controller does not have */
+
+fmi3Status fmi3EnterEventMode(fmi3Instance c) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetString(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                         size_t nValueReferences, fmi3String values[], size_t nValues) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                         size_t nValueReferences, size_t valueSizes[], fmi3Binary values[],
+                         size_t nValues) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3GetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                        size_t nValueReferences, fmi3Clock values[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetString(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                         size_t nValueReferences, const fmi3String values[], size_t nValues) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                         size_t nValueReferences, const size_t valueSizes[],
+                         const fmi3Binary values[], size_t nValues) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                        size_t nValueReferences, const fmi3Clock values[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference valueReference,
+                                               size_t *nDependencies) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference dependent,
+                                       size_t elementIndicesOfDependent[],
+                                       fmi3ValueReference independents[],
+                                       size_t elementIndicesOfIndependents[],
+                                       fmi3DependencyKind dependencyKinds[],
+                                       size_t nDependencies) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
+                                        size_t nUnknowns, const fmi3ValueReference knowns[],
+                                        size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+                                        fmi3Float64 sensitivity[], size_t nSensitivity) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
+                                    size_t nUnknowns, const fmi3ValueReference knowns[],
+                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                  size_t nValueReferences, fmi3Float64 intervals[],
+                                  fmi3IntervalQualifier qualifiers[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3GetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                   size_t nValueReferences, fmi3UInt64 counters[],
+                                   fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3GetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                               size_t nValueReferences, fmi3Float64 shifts[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3GetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                size_t nValueReferences, fmi3UInt64 counters[],
+                                fmi3UInt64 resolutions[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                  size_t nValueReferences, const fmi3Float64 intervals[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                   size_t nValueReferences, const fmi3UInt64 counters[],
+                                   const fmi3UInt64 resolutions[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                               size_t nValueReferences, const fmi3Float64 shifts[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3SetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                size_t nValueReferences, const fmi3UInt64 counters[],
+                                const fmi3UInt64 resolutions[]) {
+    return OR_ERROR(nValueReferences == 0);
+}
+
+fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *discreteStatesNeedUpdate,
+                                    fmi3Boolean *terminateSimulation,
+                                    fmi3Boolean *nominalsOfContinuousStatesChanged,
+                                    fmi3Boolean *valuesOfContinuousStatesChanged,
+                                    fmi3Boolean *nextEventTimeDefined,
+                                    fmi3Float64 *nextEventTime) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c,
+                                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+                                       fmi3Boolean *enterEventMode,
+                                       fmi3Boolean *terminateSimulation) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 continuousStates[],
+                                   size_t nContinuousStates) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 derivatives[],
+                                             size_t nContinuousStates) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 eventIndicators[],
+                                  size_t nEventIndicators) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 continuousStates[],
+                                   size_t nContinuousStates) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominals[],
+                                             size_t nContinuousStates) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *nEventIndicators) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *nContinuousStates) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3EnterStepMode(fmi3Instance c) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference valueReferences[],
+                                    size_t nValueReferences, const fmi3Int32 orders[],
+                                    fmi3Float64 values[], size_t nValues) {
+    return fmi3Error;
+}
+
+fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference clockReference,
+                                      fmi3Float64 activationTime) {
+    return fmi3Error;
+}

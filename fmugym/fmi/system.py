@@ -1,0 +1,706 @@
+"""Instances of systems: to their users they are instances of one FMU.
+
+This does what ``native/system.c`` and its siblings do, operation by operation.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import LoadableFMU
+from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.access import Access
+from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.library import Library
+from fmugym.fmi.log import Hearing, MessageLog
+from fmugym.fmi.loops import NotSolvedError, solve_loop
+from fmugym.fmi.solver import Solving
+from fmugym.fmi.status import Phase, Status, failed_call, sane
+from fmugym.systems.description import PartVariable, SystemDescription
+from fmugym.systems.layout import Layout, PartLayout, Route
+from fmugym.systems.plan import Evaluation, Group
+
+__all__ = ["SystemInstance", "SystemLibrary", "open_library"]
+
+_GOOD: Final = (Status.OK, Status.WARNING)
+
+
+class _FailedError(Exception):
+    """A call of a component returned a status worse than a warning."""
+
+    def __init__(self, status: int, who: str) -> None:
+        super().__init__(status)
+        self.status, self.who = status, who
+
+
+def _scaled(gain: float, offset: float, value: float) -> float:
+    return value if gain == 1.0 and offset == 0.0 else gain * value + offset
+
+
+def _carried(source: _Part, route: Route, value: float) -> float:
+    """What a route carries. Values that are not finite must not reach other FMUs."""
+    if not math.isfinite(value):
+        raise _FailedError(Status.NOT_FINITE, f"{source.label}, whose outputs are not finite")
+    return _scaled(route.gain, route.offset, value)
+
+
+class _Part:
+    """The instance of one component.
+
+    Args:
+        layout: Its slots.
+        instance: Of its FMU.
+    """
+
+    def __init__(self, layout: PartLayout, instance: Instance) -> None:
+        self.layout, self.instance = layout, instance
+        self.label = layout.label
+        self.inputs = Access(instance, layout.inputs)
+        self.outputs = Access(instance, layout.outputs)
+        self.started = False
+        self.forget()
+
+    def forget(self) -> None:
+        """Return the slots to the start values."""
+        self.inputs.values[:] = [v.start_number for v in self.layout.inputs]
+        self.outputs.values[:] = 0.0
+
+    def judge(self, status: int) -> None:
+        """Raise for a bad status of a call.
+
+        Raises:
+            _FailedError: With the name of the component.
+        """
+        status = self.instance.judge(sane(status))
+        if status not in _GOOD:
+            raise _FailedError(status, self.label)
+
+    def get(self, variable: Variable) -> float:
+        """Get one variable."""
+        access = Access(self.instance, (variable,))
+        self.judge(access.get())
+        return float(access.values[0])
+
+    def set(self, variable: Variable, value: float) -> None:
+        """Set one variable."""
+        access = Access(self.instance, (variable,), np.array([value]))
+        self.judge(access.set())
+
+    def read(self) -> None:
+        """Fill the slots of the outputs."""
+        self.judge(self.outputs.get())
+
+    def advance(self, time: float, step: float) -> bool:
+        """Do the communication steps; returns whether the FMU has asked to stop."""
+        count = self.layout.component.steps
+        size = step / count
+        for index in range(count):
+            status = self.instance.step(time + index * size, size)
+            if status == Status.TERMINATED:
+                return True
+            self.judge(status)
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """What a system adds to a saved state: the slots of all parts, and the states of the parts."""
+
+    inputs: bytes
+    outputs: bytes
+    fresh: bool
+    states: tuple[SavedState, ...]
+
+
+class SystemInstance(Instance):
+    """One instance of a system; made by ``Library.instantiate``.
+
+    Args:
+        layout: The slots and routes.
+        instances: Those of the components, in their order.
+        target: The logger for the system's own messages.
+    """
+
+    dtypes: ClassVar[dict[str, Any]] = {"Float64": np.float64}
+
+    def __init__(
+        self, layout: Layout, instances: Iterable[Instance], target: logging.Logger
+    ) -> None:
+        self._layout = layout
+        self._description: SystemDescription = layout.description
+        pairs = zip(layout.parts, instances, strict=True)
+        self._parts = [_Part(part, instance) for part, instance in pairs]
+        self._log = MessageLog(self._description.model_identifier, target)
+        self._hearing, self.hears_all = Hearing(), True
+        self.phase = Phase.INSTANTIATED
+        self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
+        self._fresh = False
+        self._terminated = False
+        self._pending: list[tuple[PartVariable, float | str]] | None = None
+        self._who = ""
+        self.step = self._step
+
+    # What one instance of an FMU does otherwise.
+
+    def _instantiate(self, log: MessageLog, logging: bool) -> None:
+        raise NotImplementedError
+
+    def _function_name(self, name: str) -> str:
+        raise NotImplementedError
+
+    def _prepare_step(self) -> Callable[[float, float], int]:
+        return self._step
+
+    def _prepare_initialization(self) -> Initialize:
+        raise NotImplementedError
+
+    @property
+    def can_say_more(self) -> bool:
+        """Whether a component may say more if it is made anew."""
+        return any(part.instance.can_say_more for part in self._parts)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no component has logged anything in this episode."""
+        return all(part.instance.is_silent for part in self._parts)
+
+    @property
+    def hears_more_than_wanted(self) -> bool:
+        """Whether a component logs everything although the logger drops most of it."""
+        return any(part.instance.hears_more_than_wanted for part in self._parts)
+
+    def begin_episode(self) -> None:
+        """Forget the messages of the episode before."""
+        for part in self._parts:
+            part.instance.begin_episode()
+
+    def c_type(self, variable: Variable) -> str:
+        """The values of a system are all of one type."""
+        return "Float64"
+
+    def describe_failure(self, doing: str, status: int) -> str:
+        """Say which call failed and in which component, with its last messages."""
+        said = "".join(part.instance._log.said() for part in self._parts)
+        return f"{self._log.instance_name}: {failed_call(doing, status, self._who)}{said}"
+
+    def _tell(self, failure: _FailedError) -> int:
+        self._who = failure.who
+        return failure.status
+
+    def free(self) -> None:
+        """Terminate and free the instances of all components."""
+        for part in self._parts:
+            part.instance.free()
+        self.phase = Phase.DEAD
+        self._log.close()
+
+    # Values
+
+    def prepare_access(
+        self, c_type: str, references: npt.NDArray[np.uint32], buffer: npt.NDArray[Any]
+    ) -> tuple[Any, Any, tuple[Any, ...]]:
+        """See ``Instance.prepare_access``."""
+        ends = [self._description.ends[reference] for reference in references.tolist()]
+
+        def get() -> int:
+            return self._trying(lambda: self._get_all(ends, buffer))
+
+        def set_() -> int:
+            return self._trying(lambda: self._set_all(ends, buffer))
+
+        return get, set_, ()
+
+    def _trying(self, action: Callable[[], None]) -> int:
+        self._who = ""
+        try:
+            action()
+        except _FailedError as failure:
+            return self._tell(failure)
+        return Status.OK
+
+    def _get_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
+        for index, behind in enumerate(ends):
+            end = behind[0]
+            buffer[index] = _scaled(end.gain, end.offset, self._get(end))
+
+    def _get(self, end: PartVariable) -> float:
+        part = self._parts[end.part]
+        output, given = self._layout.output_slot(end), self._layout.input_slot(end)
+        if output >= 0 and self._fresh:
+            return float(part.outputs.values[output - part.layout.first_output])
+        if given >= 0:
+            return float(part.inputs.values[given - part.layout.first_input])
+        return part.get(end.variable)
+
+    def _set_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
+        for behind, value in zip(ends, buffer.tolist(), strict=True):
+            for end in behind:
+                self._set(end, _scaled(end.gain, end.offset, value))
+
+    def _set(self, end: PartVariable, value: float) -> None:
+        part = self._parts[end.part]
+        given = self._layout.input_slot(end)
+        if given >= 0:
+            part.inputs.values[given - part.layout.first_input] = value
+        if self._pending is not None:
+            self._pending.append((end, value))
+        elif given < 0:
+            self._fresh = False
+            part.set(end.variable, value)
+
+    def set_string(self, variable: Variable, value: str) -> None:
+        """See ``Instance.set_string``."""
+        assert self._pending is not None
+        self._pending.append((self._description.ends[variable.value_reference][0], value))
+
+    # Initialization: the components are initialized one inside of the other.
+
+    def initialize(
+        self,
+        start_time: float,
+        stop_time: float | None,
+        tolerance: float | None,
+        set_start_values: Callable[[], None],
+    ) -> None:
+        """See ``Instance.initialize``."""
+        self._require(Phase.INSTANTIATED, "initialize")
+        Instance.initializations += 1
+        self._who = ""
+        try:
+            self._initialize_parts(Span(start_time, stop_time, tolerance), set_start_values)
+        except _FailedError as failure:
+            self._fail_initialization()
+            if failure.status == Status.FATAL:
+                self.phase = Phase.DEAD
+            self._tell(failure)
+            text = self.describe_failure("initialization", failure.status)
+            raise SimulationError(text) from None
+        except BaseException:
+            self._fail_initialization()
+            raise
+        self.phase = Phase.STEPPING
+
+    def _fail_initialization(self) -> None:
+        if self.phase is Phase.INSTANTIATED:
+            self.phase = Phase.FAILED
+
+    def _initialize_parts(self, span: Span, set_start_values: Callable[[], None]) -> None:
+        for part in self._parts:
+            part.forget()
+        self._fresh = False
+        self._pending = []
+        try:
+            set_start_values()
+            values, self._pending = self._pending, None
+        finally:
+            self._pending = None
+        self._begin_from(0, span, values)
+        self._refresh()
+
+    def _begin_from(self, index: int, span: Span, values: list[Any]) -> None:
+        """Begin with this part and all that follow, then exchange values."""
+        while index < len(self._parts) and not self._parts[index].layout.has_mode:
+            index += 1
+        if index == len(self._parts):
+            self._exchange_all(span, values)
+        else:
+            self._begin(index, span, values, lambda: self._begin_from(index + 1, span, values))
+
+    def _begin(
+        self, index: int, span: Span, values: list[Any], exchange: Callable[[], None] | None
+    ) -> None:
+        part = self._parts[index]
+        part.started = True
+        part.instance.exchange = exchange
+        try:
+            part.instance.initialize(*span, lambda: self._set_starts(index, values))
+        except SimulationError:
+            status = Status.FATAL if part.instance.phase is Phase.DEAD else Status.ERROR
+            raise _FailedError(status, part.label) from None
+        finally:
+            part.instance.exchange = None
+
+    def _set_starts(self, index: int, values: list[Any]) -> None:
+        """What is set for this simulation wins over what the system says."""
+        part = self._parts[index]
+        starts = part.layout.starts
+        for variable, value in starts:
+            self._set_start(part, variable, value)
+        for end, value in values:
+            if end.part == index:
+                self._set_start(part, end.variable, value)
+        if not part.layout.has_mode:
+            part.judge(part.inputs.set())
+
+    def _set_start(self, part: _Part, variable: Variable, value: float | str) -> None:
+        if isinstance(value, str):
+            part.instance.set_string(variable, value)
+        else:
+            part.set(variable, float(value))
+
+    def _exchange_all(self, span: Span, values: list[Any]) -> None:
+        def begin_if_old(index: int) -> None:
+            part = self._parts[index]
+            if not part.layout.has_mode and not part.started:
+                self._begin(index, span, values, None)
+
+        for evaluation in self._layout.plan.initialization:
+            self._evaluate(evaluation, begin_if_old)
+        for index in range(len(self._parts)):
+            begin_if_old(index)
+
+    def _evaluate(self, evaluation: Evaluation, begin_if_old: Callable[[int], None]) -> None:
+        routes = [self._layout.routes[i] for i in self._layout.routes_of(evaluation)]
+        if evaluation.loop is None:
+            for route in routes:
+                self._write_target(route, self._read_source(route, begin_if_old))
+            return
+
+        def evaluate(x: list[float]) -> list[float]:
+            for route, value in zip(routes, x, strict=True):
+                self._write_target(route, value)
+            return [self._read_source(route, begin_if_old) for route in routes]
+
+        x = [self._read_source(route, begin_if_old) for route in routes]
+        try:
+            solve_loop(evaluation.loop, x, evaluate)
+        except NotSolvedError:
+            label = self._layout.loop_label(route.source_part for route in routes)
+            raise _FailedError(Status.DISCARD, label) from None
+
+    def _read_source(self, route: Route, begin_if_old: Callable[[int], None]) -> float:
+        begin_if_old(route.source_part)
+        part = self._parts[route.source_part]
+        value = part.get(part.layout.outputs[route.source - part.layout.first_output])
+        return _carried(part, route, value)
+
+    def _write_target(self, route: Route, value: float) -> None:
+        part = self._parts[route.target_part]
+        place = route.target - part.layout.first_input
+        part.inputs.values[place] = value
+        if part.started:
+            part.set(part.layout.inputs[place], value)
+
+    def _refresh(self) -> None:
+        for part in self._parts:
+            part.read()
+        self._fresh = True
+
+    # Steps
+
+    def _step(self, time: float, step_size: float) -> int:
+        self._who, self._terminated = "", False
+        try:
+            self._step_all(time, step_size)
+        except _FailedError as failure:
+            return self.judge_step(self._tell(failure))
+        return self.judge_step(Status.TERMINATED) if self._terminated else Status.OK
+
+    def judge_step(self, status: int) -> int:
+        """See ``Instance.judge_step``; values for other components may be no numbers."""
+        if status != Status.NOT_FINITE:
+            return super().judge_step(status)
+        self.forbid_steps()
+        return status
+
+    def _step_all(self, time: float, step_size: float) -> None:
+        if not self._fresh:
+            self._refresh()
+        self._fresh = False
+        if self._layout.plan.master == "jacobi":
+            for route in self._layout.routes:
+                self._carry(route)
+        for group in self._layout.plan.groups:
+            self._step_group(group, time, step_size)
+        self._fresh = True
+
+    def _carried(self, route: Route) -> float:
+        part = self._parts[route.source_part]
+        value = float(part.outputs.values[route.source - part.layout.first_output])
+        return _carried(part, route, value)
+
+    def _take(self, route: Route, value: float) -> None:
+        part = self._parts[route.target_part]
+        part.inputs.values[route.target - part.layout.first_input] = value
+
+    def _carry(self, route: Route) -> None:
+        self._take(route, self._carried(route))
+
+    def _carry_to(self, index: int) -> None:
+        for route in self._layout.routes:
+            if route.target_part == index:
+                self._carry(route)
+
+    def _step_group(self, group: Group, time: float, step_size: float) -> None:
+        is_jacobi = self._layout.plan.master == "jacobi"
+        if group.loop is not None and not is_jacobi:
+            self._solve(group, time, step_size)
+            return
+        for index in self._layout.parts_of(group):
+            if not is_jacobi:
+                self._carry_to(index)
+            self._step_part(index, time, step_size)
+
+    def _step_part(self, index: int, time: float, step_size: float) -> None:
+        """If the FMU asks to stop, the others do their step all the same."""
+        part = self._parts[index]
+        part.judge(part.inputs.set())
+        self._terminated |= part.advance(time, step_size)
+        part.read()
+
+    def _solve(self, group: Group, time: float, step_size: float) -> None:
+        """Repeat the steps of the components of a loop from the state before the step."""
+        assert group.loop is not None
+        indices = self._layout.parts_of(group)
+        routes = [self._layout.routes[i] for i in self._layout.inner_routes(group)]
+        for index in indices:
+            self._carry_to(index)
+        x = [self._carried(route) for route in routes]
+        was_terminated = self._terminated
+        before = [self._save_part(index) for index in indices]
+        moved = False
+
+        def evaluate(x: list[float]) -> list[float]:
+            nonlocal moved
+            if moved:
+                for index, state in zip(indices, before, strict=True):
+                    self._restore_part(index, state)
+            moved = True
+            for route, value in zip(routes, x, strict=True):
+                self._take(route, value)
+            for index in indices:
+                self._step_part(index, time, step_size)
+            return [self._carried(route) for route in routes]
+
+        try:
+            solve_loop(group.loop, x, evaluate)
+        except NotSolvedError:
+            raise _FailedError(Status.DISCARD, self._layout.loop_label(indices)) from None
+        finally:
+            for state in before:
+                state.release()
+        self._terminated |= was_terminated
+
+    # States and resets
+
+    def _save_part(self, index: int) -> SavedState:
+        part = self._parts[index]
+        try:
+            return part.instance.save_state()
+        except SimulationError:
+            raise _FailedError(self._status_of(part), part.label) from None
+
+    def _restore_part(self, index: int, state: SavedState) -> None:
+        part = self._parts[index]
+        try:
+            part.instance.restore_state(state)
+        except SimulationError:
+            raise _FailedError(self._status_of(part), part.label) from None
+
+    def _status_of(self, part: _Part) -> int:
+        return Status.FATAL if part.instance.phase is Phase.DEAD else Status.ERROR
+
+    def reset(self) -> None:
+        """See ``Instance.reset``."""
+        if self.phase is Phase.DEAD:
+            raise SimulationError(
+                f"{self._log.instance_name}: no reset is legal after a fatal error"
+            )
+        for part in self._parts:
+            if part.started:
+                part.instance.reset()
+                part.started = False
+        self.phase = Phase.INSTANTIATED
+
+    def save_state(self) -> SavedState:
+        """See ``Instance.save_state``."""
+        if not self._description.capabilities.can_get_and_set_fmu_state:
+            raise SimulationError(f"{self._description.model_name} cannot get and set its state")
+        self._require(Phase.STEPPING, "save the FMU state")
+        states = tuple(part.instance.save_state() for part in self._parts)
+        memory = _Memory(*self._slots(), self._fresh, states)
+        return self._own(memory)
+
+    def _slots(self) -> tuple[bytes, bytes]:
+        return (
+            b"".join(part.inputs.values.tobytes() for part in self._parts),
+            b"".join(part.outputs.values.tobytes() for part in self._parts),
+        )
+
+    def _own(self, memory: _Memory) -> SavedState:
+        saved = _SystemState(memory)
+        self._saved_states.add(saved)
+        return saved
+
+    def restore_state(self, state: SavedState) -> None:
+        """See ``Instance.restore_state``."""
+        if self.phase is Phase.DEAD:
+            raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
+        memory: _Memory = state.memory
+        for part, own in zip(self._parts, memory.states, strict=True):
+            part.started = True
+            part.instance.restore_state(own)
+        self._put_slots(memory)
+        self.phase = Phase.STEPPING
+
+    def _put_slots(self, memory: _Memory) -> None:
+        inputs, outputs = np.frombuffer(memory.inputs), np.frombuffer(memory.outputs)
+        for part in self._parts:
+            first, last = part.layout.first_input, part.layout.first_output
+            part.inputs.values[:] = inputs[first : first + len(part.layout.inputs)]
+            part.outputs.values[:] = outputs[last : last + len(part.layout.outputs)]
+        self._fresh = memory.fresh
+
+    def serialize(self, state: SavedState) -> bytes:
+        """See ``Instance.serialize``; the native pool writes the same."""
+        memory: _Memory = state.memory
+        data = [memory.inputs, memory.outputs, struct.pack("=d", memory.fresh)]
+        for part, own in zip(self._parts, memory.states, strict=True):
+            own_data = part.instance.serialize(own)
+            data += [struct.pack("=Q", len(own_data)), own_data]
+        return b"".join(data)
+
+    def deserialize(self, data: bytes) -> SavedState:
+        """See ``Instance.deserialize``."""
+        inputs, outputs = 8 * self._layout.number_of_inputs, 8 * self._layout.number_of_outputs
+        place = inputs + outputs + 8
+        states = []
+        try:
+            fresh = struct.unpack("=d", data[place - 8 : place])[0] != 0.0
+            for part in self._parts:
+                size = struct.unpack("=Q", data[place : place + 8])[0]
+                states.append(part.instance.deserialize(data[place + 8 : place + 8 + size]))
+                place += 8 + size
+        except struct.error:
+            place = -1
+        if place != len(data):
+            self.check("deserializing a state", Status.ERROR)
+        slots = data[:inputs], data[inputs : inputs + outputs]
+        return self._own(_Memory(*slots, fresh, tuple(states)))
+
+
+class _SystemState(SavedState):
+    """The owner of the states of all components."""
+
+    release: Any
+
+    def __init__(self, memory: _Memory) -> None:
+        self.memory = memory
+        self.release = weakref.finalize(self, _release, memory.states)
+
+
+def _release(states: tuple[SavedState, ...]) -> None:
+    for state in states:
+        state.release()
+
+
+class SystemLibrary(Library):
+    """The libraries of the components of a system.
+
+    Args:
+        fmu: The system; extracted if necessary, and closed with the libraries.
+        layout: The slots and routes.
+        target: The logger for the messages of all instances.
+        solving: See ``Library``.
+
+    Raises:
+        FMULoadError: If a library cannot be loaded.
+    """
+
+    def __init__(
+        self, fmu: LoadableFMU, layout: Layout, target: logging.Logger, solving: Solving | None
+    ) -> None:
+        self.close: Any
+        self._system, self._layout, self._target = fmu, layout, target
+        self._libraries: list[Library] = []
+        self.can_save_state = fmu.description.capabilities.can_get_and_set_fmu_state
+        self._instances: list[SystemInstance] = []
+        self.close = weakref.finalize(self, _close, self._instances, self._libraries, fmu)
+        try:
+            for part, known in zip(fmu.parts, layout.parts, strict=True):
+                self._libraries.append(_load(part, known.label, target, solving))
+        except BaseException:
+            self.close()
+            raise
+
+    def instantiate(self, *, hear_all: bool = False) -> Instance:
+        """See ``Library.instantiate``."""
+        if not self.close.alive:
+            raise SimulationError(f"{self._system.path.name} is closed")
+        made: list[Instance] = []
+        try:
+            for part, library in zip(self._layout.parts, self._libraries, strict=True):
+                made.append(_instantiate(library, part.label, hear_all))
+        except BaseException:
+            for instance in made:
+                instance.free()
+            raise
+        instance = SystemInstance(self._layout, made, self._target)
+        self._instances.append(instance)
+        return instance
+
+    def discard(self, instance: Instance) -> None:
+        """See ``Library.discard``."""
+        assert isinstance(instance, SystemInstance)
+        if instance in self._instances:
+            self._instances.remove(instance)
+        instance.free()
+
+
+def _load(
+    part: LoadableFMU, label: str, target: logging.Logger, solving: Solving | None
+) -> Library:
+    try:
+        return Library(part, target, solving)
+    except FMULoadError as error:
+        raise FMULoadError(f"{label}: {error}") from None
+
+
+def _instantiate(library: Library, label: str, hear_all: bool) -> Instance:
+    try:
+        return library.instantiate(hear_all=hear_all)
+    except FMULoadError as error:
+        raise FMULoadError(f"{label}: {error}") from None
+
+
+def _close(instances: list[SystemInstance], libraries: list[Library], fmu: LoadableFMU) -> None:
+    while instances:
+        instances.pop().free()
+    for library in libraries:
+        library.close()
+    fmu.close()
+
+
+def open_library(
+    fmu: LoadableFMU,
+    target: logging.Logger,
+    solving: Solving | None,
+    inputs: Sequence[Variable],
+    outputs: Sequence[Variable],
+) -> Library:
+    """Load an FMU or a system.
+
+    Args:
+        fmu: The FMU or system.
+        target: See ``Library``.
+        solving: See ``Library``.
+        inputs: The variables that each step sets.
+        outputs: The variables that are read after each step.
+
+    Raises:
+        FMULoadError: As ``Library``.
+    """
+    description = fmu.description
+    if not isinstance(description, SystemDescription):
+        return Library(fmu, target, solving)
+    return SystemLibrary(fmu, Layout(description, inputs, outputs), target, solving)

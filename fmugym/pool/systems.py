@@ -1,0 +1,142 @@
+"""What the C code needs to know of a system; ``native/python/systems.c`` takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fmugym.archive.description import ModelDescription
+from fmugym.pool.settings import (
+    PlaceOfFMU,
+    library_settings,
+    listing,
+    manner_of,
+    solving_settings,
+)
+from fmugym.pool.spec import PoolSpec
+from fmugym.systems.description import PartVariable, SystemDescription
+from fmugym.systems.layout import Layout, PartLayout
+from fmugym.systems.plan import Loop
+
+__all__ = ["system_settings"]
+
+
+def system_settings(
+    description: ModelDescription, spec: PoolSpec, folder: Path
+) -> tuple[Any, ...] | None:
+    """What ``take_system`` of ``native/python/systems.c`` takes; None for an FMU.
+
+    Args:
+        description: That of the system or FMU.
+        spec: That of the pool.
+        folder: That of the extracted system.
+    """
+    if not isinstance(description, SystemDescription):
+        return None
+    layout = Layout(description, spec.inputs, spec.outputs)
+    return (
+        tuple(_part(part, spec, folder / str(i)) for i, part in enumerate(layout.parts)),
+        _routes(layout),
+        _variables(layout),
+        _groups(layout),
+        _transfers(layout),
+        layout.plan.master == "jacobi",
+    )
+
+
+def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
+    description = part.description
+    version = description.fmi_major_version
+    known = library_settings(description, PlaceOfFMU.here(folder, (), version))
+    label = part.label
+    numbers = [(v, float(x)) for v, x in part.starts if v.numeric]
+    texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
+    return (
+        (
+            part.component.name.encode(),
+            label.encode(),
+            f"{label}, whose outputs are not finite".encode(),
+        ),
+        (version, manner_of(description), part.has_mode),
+        (known["model"], known["token"], known["resources"]),
+        known["categories"],
+        part.component.steps,
+        solving_settings(description, spec),
+        listing(part.inputs, version),
+        _doubles(variable.start_number for variable in part.inputs),
+        listing(part.outputs, version),
+        listing([v for v, _ in numbers], version),
+        _doubles(x for _, x in numbers),
+        tuple(texts),
+    )
+
+
+def _routes(layout: Layout) -> tuple[bytes, ...]:
+    routes = layout.routes
+    return (
+        _numbers(route.source for route in routes),
+        _numbers(route.target for route in routes),
+        _doubles(route.gain for route in routes),
+        _doubles(route.offset for route in routes),
+    )
+
+
+def _variables(layout: Layout) -> tuple[bytes, ...]:
+    """The ends of all variables, and where those of each variable begin."""
+    groups = layout.description.ends
+    ends = [end for group in groups for end in group]
+    firsts = np.cumsum([0, *map(len, groups)])
+    return (
+        firsts.astype(np.uint32).tobytes(),
+        _numbers(end.part for end in ends),
+        b"".join(_type(layout, end) for end in ends),
+        _numbers(end.variable.value_reference for end in ends),
+        np.array([layout.input_slot(end) for end in ends], np.int32).tobytes(),
+        np.array([layout.output_slot(end) for end in ends], np.int32).tobytes(),
+        _doubles(end.gain for end in ends),
+        _doubles(end.offset for end in ends),
+    )
+
+
+def _type(layout: Layout, end: PartVariable) -> bytes:
+    """The C type; strings have none, and are never read."""
+    if not end.variable.numeric:
+        return b"\0"
+    version = layout.parts[end.part].description.fmi_major_version
+    return listing([end.variable], version)[0]
+
+
+def _groups(layout: Layout) -> tuple[tuple[Any, ...], ...]:
+    found = []
+    for group in layout.plan.groups:
+        parts = layout.parts_of(group)
+        loop = _loop(group.loop, layout.loop_label(parts))
+        found.append((_numbers(parts), _numbers(layout.inner_routes(group)), loop))
+    return tuple(found)
+
+
+def _transfers(layout: Layout) -> tuple[tuple[Any, ...], ...]:
+    found = []
+    for evaluation in layout.plan.initialization:
+        routes = layout.routes_of(evaluation)
+        label = layout.loop_label(layout.routes[i].source_part for i in routes)
+        found.append((_numbers(routes), _loop(evaluation.loop, label)))
+    return tuple(found)
+
+
+def _loop(loop: Loop | None, label: str) -> tuple[Any, ...] | None:
+    if loop is None:
+        return None
+    newton = loop.method == "newton"
+    return newton, loop.tolerance, loop.max_iterations, label.encode()
+
+
+def _numbers(values: Iterable[int]) -> bytes:
+    return np.array(list(values), np.uint32).tobytes()
+
+
+def _doubles(values: Iterable[float]) -> bytes:
+    return np.array(list(values), np.float64).tobytes()

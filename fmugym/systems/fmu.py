@@ -1,0 +1,178 @@
+"""A system in the place of an FMU: pools, trials and environments take it like one."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+
+from fmugym.archive.bundled import is_bundled
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, ExtractedFMU, LoadableFMU
+from fmugym.archive.safe_zip import ArchiveLimits
+from fmugym.archive.temporary import folder_name, make_folder, remove_folder
+from fmugym.errors import ConfigError, FMULoadError
+from fmugym.systems.description import SystemDescription, describe_system
+from fmugym.systems.layout import Layout
+from fmugym.systems.plan import Component, SystemPlan
+
+__all__ = ["ExtractedSystem", "SystemFMU"]
+
+
+class ExtractedSystem(ExtractedFMU):
+    """A system whose FMUs are in a folder that somebody else owns.
+
+    Args:
+        path: Names the system in messages.
+        description: The description of the system.
+        folder: That of the component with the number i is ``folder/i``.
+    """
+
+    def __init__(self, path: Path, description: SystemDescription, folder: Path) -> None:
+        super().__init__(path, description, (), folder)
+        self._parts = _parts_in(folder, description)
+
+    @property
+    def parts(self) -> tuple[LoadableFMU, ...]:
+        """The FMUs of the components."""
+        return self._parts
+
+
+def _parts_in(folder: Path, description: SystemDescription) -> tuple[LoadableFMU, ...]:
+    pairs = zip(description.plan.components, description.parts, strict=True)
+    return tuple(
+        ExtractedFMU(component.path, part, component.preload, folder / str(number))
+        for number, (component, part) in enumerate(pairs)
+    )
+
+
+class SystemFMU(FMU):
+    """A system that can stand where an ``FMU`` can.
+
+    Args:
+        plan: What to execute.
+        probe_timeout: See ``FMU``.
+
+    Attributes:
+        plan: As given.
+        path: The file of the system, or just its name.
+        description: A ``SystemDescription``.
+
+    Raises:
+        ConfigError: If a name of the plan is unknown.
+        FMULoadError: If an FMU of a component cannot be read.
+    """
+
+    def __init__(
+        self, plan: SystemPlan, *, probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
+    ) -> None:
+        self.plan = plan
+        if not plan.components:
+            raise ConfigError(f"the system {plan.name!r} has no components")
+        self._opened = tuple(map(_open, plan.components))
+        description = describe_system(plan, [fmu.description for fmu in self._opened])
+        Layout(description)  # refuses names that are unknown
+        path = Path(plan.name) if plan.file is None else plan.file
+        LoadableFMU.__init__(self, path, description, ())
+        self.limits, self.interface = ArchiveLimits(), None
+        self.probe_timeout = probe_timeout
+        self.findings = plan.findings
+        self._folder: Path | None = None
+        self._remove_folder = None
+
+    def again(self) -> SystemFMU:
+        """Open the same system once more."""
+        return SystemFMU(self.plan, probe_timeout=self.probe_timeout)
+
+    @property
+    def bundled(self) -> bool:
+        """Whether all FMUs come with the package."""
+        return all(is_bundled(component.path) for component in self.plan.components)
+
+    @property
+    def parts(self) -> tuple[LoadableFMU, ...]:
+        """The FMUs of the components, extracted."""
+        assert isinstance(self.description, SystemDescription)
+        return _parts_in(self.extract(), self.description)
+
+    @cached_property
+    def platforms(self) -> tuple[str, ...]:
+        """The platforms for which all FMUs were built, by the names of each."""
+        return tuple(sorted(set.intersection(*(set(fmu.platforms) for fmu in self._opened))))
+
+    @cached_property
+    def obstacles(self) -> tuple[str, ...]:
+        """What keeps the components from being loaded into one process; see ``FMU.obstacles``."""
+        return tuple(
+            f"component {component.name!r}: {text}"
+            for component, fmu in self._pairs()
+            for text in ((_WINDOWS_ONLY,) if fmu.in_wine else fmu.obstacles)
+        )
+
+    @cached_property
+    def missing_libraries(self) -> tuple[str, ...]:
+        """See ``FMU.missing_libraries``."""
+        found = [name for fmu in self._opened for name in fmu.missing_libraries]
+        return tuple(dict.fromkeys(found))
+
+    def _pairs(self) -> Iterator[tuple[Component, FMU]]:
+        return zip(self.plan.components, self._opened, strict=True)
+
+    def extract(self) -> Path:
+        """Extract each FMU into a folder of its own; see ``FMU.extract``.
+
+        Raises:
+            FMULoadError: If one of them cannot run here, or its archive is damaged.
+        """
+        if self._folder is not None:
+            return self._folder
+        for component, fmu in self._pairs():
+            with _naming(component):
+                _require_native(fmu)
+        folder = folder_name()
+        self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
+        try:
+            make_folder(folder)
+            for number, (component, fmu) in enumerate(self._pairs()):
+                with _naming(component):
+                    own = folder / str(number)
+                    own.mkdir()
+                    fmu._extract_to(own)
+        except BaseException:
+            self.close()
+            raise
+        self._folder = folder
+        return folder
+
+
+_WINDOWS_ONLY = (
+    "it has libraries for Windows only. These run in Wine, in processes of their own, but all "
+    "components of a system run in one process"
+)
+
+
+def _open(component: Component) -> FMU:
+    with _naming(component):
+        return FMU(
+            component.path,
+            limits=component.limits,
+            preload=component.preload,
+            interface=component.interface,
+        )
+
+
+@contextmanager
+def _naming(component: Component) -> Iterator[None]:
+    """Name the component in errors."""
+    try:
+        yield
+    except FMULoadError as error:
+        raise FMULoadError(f"component {component.name!r}: {error}") from None
+
+
+def _require_native(fmu: FMU) -> None:
+    if fmu.in_wine:
+        raise FMULoadError(f"{fmu.path.name}: {_WINDOWS_ONLY}")
+    fmu._check_library()

@@ -1,0 +1,195 @@
+"""Where the values of a system are: slots of inputs and outputs, and the routes between them.
+
+Both engines read this: ``fmugym.fmi.system`` directly, ``native/system.c`` by way of
+``fmugym.pool.systems``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from fmugym.archive.description import ModelDescription, Variable
+from fmugym.errors import ConfigError
+from fmugym.systems.description import PartVariable, SystemDescription
+from fmugym.systems.plan import Component, Evaluation, Group, Link
+
+__all__ = ["Layout", "PartLayout", "Route"]
+
+
+@dataclass
+class PartLayout:
+    """What a step sets and gets of one component.
+
+    Attributes:
+        component: Of the plan.
+        description: Of its FMU.
+        inputs, outputs: Its variables, one for each slot.
+        first_input, first_output: The numbers of its first slots.
+    """
+
+    component: Component
+    description: ModelDescription
+    inputs: list[Variable] = field(default_factory=list)
+    outputs: list[Variable] = field(default_factory=list)
+    first_input: int = 0
+    first_output: int = 0
+
+    @property
+    def label(self) -> str:
+        """Names it in messages."""
+        return f"component {self.component.name!r}"
+
+    @property
+    def has_mode(self) -> bool:
+        """Whether its FMI version has an Initialization Mode."""
+        return self.description.fmi_major_version > 1
+
+    @cached_property
+    def starts(self) -> tuple[tuple[Variable, float | str], ...]:
+        """What the plan sets before the initialization."""
+        return tuple((self._settable(name), value) for name, value in self.component.starts)
+
+    def _settable(self, name: str) -> Variable:
+        variable = self.description.variable(name)
+        if not variable.settable_at_start:
+            raise ConfigError(
+                f"{self.component.name}.{name} cannot be set: it is a {variable.variability} "
+                f"{variable.causality} with initial={variable.initial!r}"
+            )
+        return variable
+
+
+@dataclass(frozen=True)
+class Route:
+    """Carries the value of a slot of an output to a slot of an input; see ``Link``."""
+
+    source_part: int
+    source: int
+    target_part: int
+    target: int
+    gain: float
+    offset: float
+    link: int
+
+
+class Layout:
+    """The slots and routes of a system.
+
+    Args:
+        description: Of the system.
+        inputs: The system's variables that each step sets.
+        outputs: The system's variables that are read after each step.
+
+    Attributes:
+        description, plan: Of the system.
+        parts: One for each component.
+        routes: In the order of their targets.
+        number_of_inputs, number_of_outputs: Slots in all.
+
+    Raises:
+        ConfigError: If a name of the plan is unknown, or a variable cannot be used in its role.
+    """
+
+    def __init__(
+        self,
+        description: SystemDescription,
+        inputs: Iterable[Variable] = (),
+        outputs: Iterable[Variable] = (),
+    ) -> None:
+        self.description, self.plan = description, description.plan
+        pairs = zip(self.plan.components, description.parts, strict=True)
+        self.parts = [PartLayout(component, part) for component, part in pairs]
+        self._numbers = {part.component.name: i for i, part in enumerate(self.parts)}
+        self._input_slots: dict[tuple[int, int, str], int] = {}
+        self._output_slots: dict[tuple[int, int, str], int] = {}
+        self._fill(inputs, outputs)
+        self.routes = self._find_routes()
+
+    def _fill(self, inputs: Iterable[Variable], outputs: Iterable[Variable]) -> None:
+        ins: list[tuple[int, Variable]] = [self._target(link) for link in self.plan.links]
+        ins += [(e.part, e.variable) for v in inputs for e in self.ends_of(v)]
+        outs: list[tuple[int, Variable]] = [self._source(link) for link in self.plan.links]
+        outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
+        for index, part in enumerate(self.parts):
+            part.inputs = list(_different(v for number, v in ins if number == index))
+            part.outputs = list(_different(v for number, v in outs if number == index))
+        self.number_of_inputs = self.number_of_outputs = 0
+        for index, part in enumerate(self.parts):
+            part.first_input, part.first_output = self.number_of_inputs, self.number_of_outputs
+            for place, variable in enumerate(part.inputs, part.first_input):
+                self._input_slots[index, *_key(variable)] = place
+            for place, variable in enumerate(part.outputs, part.first_output):
+                self._output_slots[index, *_key(variable)] = place
+            self.number_of_inputs += len(part.inputs)
+            self.number_of_outputs += len(part.outputs)
+
+    def _source(self, link: Link) -> tuple[int, Variable]:
+        part = self._numbers[link.source]
+        return part, self.parts[part].description.variable(link.output)
+
+    def _target(self, link: Link) -> tuple[int, Variable]:
+        part = self._numbers[link.target]
+        return part, self.parts[part].description.variable(link.input)
+
+    def _find_routes(self) -> tuple[Route, ...]:
+        routes = []
+        for number, link in enumerate(self.plan.links):
+            source_part, output = self._source(link)
+            target_part, variable = self._target(link)
+            source = self._output_slots[source_part, *_key(output)]
+            target = self._input_slots[target_part, *_key(variable)]
+            routes.append(
+                Route(source_part, source, target_part, target, link.gain, link.offset, number)
+            )
+        return tuple(sorted(routes, key=lambda route: route.target))
+
+    def ends_of(self, variable: Variable) -> tuple[PartVariable, ...]:
+        """What stands behind a variable of the system."""
+        return self.description.ends[variable.value_reference]
+
+    def input_slot(self, end: PartVariable) -> int:
+        """The slot that is set for this variable; -1 if there is none."""
+        return self._input_slots.get((end.part, *_key(end.variable)), -1)
+
+    def output_slot(self, end: PartVariable) -> int:
+        """The slot that this variable is read into; -1 if there is none."""
+        return self._output_slots.get((end.part, *_key(end.variable)), -1)
+
+    # Numbers in the place of names.
+
+    @cached_property
+    def _route_of_link(self) -> dict[int, int]:
+        return {route.link: index for index, route in enumerate(self.routes)}
+
+    def parts_of(self, group: Group) -> tuple[int, ...]:
+        """The components of a group."""
+        return tuple(self._numbers[name] for name in group.components)
+
+    def inner_routes(self, group: Group) -> tuple[int, ...]:
+        """The routes within a group."""
+        inside = set(self.parts_of(group))
+        return tuple(
+            index
+            for index, route in enumerate(self.routes)
+            if route.source_part in inside and route.target_part in inside
+        )
+
+    def routes_of(self, evaluation: Evaluation) -> tuple[int, ...]:
+        """The routes of an evaluation."""
+        return tuple(self._route_of_link[link] for link in evaluation.links)
+
+    def loop_label(self, numbers: Iterable[int]) -> str:
+        """Name a loop through these components, for messages."""
+        names = dict.fromkeys(repr(self.parts[i].component.name) for i in numbers)
+        return f"the algebraic loop of {', '.join(names)}"
+
+
+def _key(variable: Variable) -> tuple[int, str]:
+    """What identifies a value of an FMU; value references of FMI 1.0 and 2.0 have a type."""
+    return variable.value_reference, variable.kind
+
+
+def _different(variables: Iterable[Variable]) -> Iterator[Variable]:
+    return iter({_key(variable): variable for variable in variables}.values())

@@ -1,0 +1,226 @@
+#include "operations.h"
+
+#include <float.h>
+#include <math.h>
+#include <string.h>
+
+#include "fmi.h"
+#include "halves.h"
+#include "platform.h"
+
+#define EACH_ITEM(size, type)                                                                      \
+    case size: {                                                                                   \
+        type *restrict into = to;                                                                  \
+        const type *restrict out = (const type *)from;                                             \
+        for (size_t j = 0; j < count; j++) {                                                       \
+            into[j * to_step] = out[j * from_step];                                                \
+        }                                                                                          \
+        break;                                                                                     \
+    }
+
+/* Copies count values of size bytes each. The steps are in values. */
+static void copy_values(void *to, size_t to_step, const void *from, size_t from_step, size_t count,
+                        size_t size) {
+    if (to_step == 1 && from_step == 1) {
+        memcpy(to, from, count * size);
+        return;
+    }
+    switch (size) {
+        EACH_ITEM(8, uint64_t)
+        EACH_ITEM(4, uint32_t)
+        EACH_ITEM(2, uint16_t)
+        EACH_ITEM(1, uint8_t)
+    }
+}
+
+/* Returns where whole blocks of the values lie: at their own place if they follow each other there,
+ * otherwise in a register, to which it copies them. */
+static const void *loaded(const Evaluation *e, const char *from, size_t step, size_t size,
+                          Register *to) {
+    if (step == 1 && e->count == e->lanes) {
+        return from;
+    }
+    copy_values(to, 1, from, step, e->count, size);
+    clear_rest(to, e->count, e->lanes, size);
+    return to;
+}
+
+static const void *load_row(const Evaluation *e, const Row *row, Register *to) {
+    const Fresh *fresh = e->source->fresh;
+    const char *from = row->data + e->begin * row->size;
+
+    if (fresh != NULL && row->output > 0) {
+        return fresh->columns + (row->output - 1) * PROGRAM_WIDTH;
+    }
+    if (row->changes) { /* a later STORE_ROW must not change what was loaded */
+        memcpy(to, from, e->count * row->size);
+        clear_rest(to, e->count, e->lanes, row->size);
+        return to;
+    }
+    return loaded(e, from, 1, row->size, to);
+}
+
+static const void *load_action(const Evaluation *e, const char *actions, size_t element,
+                               Register *to) {
+    const Source *s = e->source;
+    const char *from = actions + (e->begin * s->action_elements + element) * s->action_size;
+    return loaded(e, from, s->action_elements, s->action_size, to);
+}
+
+WIDE static void find_active(const int8_t *statuses, const uint8_t *ended, size_t count,
+                             uint8_t *restrict to) {
+    for (size_t j = 0; j < count; j++) {
+        const bool failed = (statuses[j] > STATUS_WARNING) & (statuses[j] != STATUS_TERMINATED);
+        to[j] = !failed & !ended[j];
+    }
+}
+
+WIDE static void find_stopped(const int8_t *statuses, size_t count, uint8_t *restrict to) {
+    for (size_t j = 0; j < count; j++) {
+        to[j] = statuses[j] == STATUS_TERMINATED;
+    }
+}
+
+static void load_active(const Evaluation *e, uint8_t *to) {
+    static const int8_t ok[PROGRAM_WIDTH];
+    static const uint8_t none[PROGRAM_WIDTH];
+    const Source *s = e->source;
+
+    find_active(s->statuses == NULL ? ok : s->statuses + e->begin,
+                s->ended == NULL ? none : s->ended + e->begin, e->count, to);
+    clear_rest(to, e->count, e->lanes, 1);
+}
+
+static void load_stopped(const Evaluation *e, uint8_t *to) {
+    memset(to, 0, e->lanes);
+    if (e->source->statuses != NULL) {
+        find_stopped(e->source->statuses + e->begin, e->count, to);
+    }
+}
+
+static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1, 2};
+
+/* The first loop looks whether there is any such value; nearly always there is none. */
+#define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
+    WIDE static void name(const Type *values, size_t count, Notes *notes) {                        \
+        Whole any = 0; /* as wide as the values, so that the compiler can vectorize */             \
+        for (size_t j = 0; j < count; j++) {                                                       \
+            any |= !(absolute(values[j]) <= most);                                                 \
+        }                                                                                          \
+        for (size_t j = 0; any != 0 && j < count; j++) {                                           \
+            notes->not_finite[j] |= !(absolute(values[j]) <= most);                                \
+        }                                                                                          \
+    }
+
+NOTE_NOT_FINITE(double, note_not_finite, int64_t, fabs, DBL_MAX)
+NOTE_NOT_FINITE(float, note_not_finite32, int32_t, fabsf, FLT_MAX)
+
+static void note_not_finite16(const Half *values, size_t count, Notes *notes) {
+    for (size_t j = 0; j < count; j++) {
+        notes->not_finite[j] |= !half_is_finite(values[j]);
+    }
+}
+
+void program_clear_seen(const Program *program, char *const *seen, size_t index) {
+    for (size_t i = 0; i < program->number_of_slots; i++) {
+        const Slot *slot = &program->slots[i];
+        const size_t size = size_of_type[slot->type];
+        memset(seen[slot->array] + (index * slot->elements + slot->element) * size, 0, size);
+    }
+}
+
+static void store_row(const Evaluation *e, const Row *row, const void *values) {
+    memcpy(row->data + e->begin * row->size, values, e->count * row->size);
+}
+
+static char *place_of(const Evaluation *e, const Slot *slot) {
+    const size_t first = e->begin * slot->elements + slot->element;
+    return e->source->seen[slot->array] + first * size_of_type[slot->type];
+}
+
+static void store_seen(const Evaluation *e, const Slot *slot, const void *from) {
+    copy_values(place_of(e, slot), slot->elements, from, 1, e->count, size_of_type[slot->type]);
+    if (slot->type == VALUE_DOUBLE) {
+        note_not_finite(from, e->count, e->notes);
+    } else if (slot->type == VALUE_FLOAT) {
+        note_not_finite32(from, e->count, e->notes);
+    } else if (slot->type == VALUE_HALF) {
+        note_not_finite16(from, e->count, e->notes);
+    }
+}
+
+WIDE static void convert(const double *restrict values, size_t count, float *restrict to) {
+    for (size_t k = 0; k < count; k++) {
+        to[k] = (float)values[k];
+    }
+}
+
+/* Stores outputs of which each environment's follow each other. All of them are finite as floats. */
+static void store_fresh(const Evaluation *e, const Slot *slot, size_t output, size_t number) {
+    const Fresh *fresh = e->source->fresh;
+    const double *values = fresh->lines + output;
+    float *to = (float *)(void *)place_of(e, slot);
+
+    for (size_t j = 0; j < e->count; j++, values += fresh->width, to += slot->elements) {
+        convert(values, number, to);
+    }
+}
+
+/* Whether rows are those of outputs that follow each other. */
+static bool are_neighbours(const Row *rows, size_t number) {
+    bool are = rows->output > 0;
+
+    for (size_t k = 1; k < number; k++) {
+        are &= rows[k].output == rows->output + k;
+    }
+    return are;
+}
+
+/* Stores rows of doubles as floats in neighbouring elements. */
+static void store_floats(const Evaluation *e, const Row *rows, const Slot *slots, size_t number) {
+    const Fresh *fresh = e->source->fresh;
+    Register doubles, floats;
+
+    if (fresh != NULL && fresh->fits_floats && are_neighbours(rows, number)) {
+        store_fresh(e, slots, rows->output - 1, number);
+        return;
+    }
+    for (size_t k = 0; k < number; k++) {
+        convert(load_row(e, &rows[k], &doubles), e->count, floats.floats);
+        store_seen(e, &slots[k], &floats);
+    }
+}
+
+void operation_move(const Evaluation *e, Instruction i) {
+    const Program *program = e->program;
+    Register *to = &e->registers->own[i.to];
+    const void **place = &e->registers->places[i.to];
+
+    switch (i.operation) {
+    case LOAD_ROW:
+        *place = load_row(e, &program->rows[i.extra], to);
+        break;
+    case LOAD_ACTION:
+        *place = load_action(e, e->source->actions, i.extra, to);
+        break;
+    case LOAD_PREVIOUS_ACTION:
+        *place = load_action(e, e->source->previous_actions, i.extra, to);
+        break;
+    case LOAD_ACTIVE:
+        *place = to;
+        load_active(e, to->flags);
+        break;
+    case LOAD_STOPPED:
+        *place = to;
+        load_stopped(e, to->flags);
+        break;
+    case STORE_ROW:
+        store_row(e, &program->rows[i.extra], e->registers->places[i.a]);
+        break;
+    case STORE_SEEN:
+        store_seen(e, &program->slots[i.extra], e->registers->places[i.a]);
+        break;
+    default:
+        store_floats(e, &program->rows[i.a], &program->slots[i.extra], i.b);
+    }
+}

@@ -1,0 +1,220 @@
+/* Steps of a system: exchanging values and stepping its parts by the method of the master. */
+
+#include "system.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+static bool goes_on(Status status) {
+    return status <= STATUS_WARNING;
+}
+
+static Status carry(Composite *me, size_t begin, size_t end) {
+    Status status = STATUS_OK;
+
+    for (size_t i = begin; i < end && goes_on(status); i++) {
+        const Route *route = &me->system->routes[i];
+        status = route_carry(me, route, me->outputs[route->source], &me->inputs[route->target]);
+    }
+    return status;
+}
+
+static Status carry_to(Composite *me, size_t index) {
+    const Component *part = &me->system->parts[index];
+    return carry(me, part->first_route, part->end_route);
+}
+
+typedef struct {
+    double time, step;
+    bool no_return;
+} Span;
+
+static Status advance(Composite *me, size_t index, Span span) {
+    const Component *part = &me->system->parts[index];
+    const double size = span.step / (double)part->steps;
+    Status status = STATUS_OK;
+
+    for (int64_t i = 0; i < part->steps && goes_on(status); i++) {
+        status = part_judge(me, index, part->fmi->do_step(&me->libraries[index],
+                                                          me->parts.components[index],
+                                                          span.time + (double)i * size, size,
+                                                          span.no_return));
+    }
+    return status;
+}
+
+/* If the FMU asks to stop, the others do their step all the same. */
+static Status step_part(Composite *me, size_t index, Span span) {
+    Status status = part_set_inputs(me, index);
+
+    if (goes_on(status)) {
+        status = advance(me, index, span);
+    }
+    if (status == STATUS_TERMINATED) {
+        me->terminated = true;
+        status = STATUS_OK;
+    }
+    return goes_on(status) ? part_read(me, index) : status;
+}
+
+/* Algebraic loops: their parts repeat the step from its beginning. */
+
+typedef struct {
+    Composite *me;
+    const PartGroup *group;
+    Span span;
+    bool moved; /* whether the parts are no longer at the beginning */
+} Repetition;
+
+static Status save_all(const Repetition *r) {
+    Composite *me = r->me;
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < r->group->count && goes_on(status); i++) {
+        const size_t part = r->group->parts[i];
+        const Fmi *fmi = me->system->parts[part].fmi;
+        status = fmi->get_state == NULL
+                     ? STATUS_ERROR
+                     : fmi->get_state(&me->libraries[part], me->parts.components[part],
+                                      &me->parts.before[part]);
+        status = part_judge(me, part, status);
+    }
+    return status;
+}
+
+static Status restore_all(const Repetition *r) {
+    Composite *me = r->me;
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < r->group->count && goes_on(status); i++) {
+        const size_t part = r->group->parts[i];
+        status = part_judge(me, part, me->system->parts[part].fmi->set_state(
+                                          &me->libraries[part], me->parts.components[part],
+                                          me->parts.before[part]));
+    }
+    return status;
+}
+
+static Status evaluate(void *context, const double *x, double *y) {
+    Repetition *r = context;
+    Composite *me = r->me;
+    const PartGroup *group = r->group;
+    Status status = r->moved ? restore_all(r) : STATUS_OK;
+
+    r->moved = true;
+    for (size_t i = 0; i < group->number_of_routes; i++) {
+        me->inputs[me->system->routes[group->routes[i]].target] = x[i];
+    }
+    for (size_t i = 0; i < group->count && goes_on(status); i++) {
+        status = step_part(me, group->parts[i], r->span);
+    }
+    for (size_t i = 0; i < group->number_of_routes && goes_on(status); i++) {
+        const Route *route = &me->system->routes[group->routes[i]];
+        status = route_carry(me, route, me->outputs[route->source], &y[i]);
+    }
+    return status;
+}
+
+static Status solve(Composite *me, const PartGroup *group, Span span) {
+    Repetition repetition = {me, group, span, false};
+    Status status = STATUS_OK;
+
+    repetition.span.no_return = false;
+    for (size_t i = 0; i < group->count && goes_on(status); i++) {
+        status = carry_to(me, group->parts[i]);
+    }
+    for (size_t i = 0; i < group->number_of_routes; i++) {
+        me->loop[i] = me->inputs[me->system->routes[group->routes[i]].target];
+    }
+    const bool was_terminated = me->terminated;
+    if (goes_on(status)) {
+        status = save_all(&repetition);
+    }
+    if (goes_on(status)) {
+        status = loop_solve(&group->loop, group->number_of_routes, me->loop, evaluate, &repetition);
+    }
+    me->terminated |= was_terminated;
+    if (!goes_on(status) && me->blamed == NULL) {
+        me->blamed = group->label;
+    }
+    return status;
+}
+
+/* In a Gauss-Seidel step, the inputs are those of now; in a Jacobi step, they have been carried. */
+static Status step_group(Composite *me, const PartGroup *group, Span span) {
+    const bool jacobi = me->system->jacobi;
+    Status status = STATUS_OK;
+
+    if (group->has_loop && !jacobi) {
+        return solve(me, group, span);
+    }
+    for (size_t i = 0; i < group->count && goes_on(status); i++) {
+        status = jacobi ? STATUS_OK : carry_to(me, group->parts[i]);
+        if (goes_on(status)) {
+            status = step_part(me, group->parts[i], span);
+        }
+    }
+    return status;
+}
+
+Status system_do_step(const Library *library, void *component, double time, double step,
+                      bool no_return) {
+    Composite *me = component;
+    const System *s = me->system;
+    const Span span = {time, step, no_return};
+
+    (void)library;
+    me->blamed = NULL;
+    me->terminated = false;
+    Status status = me->is_fresh ? STATUS_OK : system_refresh(me);
+    me->is_fresh = false;
+    if (goes_on(status) && s->jacobi) {
+        status = carry(me, 0, s->number_of_routes);
+    }
+    for (size_t i = 0; i < s->number_of_groups && goes_on(status); i++) {
+        status = step_group(me, &s->groups[i], span);
+    }
+    me->is_fresh = goes_on(status);
+    return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
+}
+
+static bool exchange(const Library *library, const Exchange *e) {
+    return exchange_by(&composite, library, e);
+}
+
+/* Systems are loaded by system_load. */
+static bool bind(Library *library, char *error, size_t size) {
+    (void)library;
+    (void)error;
+    (void)size;
+    return true;
+}
+
+static const char *blamed(const void *component) {
+    const Composite *me = component;
+    return me->blamed;
+}
+
+const Fmi composite = {
+    .boolean_size = sizeof(bool),
+    .bind = bind,
+    .instantiate = system_instantiate,
+    .choose_messages = system_choose_messages,
+    .initialize = system_initialize,
+    .do_step = system_do_step,
+    .exchange = exchange,
+    .get = system_get,
+    .set = system_set,
+    .set_string = system_set_string,
+    .reset = system_reset,
+    .terminate = system_terminate,
+    .free_instance = system_free,
+    .get_state = system_get_state,
+    .set_state = system_set_state,
+    .free_state = system_free_state,
+    .state_size = system_state_size,
+    .serialize = system_serialize,
+    .deserialize = system_deserialize,
+    .blamed = blamed,
+    .drop = system_drop,
+};

@@ -1,0 +1,184 @@
+/* A system: several FMUs that look like one. Its instances have an instance of each FMU.
+ *
+ * All values of a system are FLOAT64; its parts convert them to the types of their FMUs. A value
+ * reference is an index of its variables. fmugym/fmi/system.py does the same operation by
+ * operation. */
+
+#ifndef FMUGYM_SYSTEM_H
+#define FMUGYM_SYSTEM_H
+
+#include "access.h"
+#include "fmi.h"
+#include "loops.h"
+#include "methods.h"
+
+typedef struct {
+    uint32_t reference;
+    const char *text;
+} PartString;
+
+/* An FMU of the system. */
+typedef struct {
+    const char *name;
+    const char *label;      /* names it in messages */
+    const char *not_finite; /* the same if its outputs are not finite */
+    const Fmi *fmi;
+    const char *model, *token, *resources;
+    const char **categories;
+    size_t number_of_categories;
+    bool has_mode; /* whether its FMI version has an Initialization Mode */
+    int64_t steps; /* in one of the system */
+    Solving solving;
+    Access inputs, outputs; /* what a step sets and gets, in the order of the slots */
+    const double *input_starts;
+    size_t first_input, first_output; /* its first slots */
+    size_t first_route, end_route;    /* the routes to its inputs */
+    Access starts;                    /* what is set before initialization */
+    const double *start_values;
+    PartString *strings;
+    size_t number_of_strings;
+} Component;
+
+/* target = gain * source + offset; without arithmetic if they are 1 and 0. */
+typedef struct {
+    double gain, offset;
+    bool plain;
+} Scale;
+
+static inline double scaled(Scale scale, double value) {
+    return scale.plain ? value : scale.gain * value + scale.offset;
+}
+
+/* From a slot of an output to a slot of an input. */
+typedef struct {
+    uint32_t source, target, source_part, target_part;
+    Scale scale;
+} Route;
+
+/* A variable of an FMU behind one of the system. */
+typedef struct {
+    uint32_t part, reference;
+    Type type;
+    int32_t input, output; /* its slots, or -1 */
+    Scale scale;
+} End;
+
+/* Parts that step one after the other; or a loop, whose inner routes carry what it solves for. */
+typedef struct {
+    const uint32_t *parts;
+    size_t count;
+    const uint32_t *routes;
+    size_t number_of_routes;
+    bool has_loop;
+    LoopMethod loop;
+    const char *label; /* names it in messages */
+} PartGroup;
+
+/* Routes of the initialization, one after the other or solved for together. */
+typedef struct {
+    const uint32_t *routes;
+    size_t count;
+    bool has_loop;
+    LoopMethod loop;
+    const char *label;
+} Transfer;
+
+typedef struct System {
+    Component *parts;
+    size_t count;
+    size_t inputs, outputs; /* numbers of slots */
+    Route *routes;          /* sorted by the parts of their targets */
+    size_t number_of_routes;
+    PartGroup *groups;
+    size_t number_of_groups;
+    Transfer *transfers;
+    size_t number_of_transfers;
+    End *ends;
+    const uint32_t *first_ends; /* of each variable; one more */
+    size_t number_of_variables;
+    bool jacobi;
+    size_t memory; /* doubles that the largest loop needs */
+    size_t scratch; /* doubles that the longest list of variables of a part needs */
+} System;
+
+/* A value that is to be set before the initialization. */
+typedef struct {
+    const End *end;
+    double value;
+    const char *text; /* of a String, or NULL */
+} Pending;
+
+/* One place for each part. */
+typedef struct {
+    bool *dead;    /* the parts for which no call is legal */
+    bool *started; /* the parts that have left instantiation */
+    void **before; /* states at the begin of a step */
+    void **components;
+    char *names; /* of LOG_NAME bytes each */
+} PartPlaces;
+
+/* One instance. */
+typedef struct {
+    const System *system;
+    const Library *libraries; /* of the parts */
+    const Floats *floats;
+    PartPlaces parts;
+    double *inputs, *outputs; /* the slots */
+    double *loop, *typed;     /* scratch memory */
+    bool is_fresh;            /* whether the output slots are what the parts would tell */
+    bool is_collecting;       /* whether values to be set are pending */
+    bool terminated;          /* whether a part has asked to stop in this step */
+    const char *blamed;       /* who failed last, or NULL */
+    Pending *pending;
+    size_t number_pending, room;
+} Composite;
+
+/* Loads the libraries of all parts into one that stands for them. */
+bool system_load(Library *library, const System *system, const char *const *paths, char *error,
+                 size_t size);
+void system_unload(Library *library);
+
+/* The source files of systems share what follows. */
+
+void *system_instantiate(const Library *library, const Identity *identity);
+void system_free(const Library *library, void *component);
+/* Frees what may still be freed after a fatal error. */
+void system_drop(const Library *library, void *component);
+Status system_choose_messages(const Library *library, void *component,
+                              const char *const *categories, size_t count);
+Status system_initialize(const Library *library, void *component, const Experiment *experiment,
+                         StartValues start_values, const char **doing);
+Status system_do_step(const Library *library, void *component, double time, double step,
+                      bool no_return);
+Status system_reset(const Library *library, void *component);
+Status system_terminate(const Library *library, void *component);
+Status system_get(const Library *library, void *component, Type type, const uint32_t *references,
+                  size_t count, void *values, size_t size);
+Status system_set(const Library *library, void *component, Type type, const uint32_t *references,
+                  size_t count, const void *values, size_t size);
+Status system_set_string(const Library *library, void *component, uint32_t reference,
+                         const char *text);
+Status system_get_state(const Library *library, void *component, void **state);
+Status system_set_state(const Library *library, void *component, void *state);
+Status system_free_state(const Library *library, void *component, void **state);
+size_t system_state_size(const Library *library, void *component, void *state);
+Status system_serialize(const Library *library, void *component, void *state, char *bytes,
+                        size_t size);
+Status system_deserialize(const Library *library, void *component, const char *bytes, size_t size,
+                          void **state);
+
+/* Notes a status of a part and returns it. */
+Status part_judge(Composite *me, size_t index, Status status);
+/* Sets the inputs of a part to its slots. */
+Status part_set_inputs(Composite *me, size_t index);
+/* One variable of a part. The place of its reference must stay the same: solvers compare it. */
+Status part_get(Composite *me, size_t index, Type type, const uint32_t *reference, double *value);
+Status part_set(Composite *me, size_t index, Type type, const uint32_t *reference, double value);
+/* Fills the output slots of a part. */
+Status part_read(Composite *me, size_t index);
+/* Computes what a route carries. Values that are not finite must not reach other FMUs. */
+Status route_carry(Composite *me, const Route *route, double value, double *carried);
+/* Fills the output slots of all parts. */
+Status system_refresh(Composite *me);
+
+#endif

@@ -1,0 +1,221 @@
+/* Initialization of a system. All FMUs are in Initialization Mode while values are exchanged: each
+ * is initialized inside of the initialization of the one before. FMUs of FMI 1.0 have no such mode.
+ * They are initialized when somebody needs their outputs, or at the end. */
+
+#include <string.h>
+
+#include "system.h"
+
+typedef struct {
+    Composite *me;
+    const Experiment *experiment;
+    const char **doing;
+} Beginning;
+
+/* Where the recursion is. */
+typedef struct {
+    const Beginning *beginning;
+    size_t index;
+} Place;
+
+static Status set_pending(Composite *me, size_t index, const Pending *pending) {
+    const End *end = pending->end;
+    const Component *part = &me->system->parts[index];
+
+    if (pending->text == NULL) {
+        return part_set(me, index, end->type, &end->reference, pending->value);
+    }
+    return part_judge(me, index, part->fmi->set_string(&me->libraries[index],
+                                                       me->parts.components[index],
+                                                       end->reference, pending->text));
+}
+
+/* What is set for this simulation wins over what the system says. */
+static Status set_starts(void *context) {
+    const Place *place = context;
+    Composite *me = place->beginning->me;
+    const size_t index = place->index;
+    const Component *part = &me->system->parts[index];
+    const Library *library = &me->libraries[index];
+    void *component = me->parts.components[index];
+
+    Status status = part_judge(me, index, access_set(&part->starts, library, component,
+                                                     part->start_values, me->typed, me->floats));
+    for (size_t i = 0; i < part->number_of_strings && status <= STATUS_WARNING; i++) {
+        const PartString *string = &part->strings[i];
+        status = part_judge(me, index, part->fmi->set_string(library, component, string->reference,
+                                                             string->text));
+    }
+    for (size_t i = 0; i < me->number_pending && status <= STATUS_WARNING; i++) {
+        if (me->pending[i].end->part == index) {
+            status = set_pending(me, index, &me->pending[i]);
+        }
+    }
+    /* an FMU of FMI 1.0 takes no values between these and the end of its initialization */
+    return status <= STATUS_WARNING && !part->has_mode ? part_set_inputs(me, index) : status;
+}
+
+static Status begin_from(const Beginning *b, size_t index);
+
+static Status begin_next(void *context) {
+    const Place *place = context;
+    return begin_from(place->beginning, place->index + 1);
+}
+
+static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
+    Composite *me = b->me;
+    Place place = {b, index};
+    const StartValues values = {
+        .set = set_starts, .context = &place, .exchange = goes_on ? begin_next : NULL};
+
+    me->parts.started[index] = true;
+    return part_judge(me, index, me->system->parts[index].fmi->initialize(
+                                     &me->libraries[index], me->parts.components[index],
+                                     b->experiment, values, b->doing));
+}
+
+/* Exchanging values */
+
+static Status begin_if_old(const Beginning *b, size_t index) {
+    Composite *me = b->me;
+    const bool waits = !me->system->parts[index].has_mode && !me->parts.started[index];
+    return waits ? begin_part(b, index, false) : STATUS_OK;
+}
+
+static Status read_source(const Beginning *b, const Route *route, double *value) {
+    const Component *part = &b->me->system->parts[route->source_part];
+    const size_t place = route->source - part->first_output;
+    Status status = begin_if_old(b, route->source_part);
+
+    if (status <= STATUS_WARNING) {
+        status = part_get(b->me, route->source_part, (Type)part->outputs.types[place],
+                          &part->outputs.variables[place].reference, value);
+    }
+    return status > STATUS_WARNING ? status : route_carry(b->me, route, *value, value);
+}
+
+/* An FMU of FMI 1.0 that waits gets the value when it begins. */
+static Status write_target(const Beginning *b, const Route *route, double value) {
+    Composite *me = b->me;
+    const Component *part = &me->system->parts[route->target_part];
+    const size_t place = route->target - part->first_input;
+
+    me->inputs[route->target] = value;
+    return me->parts.started[route->target_part]
+               ? part_set(me, route->target_part, (Type)part->inputs.types[place],
+                          &part->inputs.variables[place].reference, value)
+               : STATUS_OK;
+}
+
+typedef struct {
+    const Beginning *beginning;
+    const Transfer *transfer;
+} LoopOfLinks;
+
+static Status evaluate(void *context, const double *x, double *y) {
+    const LoopOfLinks *loop = context;
+    const Route *routes = loop->beginning->me->system->routes;
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < loop->transfer->count && status <= STATUS_WARNING; i++) {
+        status = write_target(loop->beginning, &routes[loop->transfer->routes[i]], x[i]);
+    }
+    for (size_t i = 0; i < loop->transfer->count && status <= STATUS_WARNING; i++) {
+        status = read_source(loop->beginning, &routes[loop->transfer->routes[i]], &y[i]);
+    }
+    return status;
+}
+
+static Status solve(const Beginning *b, const Transfer *transfer) {
+    Composite *me = b->me;
+    LoopOfLinks context = {b, transfer};
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
+        status = read_source(b, &me->system->routes[transfer->routes[i]], &me->loop[i]);
+    }
+    if (status <= STATUS_WARNING) {
+        status = loop_solve(&transfer->loop, transfer->count, me->loop, evaluate, &context);
+    }
+    if (status > STATUS_WARNING && me->blamed == NULL) {
+        me->blamed = transfer->label;
+    }
+    return status;
+}
+
+static Status carry(const Beginning *b, const Transfer *transfer) {
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
+        const Route *route = &b->me->system->routes[transfer->routes[i]];
+        double value;
+        status = read_source(b, route, &value);
+        if (status <= STATUS_WARNING) {
+            status = write_target(b, route, value);
+        }
+    }
+    return status;
+}
+
+static Status exchange_all(const Beginning *b) {
+    const System *s = b->me->system;
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < s->number_of_transfers && status <= STATUS_WARNING; i++) {
+        const Transfer *transfer = &s->transfers[i];
+        status = transfer->has_loop ? solve(b, transfer) : carry(b, transfer);
+    }
+    for (size_t i = 0; i < s->count && status <= STATUS_WARNING; i++) {
+        status = begin_if_old(b, i);
+    }
+    return status;
+}
+
+/* Begins with this part and all that follow, and exchanges values when all have begun. */
+static Status begin_from(const Beginning *b, size_t index) {
+    const System *s = b->me->system;
+
+    while (index < s->count && !s->parts[index].has_mode) {
+        index++;
+    }
+    return index == s->count ? exchange_all(b) : begin_part(b, index, true);
+}
+
+static void forget(Composite *me) {
+    for (size_t i = 0; i < me->system->count; i++) {
+        const Component *part = &me->system->parts[i];
+        memcpy(me->inputs + part->first_input, part->input_starts,
+               part->inputs.count * sizeof(double));
+    }
+    memset(me->outputs, 0, me->system->outputs * sizeof(double));
+    me->is_fresh = false;
+    me->blamed = NULL;
+    me->number_pending = 0;
+}
+
+static Status collect(Composite *me, StartValues start_values) {
+    forget(me);
+    me->is_collecting = true;
+    const Status status = start_values.set(start_values.context);
+    me->is_collecting = false;
+    return status;
+}
+
+Status system_initialize(const Library *library, void *component, const Experiment *experiment,
+                         StartValues start_values, const char **doing) {
+    Composite *me = component;
+    const Beginning beginning = {me, experiment, doing};
+
+    (void)library;
+    *doing = "setting the start values";
+    Status status = collect(me, start_values);
+    if (status <= STATUS_WARNING) {
+        *doing = "initialization";
+        status = begin_from(&beginning, 0);
+    }
+    if (status <= STATUS_WARNING) {
+        *doing = "reading the outputs";
+        status = system_refresh(me);
+    }
+    return status;
+}

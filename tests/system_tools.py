@@ -1,0 +1,150 @@
+"""Systems of FMUs with linear equations (``zoo/linear.c``), and their exact solutions."""
+
+from pathlib import Path
+
+import model_tools
+import numpy as np
+from scipy.linalg import expm
+
+from fmugym.systems.plan import Component, Evaluation, Group, Link, SystemPlan
+
+STATES = {
+    1: 'canHandleVariableCommunicationStepSize="true"',
+    2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true" '
+    'canHandleVariableCommunicationStepSize="true"',
+    3: 'canGetAndSetFMUState="true" canHandleVariableCommunicationStepSize="true"',
+}
+MATRICES = ("a", "b", "c", "d")
+VARIABLES = (
+    ("t", "output", ""),
+    *((f"u{i}", "input", 'start="0"') for i in (1, 2)),
+    *((f"y{i}", "output", "") for i in (1, 2)),
+    *((f"x{i}_0", "parameter", 'start="0"') for i in (1, 2)),
+    *((f"{m}{i}{j}", "parameter", 'start="0"') for m in MATRICES for i in (1, 2) for j in (1, 2)),
+    *((name, "parameter", 'start="0"') for name in ("limit", "fails", "status")),
+)
+
+
+def linear_fmu(path, version=2):
+    """Write the FMU."""
+    flags = STATES[version]
+    return model_tools.model_fmu(path, "linear", version, "{linear}", VARIABLES, flags=flags)
+
+
+def linear(name, path, x0=(0.0, 0.0), steps=1, interface=None, **matrices):
+    """A component; the matrices a to d are nested lists, or zero."""
+    starts = {"x1_0": x0[0], "x2_0": x0[1]}
+    for letter, matrix in matrices.items():
+        if letter in MATRICES:
+            matrix = np.array(matrix, float)
+            starts |= {f"{letter}{i + 1}{j + 1}": matrix[i, j] for i, j in np.ndindex(2, 2)}
+        else:
+            starts[letter] = matrix
+    values = tuple((key, float(value)) for key, value in starts.items())
+    return Component(name, Path(path), interface, steps, values)
+
+
+def system(components, links, loop=None, name="system", **options):
+    """A plan whose components step in their order, or together if there is a loop."""
+    names = tuple(component.name for component in components)
+    links = tuple(links)
+    if loop is None:
+        groups = tuple(Group((one,)) for one in names)
+        evaluations = tuple(Evaluation((i,)) for i in range(len(links)))
+    else:
+        groups, evaluations = (Group(names, loop),), (Evaluation(tuple(range(len(links))), loop),)
+    return SystemPlan(name, tuple(components), links, groups, evaluations, **options)
+
+
+# Two masses between springs, coupled by a spring with a damper.
+
+MASS, STIFFNESS, COUPLING, DAMPING = (1.0, 2.0), (4.0, 3.0), 5.0, 0.4
+POSITIONS = (1.0, -0.5)
+
+
+def masses(paths, steps=(1, 1), **options):
+    """The first tells its position and velocity, the second the force of the coupling."""
+    k1, k2, k, d = *STIFFNESS, COUPLING, DAMPING
+    first = linear(
+        "first",
+        paths[0],
+        (POSITIONS[0], 0.0),
+        steps[0],
+        a=[[0, 1], [-k1 / MASS[0], 0]],
+        b=[[0, 0], [1 / MASS[0], 0]],
+        c=np.eye(2),
+    )
+    m = MASS[1]
+    second = linear(
+        "second",
+        paths[1],
+        (POSITIONS[1], 0.0),
+        steps[1],
+        a=[[0, 1], [-(k2 + k) / m, -d / m]],
+        b=[[0, 0], [k / m, d / m]],
+        c=[[k, d], [1, 0]],
+        d=[[-k, -d], [0, 0]],
+    )
+    links = (
+        Link("first", "y1", "second", "u1"),
+        Link("first", "y2", "second", "u2"),
+        Link("second", "y1", "first", "u1"),
+    )
+    return system((first, second), links, **options)
+
+
+def masses_exactly(times):
+    """The positions of both masses, shape (2, times)."""
+    k1, k2, k, d = *STIFFNESS, COUPLING, DAMPING
+    m1, m2 = MASS
+    matrix = np.array(
+        [
+            [0, 1, 0, 0],
+            [-(k1 + k) / m1, -d / m1, k / m1, d / m1],
+            [0, 0, 0, 1],
+            [k / m2, d / m2, -(k2 + k) / m2, -d / m2],
+        ]
+    )
+    start = np.array([POSITIONS[0], 0.0, POSITIONS[1], 0.0])
+    return np.array([(expm(matrix * t) @ start)[[0, 2]] for t in times]).T
+
+
+# A tank with a controller: h' = (u - c h) / area, u = gain (goal - h) + integral.
+
+AREA, OUTFLOW, GAIN, RATE, GOAL = 2.0, 0.3, 1.5, 0.4, 1.2
+
+
+def tank(paths, steps=(1, 1), **options):
+    """The controller follows the level at once."""
+    plant = linear(
+        "tank",
+        paths[0],
+        (0.2, 0.0),
+        steps[0],
+        a=[[-OUTFLOW / AREA, 0], [0, 0]],
+        b=[[1 / AREA, 0], [0, 0]],
+        c=[[1, 0], [0, 0]],
+    )
+    control = linear(
+        "control",
+        paths[1],
+        (0.0, 0.0),
+        steps[1],
+        b=[[RATE, 0], [0, 0]],
+        c=[[1, 0], [0, 0]],
+        d=[[GAIN, 0], [0, 0]],
+    )
+    links = (
+        Link("tank", "y1", "control", "u1", -1.0, GOAL),
+        Link("control", "y1", "tank", "u1"),
+    )
+    return system((plant, control), links, **options)
+
+
+def tank_exactly(times):
+    """The level, shape (1, times)."""
+    matrix = np.array(
+        [[-(OUTFLOW + GAIN) / AREA, 1 / AREA, GAIN * GOAL / AREA], [-RATE, 0, RATE * GOAL], [0] * 3]
+    )
+    start = np.array([0.2, 0.0, 1.0])
+    return np.array([(expm(matrix * t) @ start)[:1] for t in times]).T

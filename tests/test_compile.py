@@ -1,0 +1,152 @@
+"""``fmugym compile``: FMUs with source code."""
+
+import json
+import logging
+from contextlib import closing
+
+import building
+import exchange_tools
+import fmpy
+import fmu_tools
+import numpy as np
+import pytest
+
+from fmugym import FMU, ConfigError, FMULoadError
+from fmugym.pool import PoolSpec
+from fmugym.tools import compilers
+from fmugym.tools.cli import main
+from fmugym.tools.compiling import compile_fmu
+from fmugym.trial import opening
+
+FILES = ("core.c", "usual.c", "dahlquist.c")
+BOTH = ("CoSimulation", "ModelExchange")
+
+
+def sources(version):
+    """The source code of a model, by its place in the FMU."""
+    folder = building.HERE / "exchange"
+    names = (*FILES, f"fmi{version}.c", "exchange.h")
+    found = {f"sources/code/{name}": (folder / name).read_bytes() for name in names}
+    stubs = fmu_tools.stubs(version, f"fmi{version}", folder / f"fmi{version}.c")
+    return found | {"sources/headers/stubs.h": stubs.encode()}
+
+
+def build_description(version, **changes):
+    names = [f"code/{name}" for name in (*FILES, f"fmi{version}.c")]
+    attributes = {"modelIdentifier": "Model", "language": "C99"} | changes
+    return f"""<fmiBuildDescription fmiVersion="3.0">
+      <BuildConfiguration modelIdentifier="Other"/>
+      <BuildConfiguration modelIdentifier="{attributes["modelIdentifier"]}">
+        <SourceFileSet language="{attributes["language"]}">
+          {"".join(f'<SourceFile name="{name}"/>' for name in names)}
+          <PreprocessorDefinition name="STUBS" value="&quot;stubs.h&quot;"/>
+          <PreprocessorDefinition name="FMI_VERSION" value="{version}"/>
+          <PreprocessorDefinition name="BROKEN" optional="true" value="x"/>
+          <IncludeDirectory name="headers"/>
+        </SourceFileSet>
+        <Library name="m"/>
+      </BuildConfiguration>
+    </fmiBuildDescription>"""
+
+
+@pytest.fixture
+def source_fmu(tmp_path):
+    """Make an FMU without a library."""
+
+    def make(version=3, add=None, described=True):
+        files = sources(version)
+        xml = exchange_tools.describe("dahlquist", version, BOTH)
+        if described:
+            files["sources/buildDescription.xml"] = build_description(version).encode()
+        else:
+            names = (*(f"code/{name}" for name in FILES), "code/shim.c")
+            text = '#define FMI_VERSION 2\n#define STUBS "../headers/stubs.h"\n#include "fmi2.c"\n'
+            files["sources/code/shim.c"] = text.encode()
+            listing = "".join(f'<File name="{name}"/>' for name in names)
+            xml = xml.replace("/><", f"><SourceFiles>{listing}</SourceFiles></CoSimulation><", 1)
+        files["modelDescription.xml"] = xml
+        return fmu_tools.write_fmu(tmp_path / "with sources.fmu", files | (add or {}))
+
+    return make
+
+
+def simulated(path, interface):
+    fmu = FMU(path, interface=interface, probe_timeout=None)
+    spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=0.1)
+    with closing(opening.make_pool(fmu, spec, 2, logging.getLogger("fmugym.test"))) as pool:
+        pool.reset((), np.zeros((0, 2)))
+        return [pool.step(np.array([[u, -u]]))[0].copy() for u in (0.0, 1.0, 2.0)]
+
+
+class TestCompile:
+    @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+    @pytest.mark.parametrize("version", [2, 3])
+    def test_the_library_computes_the_same(self, tmp_path, source_fmu, version, interface):
+        made = compile_fmu(source_fmu(version))
+        assert made.parent == tmp_path
+        built = exchange_tools.exchange_fmu(tmp_path / "b.fmu", "dahlquist", version, BOTH)
+        np.testing.assert_allclose(
+            simulated(made, interface), simulated(built, interface), rtol=1e-15
+        )
+        assert fmu_tools.read_fmu(made).keys() > fmu_tools.read_fmu(source_fmu(version)).keys()
+
+    def test_a_list_in_the_model_description(self, tmp_path, source_fmu):
+        made = compile_fmu(source_fmu(2, described=False), tmp_path / "made.fmu")
+        built = exchange_tools.exchange_fmu(tmp_path / "b.fmu", "dahlquist", 2, BOTH)
+        found, expected = simulated(made, "co_simulation"), simulated(built, "co_simulation")
+        np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+    def test_ziglang_where_the_system_has_no_compiler(self, tmp_path, source_fmu, monkeypatch):
+        pytest.importorskip("ziglang")
+        monkeypatch.setattr(compilers.shutil, "which", lambda name: None)
+        made = compile_fmu(source_fmu(3))
+        assert np.isfinite(simulated(made, "co_simulation")).all()
+
+    def test_the_command(self, source_fmu, capsys):
+        path = source_fmu(3)
+        assert main(["compile", str(path), "--json"]) == 0
+        made = json.loads(capsys.readouterr().out)["output"]
+        assert fmpy.platform_tuple in made
+        assert main(["compile", str(path)]) == 1
+        assert "exists" in capsys.readouterr().err
+
+
+class TestRefusals:
+    def test_the_error_of_such_an_fmu_names_the_command(self, source_fmu):
+        with closing(FMU(source_fmu(3))) as fmu, pytest.raises(FMULoadError) as caught:
+            fmu.extract()
+        assert "fmugym compile 'with sources.fmu'" in str(caught.value)
+
+    def test_no_source_code(self, tmp_path):
+        path = exchange_tools.exchange_fmu(tmp_path / "b.fmu", "dahlquist", 2)
+        with pytest.raises(FMULoadError, match="no source code"):
+            compile_fmu(path)
+
+    def test_source_code_without_a_list(self, tmp_path, source_fmu):
+        path = source_fmu(3, {"sources/buildDescription.xml": b"<fmiBuildDescription/>"})
+        with pytest.raises(FMULoadError, match="no list"):
+            compile_fmu(path)
+
+    @pytest.mark.parametrize("name", ["../other.c", "/etc/passwd", "code/missing.c", ""])
+    def test_files_elsewhere(self, source_fmu, name):
+        text = build_description(3).replace("code/usual.c", name)
+        path = source_fmu(3, {"sources/buildDescription.xml": text.encode()})
+        with pytest.raises(FMULoadError, match="source"):
+            compile_fmu(path)
+
+    def test_broken_code(self, tmp_path, source_fmu):
+        path = source_fmu(3, {"sources/code/usual.c": b"int wrong = nowhere;\n"})
+        with pytest.raises(FMULoadError, match="nowhere"):
+            compile_fmu(path)
+        assert not list(tmp_path.glob("*_*.fmu"))
+
+    def test_no_compiler(self, source_fmu, monkeypatch):
+        monkeypatch.setattr(compilers.shutil, "which", lambda name: None)
+        monkeypatch.setattr(compilers.importlib.util, "find_spec", lambda name: None)
+        with pytest.raises(ConfigError, match="ziglang"):
+            compile_fmu(source_fmu(3))
+
+    def test_not_xml(self, source_fmu):
+        path = source_fmu(3, {"sources/buildDescription.xml": b"<a><b></a>"})
+        with pytest.raises(FMULoadError, match="buildDescription"):
+            compile_fmu(path)

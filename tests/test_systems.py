@@ -1,0 +1,505 @@
+"""Systems: what the masters compute, and that a system does what an FMU does."""
+
+import logging
+import pickle
+from dataclasses import replace
+
+import exchange_tools
+import fmu_tools
+import numpy as np
+import pytest
+import system_tools
+from system_tools import linear, linear_fmu, masses, system, tank
+
+import fmugym
+from fmugym import FMULoadError, SimulationError, bundled_fmu
+from fmugym.fmi.status import Status
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.local import local_pool
+from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.plan import (
+    MASTERS,
+    Component,
+    Connector,
+    End,
+    Evaluation,
+    Group,
+    Link,
+    Loop,
+    SystemPlan,
+)
+from fmugym.trial import opening
+
+LOG = logging.getLogger("fmugym.test")
+ENGINES = [pytest.param(False, id="python")]
+if has_native_pool():
+    ENGINES.append(pytest.param(True, id="native"))
+in_each_engine = pytest.mark.parametrize("native", ENGINES)
+by_each_master = pytest.mark.parametrize("master", MASTERS)
+NO_START = ((), np.zeros((0, 1)))
+
+
+@pytest.fixture(scope="module", name="fmus")
+def compiled(tmp_path_factory):
+    """The FMU of linear equations by FMI version."""
+    folder = tmp_path_factory.mktemp("linear")
+    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
+
+
+@pytest.fixture(name="make")
+def closing_pools():
+    """Make pools of plans that are closed after the test."""
+    made = []
+
+    def make(plan, inputs=(), outputs=(), native=True, count=1, time_step=0.1, **options):
+        fmu = SystemFMU(plan)
+        spec = PoolSpec(
+            tuple(map(fmu.variable, inputs)),
+            tuple(map(fmu.variable, outputs)),
+            time_step,
+            **options,
+        )
+        pool = local_pool(fmu, spec, count, LOG, native=native)
+        pool.variable = fmu.variable
+        made.append(pool)
+        return pool
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+def play(pool, steps, inputs=None):
+    """Reset and step; the outputs, shape (steps + 1, k)."""
+    names, values = (), np.zeros((0, pool.num_instances))
+    outputs, statuses = pool.reset(names, values)
+    assert not statuses.any(), pool.failure(0)
+    rows = [outputs[:, 0].copy()]
+    for i in range(steps):
+        outputs, statuses = pool.step(None if inputs is None else inputs[i])
+        assert not statuses.any(), pool.failure(0)
+        rows.append(outputs[:, 0].copy())
+    return np.array(rows)
+
+
+# Correctness
+
+ORDERS = {
+    "masses": (masses, system_tools.masses_exactly, ["first.y1", "second.y2"]),
+    "tank": (tank, system_tools.tank_exactly, ["tank.y1"]),
+}
+
+
+class TestAgainstClosedForms:
+    @in_each_engine
+    @by_each_master
+    @pytest.mark.parametrize("name", ORDERS)
+    @pytest.mark.parametrize("steps", [(1, 1), (1, 4), (3, 2)])
+    def test_errors_are_of_the_first_order_in_the_step_size(
+        self, make, fmus, native, master, name, steps
+    ):
+        """Inputs are constant over a step, so half the step size gives half the error."""
+        build, exact, outputs = ORDERS[name]
+        plan = build([fmus[2], fmus[3]], steps, master=master)
+        errors = []
+        for count in (24, 48, 96):
+            rows = play(make(plan, (), outputs, native, time_step=2.0 / count), count)
+            expected = exact(np.arange(count + 1) * 2.0 / count).T
+            errors.append(np.abs(rows - expected).max())
+        assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
+        assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
+
+    @by_each_master
+    def test_the_start_is_exact(self, make, fmus, master):
+        """All components exchange values before the first step, in the order of the links."""
+        pool = make(masses([fmus[3], fmus[2]], master=master), (), ["second.y1", "first.u1"])
+        force = play(pool, 0)[0]
+        distance = system_tools.POSITIONS[1] - system_tools.POSITIONS[0]
+        assert force.tolist() == [system_tools.COUPLING * distance] * 2
+
+    @in_each_engine
+    def test_gauss_seidel_follows_without_delay(self, make, fmus, native):
+        """A chain of gains carries the newest value through in one step, a Jacobi step carries it
+        by one component."""
+        gain = {"d": [[2, 0], [0, 0]]}
+        parts = [linear(name, fmus[2], **gain) for name in "abc"]
+        links = (Link("a", "y1", "b", "u1"), Link("b", "y1", "c", "u1"))
+        found = {}
+        for master in MASTERS:
+            pool = make(system(parts, links, master=master), ["a.u1"], ["c.y1"], native)
+            found[master] = play(pool, 3, np.array([1.0, 2.0, 3.0]).reshape(3, 1, 1))[:, 0]
+        assert found["gauss_seidel"].tolist() == [0.0, 8.0, 16.0, 24.0]
+        assert found["jacobi"].tolist() == [0.0, 0.0, 0.0, 8.0]
+
+
+def pendulums(master="gauss_seidel", versions=("2.0", "3.0", "2.0"), steps=(1, 2, 3)):
+    """Three bundled pendulums in a chain."""
+    names = ("a", "b", "c")
+    components = tuple(
+        Component(n, bundled_fmu("Pendulum", v), steps=m, starts=(("q_0", 0.3 * m),))
+        for n, v, m in zip(names, versions, steps, strict=True)
+    )
+    links = (
+        Link("a", "theta_dot", "b", "tau", 0.02),
+        Link("b", "theta", "c", "tau", -0.03, 0.01),
+        Link("c", "theta", "a", "tau", 0.01),
+    )
+    return SystemPlan(
+        "chain",
+        components,
+        links,
+        tuple(Group((n,)) for n in names),
+        tuple(Evaluation((i,)) for i in range(3)),
+        master,
+    )
+
+
+PENDULUM_OUTPUTS = ["a.theta", "b.theta_dot", "c.q", "c.tau"]
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+class TestBothEngines:
+    @by_each_master
+    @pytest.mark.parametrize("versions", [("2.0", "3.0", "2.0"), ("1.0", "2.0", "1.0")])
+    @pytest.mark.parametrize(
+        "options", [{}, {"substeps": 3, "start_time": 0.5}, {"warm_up_steps": 2}]
+    )
+    def test_compute_the_same_to_the_last_bit(self, make, master, versions, options):
+        found = []
+        for native in (False, True):
+            pool = make(
+                pendulums(master, versions), (), PENDULUM_OUTPUTS, native, time_step=0.02, **options
+            )
+            found.append(play(pool, 50))
+        assert np.abs(found[0]).max() > 0.1
+        assert found[0].tobytes() == found[1].tobytes()
+
+    @pytest.mark.parametrize("method", ["newton", "fixed_point"])
+    @by_each_master
+    def test_solve_loops_alike(self, make, fmus, method, master):
+        found = []
+        for native in (False, True):
+            plan = loop_of_gains(fmus, Loop(method), master=master)
+            pool = make(plan, ["a.u2"], ["a.y1", "b.y1", "a.u1"], native)
+            found.append(play(pool, 4, np.linspace(1, 2, 4).reshape(4, 1, 1)))
+        assert found[0].tobytes() == found[1].tobytes()
+
+    def test_exchange_model_exchange_and_co_simulation(self, make, fmus, tmp_path):
+        """x' = u - x with its solver beside a gain; FMI 1.0, 2.0 and 3.0 in one system."""
+        found = []
+        for native in (False, True):
+            plan = decay_with_gain(tmp_path, fmus)
+            pool = make(plan, (), ["decay.x", "gain.y1"], native, time_step=0.05)
+            found.append(play(pool, 40))
+        assert found[0].tobytes() == found[1].tobytes()
+
+    def test_serialize_alike(self, make):
+        found = []
+        for native in (False, True):
+            pool = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
+            pool.reset((), np.zeros((0, 2)))
+            pool.step()
+            data, ends, *_ = pool.serialize_states(np.arange(2))
+            found.append((bytes(data), ends.tolist()))
+        assert found[0][1] == found[1][1]
+        assert len(found[0][0]) == len(found[1][0])
+
+
+def decay_with_gain(folder, fmus, versions=(2, 1)):
+    path = exchange_tools.exchange_fmu(folder / "decay.fmu", "dahlquist", versions[0])
+    decay = Component("decay", path, starts=(("k", 1.0), ("x", 1.0)))
+    gain = linear("gain", fmus[versions[1]], d=[[0.5, 0], [0, 0]])
+    links = (Link("decay", "x", "gain", "u1"), Link("gain", "y1", "decay", "u"))
+    return system((decay, gain), links)
+
+
+# Algebraic loops
+
+
+def loop_of_gains(fmus, loop, gains=(0.5, -0.6), **options):
+    """a = 0.5 b + u, b = -0.6 a: both follow at once."""
+    a = linear("a", fmus[2], d=[[gains[0], 1], [0, 0]])
+    b = linear("b", fmus[3], d=[[gains[1], 0], [0, 0]])
+    links = (Link("a", "y1", "b", "u1"), Link("b", "y1", "a", "u1"))
+    return system((a, b), links, loop, **options)
+
+
+class TestLoops:
+    @in_each_engine
+    @pytest.mark.parametrize("method", ["newton", "fixed_point"])
+    def test_are_solved_within_the_tolerance(self, make, fmus, native, method):
+        plan = loop_of_gains(fmus, Loop(method, 1e-10))
+        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"], native)
+        rows = play(pool, 3, np.array([1.0, -2.0, 5.0]).reshape(3, 1, 1))
+        expected = np.array([0.0, 1.0, -2.0, 5.0]) / (1 + 0.3)
+        assert np.allclose(rows[:, 0], expected, rtol=1e-9, atol=1e-12)
+        assert np.allclose(rows[:, 1], -0.6 * expected, rtol=1e-9, atol=1e-12)
+
+    @in_each_engine
+    def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus, native):
+        for method, status in (("newton", Status.OK), ("fixed_point", Status.DISCARD)):
+            pool = make(loop_of_gains(fmus, Loop(method), (2.0, 3.0)), ["a.u2"], ["a.y1"], native)
+            pool.reset(*NO_START)
+            outputs, statuses = pool.step(np.array([[1.0]]))
+            assert statuses.tolist() == [status]
+            if status:
+                assert "loop" in pool.failure(0)
+                assert "'a'" in pool.failure(0)
+                assert "'b'" in pool.failure(0)
+            else:
+                assert outputs[0, 0] == pytest.approx(1 / (1 - 6))
+
+    @in_each_engine
+    def test_are_solved_before_the_first_step(self, make, fmus, native):
+        plan = loop_of_gains(fmus, Loop())
+        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"], native)
+        start = (pool.variable("a.u2"),)
+        outputs, statuses = pool.reset(start, np.array([[2.6]]))
+        assert not statuses.any()
+        assert outputs[:, 0] == pytest.approx([2.0, -1.2])
+
+    @in_each_engine
+    def test_repeat_the_dynamics_from_the_beginning_of_the_step(self, make, fmus, native):
+        """The coupled masses as a loop: what both compute agrees with what both got."""
+        plan = masses([fmus[2], fmus[3]])
+        loop = Loop("newton", 1e-12)
+        plan = replace(plan, groups=(Group(("first", "second"), loop),))
+        outputs = ["first.y1", "first.y2", "second.u1", "second.u2", "second.y1", "first.u1"]
+        rows = play(make(plan, (), outputs, native, time_step=0.05), 20)
+        assert np.allclose(rows[1:, :2], rows[1:, 2:4], rtol=0, atol=1e-11)
+        assert np.allclose(rows[1:, 4], rows[1:, 5], rtol=0, atol=1e-11)
+
+
+# Names, values and faults
+
+
+class TestValues:
+    @in_each_engine
+    def test_connectors_stand_for_variables_in_other_units(self, make, fmus, native):
+        """One input for two components; an output and a parameter in other units."""
+        parts = [
+            linear(n, fmus[v], b=[[1, 0], [0, 0]], c=np.eye(2)) for n, v in (("a", 2), ("b", 3))
+        ]
+        connectors = (
+            Connector("push", (End("a", "u1", 2.0), End("b", "u1", 1.0, 0.5)), "input"),
+            Connector("level", (End("b", "y1", 100.0, -1.0),), "output", "cm"),
+            Connector("start", (End("b", "x1_0", 0.01),), "parameter"),
+        )
+        plan = system(parts, (), connectors=connectors)
+        pool = make(plan, ["push"], ["a.y1", "level"], native)
+        outputs, _ = pool.reset((pool.variable("start"),), np.array([[30.0]]))
+        assert outputs[:, 0] == pytest.approx([0.0, 29.0])
+        outputs, _ = pool.step(np.array([[3.0]]))
+        assert outputs[:, 0] == pytest.approx([0.6, 29.0 + 35.0])
+
+    @in_each_engine
+    def test_start_values_win_over_those_of_the_plan(self, make, native):
+        pool = make(pendulums(), (), ["a.q", "b.q"], native, time_step=0.02)
+        assert play(pool, 0)[0] == pytest.approx([0.3, 0.6])
+        outputs, _ = pool.reset((pool.variable("b.q_0"),), np.array([[1.5]]))
+        assert outputs[:, 0] == pytest.approx([0.3, 1.5])
+        outputs, _ = pool.reset(*NO_START)
+        assert outputs[:, 0] == pytest.approx([0.3, 0.6])
+
+    @in_each_engine
+    def test_types_are_converted_by_each_component(self, make, native, tmp_path):
+        """A Real drives an Integer and a Boolean; Enumerations of FMI 2.0 and 3.0 are read."""
+        probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
+        parts = tuple(Component(n, p) for n, p in zip("ab", probes, strict=True))
+        links = (Link("a", "steps", "b", "n"), Link("b", "on_out", "a", "free"))
+        plan = SystemPlan(
+            "types",
+            parts,
+            links,
+            (Group(("a",)), Group(("b",))),
+            (Evaluation((0,)), Evaluation((1,))),
+        )
+        names = ["b.n_out", "a.free_out", "a.mode_out", "b.mode_out"]
+        pool = make(plan, ["b.on", "a.mode", "b.mode"], names, native)
+        rows = play(pool, 2, np.array([[[1.0], [2.0], [5.0]]] * 2))
+        assert rows[-1, 2:].tolist() == [2.0, 5.0]
+        assert rows[-1, 1] == 1.0
+
+    def test_a_driven_input_is_none_of_the_system(self, fmus):
+        description = SystemFMU(masses([fmus[2], fmus[2]])).description
+        assert not description.variable("first.u1").settable_in_step
+        assert description.variable("first.u2").settable_in_step
+        assert not description.variable("second.u1").settable_at_start
+
+    def test_capabilities_are_those_of_all(self, fmus):
+        able = SystemFMU(masses([fmus[2], fmus[2]])).description.capabilities
+        less = SystemFMU(masses([fmus[2], fmus[3]])).description.capabilities
+        least = SystemFMU(masses([fmus[1], fmus[2]])).description.capabilities
+        assert (able.can_get_and_set_fmu_state, able.can_serialize_fmu_state) == (True, True)
+        assert (less.can_get_and_set_fmu_state, less.can_serialize_fmu_state) == (True, False)
+        assert not least.can_get_and_set_fmu_state
+        assert least.can_handle_variable_communication_step_size
+
+
+class TestFaults:
+    @in_each_engine
+    @by_each_master
+    def test_end_one_system_and_name_the_component(self, make, fmus, native, master):
+        plan = masses([fmus[2], fmus[2]], master=master)
+        pool = make(plan, (), ["first.y1"], native, 3)
+        start = tuple(map(pool.variable, ("second.fails", "second.status")))
+        pool.reset(start, np.array([[0.25] * 3, [0.0, 3.0, 0.0]]))
+        for expected in (0, 0, Status.ERROR):
+            _, statuses = pool.step()
+            assert statuses.tolist() == [0, expected, 0]
+        assert "component 'second'" in pool.failure(1)
+        assert "t = 0.2" in pool.failure(1)
+        mask = np.array([False, True, False])
+        outputs, statuses = pool.reset(start, np.zeros((2, 3)), mask)
+        assert not statuses.any()
+        assert outputs[0, 1] == system_tools.POSITIONS[0]
+
+    @in_each_engine
+    def test_a_component_that_asks_to_stop_stops_the_system(self, make, fmus, native):
+        plan = masses([fmus[2], fmus[3]])
+        pool = make(plan, (), ["first.t", "second.t"], native)
+        start = tuple(map(pool.variable, ("first.fails", "first.status")))
+        pool.reset(start, np.array([[0.15], [1.0]]))
+        pool.step()
+        outputs, statuses = pool.step()
+        assert statuses.tolist() == [Status.TERMINATED]
+        assert outputs[:, 0] == pytest.approx([0.2, 0.2])
+
+    @in_each_engine
+    def test_no_component_gets_what_is_no_number(self, make, fmus, native):
+        big = linear("big", fmus[2], (1e200, 0.0), c=[[1e200, 0], [0, 0]])
+        plan = system((linear("a", fmus[3]), big), (Link("big", "y1", "a", "u1"),))
+        pool = make(plan, (), ["a.y1"], native)
+        _, statuses = pool.reset(*NO_START)
+        assert statuses[0] > Status.WARNING
+        assert "component 'big'" in pool.failure(0)
+        assert "not finite" in pool.failure(0)
+
+    @in_each_engine
+    def test_discarded_steps_are_repeated_as_smaller_ones_of_all(self, make, fmus, native):
+        """One component accepts only steps of at most 0.03 s, so the system does four of 0.025."""
+        plan = masses([fmus[2], fmus[2]])
+        limited = make(plan, (), ["first.y1", "second.y2"], native, time_step=0.1, fault_retries=3)
+        fine = make(plan, (), ["first.y1", "second.y2"], native, time_step=0.025)
+        outputs, _ = limited.reset((limited.variable("second.limit"),), np.array([[0.03]]))
+        fine.reset(*NO_START)
+        for _ in range(5):
+            outputs, statuses = limited.step()
+            assert not statuses.any()
+            for _ in range(4):
+                expected, _ = fine.step()
+            assert np.allclose(outputs, expected, rtol=0, atol=1e-13)
+
+    def test_an_fmu_that_cannot_be_loaded_is_named(self, make, fmus, tmp_path):
+        files = fmu_tools.read_fmu(fmus[2])
+        name = next(name for name in files if name.startswith("binaries"))
+        files[name] = files[name][:-9000]
+        broken = fmu_tools.write_fmu(tmp_path / "broken.fmu", files)
+        with pytest.raises(FMULoadError, match=r"component 'second'.*broken\.fmu"):
+            make(masses([fmus[2], broken]))
+
+    @pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+    def test_messages_name_the_component(self, make, tmp_path, caplog):
+        probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
+        parts = tuple(Component(n, p) for n, p in zip(("one", "two"), probes, strict=True))
+        plan = SystemPlan("talk", parts, groups=(Group(("one",)), Group(("two",))))
+        pool = make(plan, (), ["one.sum"], True, 2)
+        start = (pool.variable("two.log_status"),)
+        pool.reset(start, np.array([[-1.0, 1.0]]))
+        pool.step()
+        said = [r.getMessage() for r in caplog.records if "talk_" in r.getMessage()]
+        assert said
+        assert all("talk_1.two" in text for text in said)
+
+
+# States
+
+
+class TestStates:
+    @in_each_engine
+    @by_each_master
+    def test_return_as_one(self, make, native, master):
+        pool = make(pendulums(master), (), PENDULUM_OUTPUTS, native, 2, 0.02)
+        pool.reset((), np.zeros((0, 2)))
+        for _ in range(7):
+            pool.step()
+        snapshot = pool.save()
+        before = [pool.step()[0].copy() for _ in range(5)]
+        pool.restore(snapshot)
+        again = [pool.step()[0].copy() for _ in range(5)]
+        assert np.array_equal(before, again)
+
+    @in_each_engine
+    def test_pass_to_other_pools_as_bytes(self, make, native):
+        one = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
+        other = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
+        for pool in (one, other):
+            pool.reset((), np.zeros((0, 2)))
+        for _ in range(5):
+            one.step()
+        one.save_by(lambda: SaveMethod.STATE)
+        other.save_by(lambda: SaveMethod.STATE)
+        bundle = pickle.loads(pickle.dumps(one.save_instances(np.arange(2))))
+        other.restore_instances(bundle, np.arange(2), np.arange(2))
+        for _ in range(5):
+            assert one.step()[0].tobytes() == other.step()[0].tobytes()
+
+
+# Where an FMU stands
+
+
+class Chain(fmugym.FMUEnv):
+    """Pushes the first pendulum of a chain."""
+
+    def __init__(self, plan, backend=None, isolation=None):
+        config = {
+            "model_input_names": ["a.tau"],
+            "model_output_names": ["a.theta", "b.theta"],
+            "model_parameters": {"b.q_0": 0.2},
+            "time_step": 0.02,
+            "bounds": {"a.tau": (-1, 1)},
+            "max_episode_steps": 30,
+        }
+        super().__init__(plan, config, backend=backend, isolation=isolation)
+
+    def _is_done(self):
+        return abs(self.out["b.theta"]) > 10
+
+
+def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
+    """A trial plays it in a process of its own, and its verdict is kept by content."""
+    monkeypatch.setenv("FMUGYM_CACHE", str(tmp_path))
+    from fmugym.trial.trial import Candidate, examine, known_verdict
+
+    fmu = SystemFMU(masses([fmus[2], fmus[3]]))
+    spec = PoolSpec((), (fmu.variable("first.y1"),), 0.1)
+    verdict = examine(Candidate.of(fmu), spec, several=True)
+    assert verdict.complete
+    assert verdict.deterministic
+    assert str(verdict.reset_method) == "restore"
+    assert known_verdict(SystemFMU(masses([fmus[2], fmus[3]]))) is not None
+    other = masses([fmus[2], fmus[3]], steps=(2, 1))
+    assert known_verdict(SystemFMU(other)) is None
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_system_runs_in_worker_processes(make, workers):
+    fmu = SystemFMU(pendulums())
+    spec = PoolSpec((), tuple(map(fmu.variable, PENDULUM_OUTPUTS)), 0.02)
+    pool = opening.make_pool(fmu, spec, 3, LOG, isolation="process", workers=workers)
+    here = make(pendulums(), (), PENDULUM_OUTPUTS, has_native_pool(), 3, 0.02)
+    try:
+        for one in (pool, here):
+            one.reset((), np.zeros((0, 3)))
+        for _ in range(10):
+            assert pool.step()[0].tobytes() == here.step()[0].tobytes()
+    finally:
+        pool.close()
+
+
+def test_a_closed_system_says_so(make):
+    pool = make(pendulums(), (), PENDULUM_OUTPUTS, has_native_pool())
+    pool.close()
+    with pytest.raises(SimulationError, match="closed"):
+        pool.reset(*NO_START)
