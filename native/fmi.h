@@ -147,9 +147,15 @@ typedef struct Fmi {
 } Fmi;
 
 /* How an FMU is run. fmugym/pool/settings.py has the same numbers. */
-typedef enum { CO_SIMULATION_ALONE, MODEL_EXCHANGE_SOLVED, CO_SIMULATION_WITH_EVENTS } Manner;
+typedef enum {
+    CO_SIMULATION_ALONE,
+    MODEL_EXCHANGE_SOLVED,
+    CO_SIMULATION_WITH_EVENTS,
+    CO_SIMULATION_WITH_RAMPS,
+    NUMBER_OF_MANNERS
+} Manner;
 
-extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
+extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3, ramped1, ramped2;
 /* Of systems. */
 extern const Fmi composite;
 

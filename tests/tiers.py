@@ -8,6 +8,7 @@ in the default run: of a test with many combinations of parameters, it takes eve
 SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
+    "test_cli_advice",
     "test_cli_docs",
     "test_cli_tuning",
     "test_compile",
@@ -17,15 +18,18 @@ SLOW_MODULES = {
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
+    "test_examples_system",
     "test_examples_train_house",
     "test_export",
     "test_export_fmu",
+    "test_export_onnx",
     "test_export_sb3",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
     "test_fuzz_signals",
     "test_fuzz_tasks",
+    "test_input_interpolation",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_nested_fmus",
@@ -35,9 +39,13 @@ SLOW_MODULES = {
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
+    "test_pettingzoo",
     "test_start_times",
     "test_value_types",
     "test_systems",
+    "test_systems_description",
+    "test_systems_faces",
+    "test_systems_ssp",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -187,6 +195,10 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
+    "test_examples_system.py",
+    "test_systems_ssp.py::TestDamaged",
     "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",

@@ -227,6 +227,9 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         offer.canBeInstantiatedOnlyOncePerProcess,
         offer.needsExecutionTool,
         _provides(root, _ELEMENTS[interface], "Adjoint"),
+        interface == "co_simulation"
+        and source.fmiVersion.startswith("2")
+        and offer.canInterpolateInputs,
     )
 
 
@@ -250,6 +253,7 @@ def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
         or flag("canHandleVariableCommunicationStepSize"),
         can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
         needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
+        can_interpolate_inputs=interface == "co_simulation" and flag("canInterpolateInputs"),
     )
 
 

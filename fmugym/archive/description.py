@@ -246,6 +246,7 @@ class Capabilities:
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
     provides_adjoint_derivatives: bool = False
+    can_interpolate_inputs: bool = False
 
     @property
     def provides_derivatives(self) -> bool:

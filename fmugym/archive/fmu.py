@@ -25,8 +25,9 @@ from fmugym.archive.description import INTERFACES, ModelDescription, Variable
 from fmugym.archive.executable import check_library
 from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
-from fmugym.archive.reading import read_model_description
+from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
+from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.checks import check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
@@ -251,6 +252,15 @@ class FMU(LoadableFMU):
     def variable(self, name: str) -> Variable:
         """Look a variable up by name; see ``ModelDescription.variable``."""
         return self.description.variable(name)
+
+    @cached_property
+    def feedthrough(self) -> Feedthrough:
+        """Which inputs act on which outputs at once, as the model description tells it.
+
+        Raises:
+            FMULoadError: If the archive has been changed or removed.
+        """
+        return read_feedthrough(read_root(self._archive, self.limits), self.description)
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.checks import check_option
 from fmugym.declared.devices import DEVICE_KEYS, IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import IDENTITY, Conversion, conversion_between, duration
+from fmugym.declared.quantities import duration
 from fmugym.declared.values import number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name

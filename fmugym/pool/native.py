@@ -156,7 +156,7 @@ class NativePool(SavingPool):
             return _native.Pool(
                 library=cast(
                     "_native.Library",
-                    library_settings(description, place)
+                    library_settings(description, spec, place)
                     | {
                         "private": private_libraries,
                         "logging": log.isEnabledFor(logging.INFO),
@@ -194,7 +194,7 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = table_of(self._fmu.description)
-            manner = manner_of(self._fmu.description)
+            manner = manner_of(self._fmu.description, self._spec)
             access = _native.Access(version, *listing(variables, version), manner)
             self._accesses[variables] = access
         return access

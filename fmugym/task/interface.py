@@ -151,7 +151,33 @@ class Interface:
             samplings=self._samplings(),
             solver=config.solver,
             max_step=self._max_step(),
+            ramped=self._ramped(),
         )
+
+    def _ramped(self) -> tuple[Variable, ...]:
+        """The inputs that change linearly within a step.
+
+        Raises:
+            ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real.
+        """
+        names = self.config.ramped_inputs
+        if names and not self.description.capabilities.can_interpolate_inputs:
+            raise ConfigError(
+                f"config key 'input_interpolation': {self.description.model_name} "
+                f"(FMI {self.description.fmi_version}) cannot interpolate inputs, which is an "
+                "option of FMI 1.0 and 2.0 for co-simulation; its inputs can only hold"
+            )
+        inputs = {variable.name: variable for variable in self.inputs}
+        ramped = tuple(inputs[name] for name in names)
+        for variable in ramped:
+            found = variable.kind, variable.variability, variable.causality, variable.shape
+            if found != ("real", "continuous", "input", ()):
+                raise ConfigError(
+                    f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
+                    f"a {variable.variability} {variable.causality} of type {variable.type}, "
+                    "expected a continuous Real input"
+                )
+        return ramped
 
     def _max_step(self) -> float | None:
         """The config's, or else, for a solver of fixed steps, the FMU's default step size."""
@@ -206,6 +232,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     outputs = read[: len(read) - len(monitors)]
     bounded = inputs + outputs
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
+    _check_no_arrays_beside_clocks(description, inputs)
     return Interface(
         inputs=inputs,
         outputs=outputs,
@@ -216,6 +243,19 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         description=description,
         limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
     )
+
+
+def _check_no_arrays_beside_clocks(
+    description: ModelDescription, inputs: Sequence[Variable]
+) -> None:
+    """Inputs are set one by one where some of them wait for clocks."""
+    arrays = [variable for variable in inputs if variable.array is not None]
+    if arrays and description.clocked_inputs:
+        raise ConfigError(
+            f"{arrays[0].name!r} cannot be an input: it belongs to an array, and "
+            f"{description.model_name} has inputs with clocks, such as "
+            f"{description.clocked_inputs[0].name!r}"
+        )
 
 
 def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:

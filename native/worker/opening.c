@@ -142,6 +142,9 @@ static void read_solving(Reader *reader, Solving *solving) {
     solving->rate_references = read_references(reader, solving->states);
     solving->clocks = read_copy(reader, sizeof(Clock), &solving->number_of_clocks);
     solving->clocked = read_copy(reader, sizeof(Clocked), &solving->number_of_clocked);
+    solving->ramped_references =
+        read_copy(reader, sizeof(uint32_t), &solving->number_of_ramps);
+    solving->ramp_duration = read_number(reader);
     reader->sound = reader->sound && solving->method != NULL;
 }
 
