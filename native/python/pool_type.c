@@ -551,6 +551,7 @@ static PyMethodDef methods[] = {
      NULL},
     FAST("play", py_play),
     FAST("rollout", py_rollout),
+    {"exchange_play", py_exchange_play, METH_O, NULL},
     {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
      METH_VARARGS | METH_KEYWORDS, NULL},
     FAST("step_single", py_step_single),
