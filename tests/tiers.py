@@ -29,6 +29,7 @@ SLOW_MODULES = {
     "test_fuzz_hooks",
     "test_fuzz_signals",
     "test_fuzz_tasks",
+    "test_input_interpolation",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_nested_fmus",
