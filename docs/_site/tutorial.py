@@ -45,7 +45,7 @@ _SVG: Final = """\
 <svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}">
 <rect width="{width}" height="{height}" rx="8" fill="#1d2329"/>
 <g font-family="ui-monospace, 'DejaVu Sans Mono', Consolas, monospace" font-size="12" \
-fill="#e6eaee" xml:space="preserve">
+fill="#e6eaee">
 {lines}
 </g>
 </svg>
@@ -59,7 +59,8 @@ def printed(commands: Sequence[str]) -> list[str]:
         text = io.StringIO()
         with contextlib.redirect_stdout(text), contextlib.redirect_stderr(io.StringIO()):
             main(shlex.split(command)[1:])
-        lines += [f"$ {command}", *text.getvalue().splitlines()]
+        told = text.getvalue().replace(str(Path.cwd()), "~/house")
+        lines += [f"$ {command}", *told.splitlines()]
     return lines
 
 
@@ -76,10 +77,15 @@ def terminal(lines: Sequence[str]) -> str:
     for number, line in enumerate(shown):
         colour = ' fill="#7cc4f2"' if line.startswith("$ ") else ""
         y = _EDGE + 12 + number * _LINE
-        texts.append(f'<text x="{_EDGE}" y="{y}"{colour}>{escape(line)}</text>')
+        texts.append(f'<text x="{_EDGE}" y="{y}"{colour}>{_spaced(line)}</text>')
     width = round(2 * _EDGE + _CHARACTER * max(map(len, shown)))
     height = 2 * _EDGE + len(shown) * _LINE
     return _SVG.format(width=width, height=height, lines="\n".join(texts))
+
+
+def _spaced(line: str) -> str:
+    """The text of a line whose spaces are all shown."""
+    return escape(line).replace(" ", "\u00a0")
 
 
 def write(folder: Path) -> None:
