@@ -484,9 +484,10 @@ def _require_numeric(variable: Variable, role: str) -> None:
 
 
 _CURES: Final = {
-    "String": ". A scalar String can be given a text in 'model_parameters'; to read one, let the FMU "
-    "tell the same by a number or an Enumeration",
-    "Binary": ". Nothing but the FMU knows what its bytes mean: let it tell what you need by numbers",
+    "String": ". A scalar String can be given a text in 'model_parameters'; to read one, let the "
+    "FMU tell the same by a number or an Enumeration",
+    "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
+    "numbers",
 }
 
 
