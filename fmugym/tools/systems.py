@@ -11,7 +11,6 @@ from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.systems import fmu_of
 from fmugym.systems import FMUSystem
-from fmugym.systems.fmu import SystemFMU
 from fmugym.tools.overview import overview, plain, tables
 
 __all__ = ["as_text_of_system", "open_model", "open_system", "overview_of_system"]
@@ -40,7 +39,7 @@ def open_model(path: Path) -> FMU:
         FMULoadError: If it cannot be read.
     """
     if path.suffix.lower() == ".ssp":
-        return SystemFMU(FMUSystem.read(path).plan)
+        return FMUSystem.read(path).as_fmu()
     return FMU(path)
 
 
@@ -57,7 +56,7 @@ def overview_of_system(
     Returns:
         As ``overview``, with ``system``, a dict; ``docs/command-line.md`` describes the keys.
     """
-    facts = overview(SystemFMU(system.plan), everything=everything, pattern=pattern)
+    facts = overview(system.as_fmu(), everything=everything, pattern=pattern)
     groups = [
         {"components": list(group.components), "is_loop": group.loop is not None}
         for group in system.order.groups
