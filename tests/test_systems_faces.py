@@ -339,6 +339,14 @@ class TestCommandLine:
             {"components": ["west"], "is_loop": False},
         ]
 
+    def test_info_of_a_task_with_an_fmu_is_that_of_the_fmu(self, tmp_path, capsys):
+        path = tmp_path / "task.toml"
+        path.write_text('fmu = { bundled = "House" }\n')
+        assert main(["info", str(path)]) == 0
+        found = capsys.readouterr().out
+        assert main(["info", str(HOUSE)]) == 0
+        assert found == capsys.readouterr().out
+
     def test_the_plot_is_for_systems(self, tmp_path, capsys):
         assert main(["info", str(HOUSE), "--plot", str(tmp_path / "x.svg")]) == 1
         assert "--plot" in capsys.readouterr().err
@@ -352,6 +360,9 @@ class TestCommandLine:
         assert main(run) == 0
         header = (tmp_path / "run.csv").read_text().splitlines()[0]
         assert "west_E" in header
+        program = tmp_path / "houses.py"
+        assert main(["new", "--class", str(archive), "--output", str(program)]) == 0
+        assert "(fmugym.FMUEnv)" in program.read_text()
         assert main(["bench", str(archive), "--envs", "2", "--seconds", "0.1"]) == 0
         capsys.readouterr()
 
