@@ -42,6 +42,7 @@ SLOW_MODULES = {
     "test_systems",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_parts",
     "test_systems_ssp",
     "test_without_native",
 }
