@@ -19,7 +19,8 @@ def imported(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
+        needed = module.removeprefix("fmugym.").partition(".")[0]
         raise ConfigError(
-            f"this needs {module.partition('.')[0]}, which cannot be imported; install the extra: "
+            f"this needs {needed}, which cannot be imported; install the extra: "
             f"pip install 'fmugym-toolbox[{extra}]'"
         ) from error

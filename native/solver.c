@@ -53,6 +53,11 @@ static void share_out(Solver *me, double *memory) {
     me->found_z = take(&memory, s->indicators);
 }
 
+size_t solver_kept_size(const Solver *me) {
+    const Solving *s = me->solving;
+    return s->number_of_clocks * sizeof(Ticks) + s->number_of_ramps * sizeof(Ramp);
+}
+
 bool solver_open(Solver *me) {
     const Solving *s = me->solving;
     const size_t rows = 7 + s->method->stages + (s->method->needs_jacobian ? 2 * s->states : 0);
@@ -60,13 +65,15 @@ bool solver_open(Solver *me) {
     me->n = s->states;
     double *memory = calloc(me->n * rows + 4 * s->indicators + 1, sizeof *memory);
     me->pivots = calloc(me->n + 1, sizeof *me->pivots);
-    me->ticks = calloc(s->number_of_clocks + 1, sizeof *me->ticks);
+    me->kept = calloc(solver_kept_size(me) + 1, 1);
     me->active = calloc(s->number_of_clocks + 1, sizeof *me->active);
     me->arrays = memory;
-    if (memory == NULL || me->pivots == NULL || me->ticks == NULL || me->active == NULL) {
+    if (memory == NULL || me->pivots == NULL || me->kept == NULL || me->active == NULL) {
         solver_close(me);
         return false;
     }
+    me->ticks = (Ticks *)(void *)me->kept;
+    me->ramps = (Ramp *)(void *)(me->ticks + s->number_of_clocks);
     share_out(me, memory);
     return true;
 }
@@ -74,7 +81,7 @@ bool solver_open(Solver *me) {
 void solver_close(Solver *me) {
     free(me->arrays);
     free(me->pivots);
-    free(me->ticks);
+    free(me->kept);
     free(me->active);
 }
 
@@ -517,10 +524,13 @@ static Status step_by_fmu(Solver *me, double until) {
     const double time = me->memory.time;
     double reached = until;
     bool event = false, terminate = false;
-    const Status status = me->model->step(me->library, me->component, time, until - time, &reached,
-                                          &event, &terminate);
+    Status status = me->solving->number_of_ramps > 0 ? ramps_set(me, time) : STATUS_OK;
 
-    solver_restore_floats(me);
+    if (good(status)) {
+        status = me->model->step(me->library, me->component, time, until - time, &reached, &event,
+                                 &terminate);
+        solver_restore_floats(me);
+    }
     if (!good(status)) {
         return status;
     }

@@ -23,7 +23,7 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
-    {"export"},
+    {"export", "logs", "minari"},
     {"envs", "pettingzoo", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]

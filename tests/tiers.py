@@ -8,6 +8,7 @@ in the default run: of a test with many combinations of parameters, it takes eve
 SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
+    "test_cli_advice",
     "test_cli_docs",
     "test_cli_tuning",
     "test_compile",
@@ -21,12 +22,14 @@ SLOW_MODULES = {
     "test_examples_train_house",
     "test_export",
     "test_export_fmu",
+    "test_export_onnx",
     "test_export_sb3",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",
     "test_fuzz_signals",
     "test_fuzz_tasks",
+    "test_input_interpolation",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_nested_fmus",
@@ -193,6 +196,8 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
     "test_examples_system.py",
     "test_systems_ssp.py::TestDamaged",
     "test_compile.py::TestCompile::test_ziglang",

@@ -34,6 +34,8 @@ MODULES: Final = {
     "TorchRL": "fmugym.torchrl",
     "PettingZoo": "fmugym.pettingzoo",
     "RLlib": "fmugym.rllib",
+    "Plant logs": "fmugym.logs",
+    "Minari": "fmugym.minari",
     "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",

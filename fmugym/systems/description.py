@@ -113,7 +113,12 @@ def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabi
     }
     restrictions = ("can_be_instantiated_only_once_per_process", "needs_execution_tool")
     able |= {name: any(getattr(one, name) for one in flags) for name in restrictions}
-    return replace(Capabilities(**able), provides_directional_derivatives=False)
+    return replace(
+        Capabilities(**able),
+        provides_directional_derivatives=False,
+        provides_adjoint_derivatives=False,
+        can_interpolate_inputs=False,
+    )
 
 
 def _units(parts: Iterable[ModelDescription]) -> dict[str, Unit]:

@@ -22,7 +22,7 @@ __all__ = ["maker_of", "scenarios_of"]
 _MODELS: Final = {".fmu", ".ssp"}
 
 
-def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
+def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
     """Find what a text names.
 
     Args:
@@ -31,7 +31,7 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
         scenario: A scenario of the task file; None for any episodes.
 
     Returns:
-        A function that makes the environment.
+        A function that makes the environment. It takes arguments of the environment.
 
     Raises:
         ConfigError: If there is no such thing, or the task has a mistake.
@@ -67,14 +67,16 @@ def _scenarios(task: Task | None) -> list[str]:
     return [] if task is None else list(task.document.get("scenarios", {}))
 
 
-def _registered(env_id: str, arguments: dict[str, Any]) -> FMUEnv:
+def _registered(env_id: str, arguments: dict[str, Any], **more: Any) -> FMUEnv:
     try:
-        env = gymnasium.make(env_id, **arguments).unwrapped
+        made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:
         raise ConfigError(
             f"{shown(env_id)} is no task file, no class and no registered id: {error}"
         ) from None
+    env = made.unwrapped
     if not isinstance(env, FMUEnv):
         env.close()
         raise ConfigError(f"{shown(env_id)} is no environment of fmugym")
+    env.spec = made.spec  # with the time limit, which is a wrapper's
     return env

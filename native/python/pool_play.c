@@ -419,8 +419,24 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
         playing_free(playing);
         return NULL;
     }
+    PyCapsule_SetContext(capsule, self); /* other pools have other arrays */
     replace_reference(&self->playing, capsule);
     Py_RETURN_NONE;
+}
+
+/* Puts what was prepared before in the place of what is prepared now, and returns that. */
+PyObject *py_exchange_play(PyObject *object, PyObject *other) {
+    PyPool *self = (PyPool *)object;
+    PyObject *present = Py_NewRef(self->playing == NULL ? Py_None : self->playing);
+
+    if (other != Py_None &&
+        (!PyCapsule_IsValid(other, PLAYING) || PyCapsule_GetContext(other) != self)) {
+        Py_DECREF(present);
+        PyErr_SetString(PyExc_TypeError, "expected what exchange_play has returned");
+        return NULL;
+    }
+    replace_reference(&self->playing, other == Py_None ? NULL : Py_NewRef(other));
+    return present;
 }
 
 /* Playing */
@@ -648,6 +664,7 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
 typedef struct {
     PyTurn turn;
     size_t horizon;
+    Mask left_out;
 } PyRollout;
 
 static bool has_bad_action(const PyRollout *r) {
@@ -670,7 +687,8 @@ static void do_rollout(PyPool *self, bool alone, void *context) {
     t->ends.outside = false;
     t->bad_action = has_bad_action(r);
     if (!t->bad_action) {
-        t->troubled = pool_rollout(&self->pool, &t->call, r->horizon, &t->ends.outside);
+        t->troubled =
+            pool_rollout(&self->pool, &t->call, r->horizon, r->left_out, &t->ends.outside);
     }
 }
 
@@ -730,13 +748,25 @@ static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *
                        (Py_ssize_t)playing->play.draws->count, n);
 }
 
-static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
+static bool take_left_out(PyPool *self, PyObject *mask, PyRollout *r) {
+    Py_buffer *buffer = &r->turn.buffers[MASK];
+
+    if (!take_vector(mask, buffer, COPIED, "the mask", ITEM_BOOLEAN,
+                     (Py_ssize_t)self->pool.settings.count)) {
+        return false;
+    }
+    r->left_out = (Mask){buffer->buf, buffer->strides[0]};
+    return true;
+}
+
+/* The mask may be NULL. */
+static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args, PyObject *mask) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     PyRollout r = {.horizon = 0};
     bool done = false;
 
     clear_turn(playing, &r.turn);
-    if (take_rollout(self, playing, args, &r)) {
+    if (take_rollout(self, playing, args, &r) && (mask == NULL || take_left_out(self, mask, &r))) {
         settle_turn(self, playing, &r.turn);
         done = perform(self, NEVER_SHORT, do_rollout, &r) && !is_outside(&r.turn) &&
                report_messages(self);
@@ -752,11 +782,11 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, LAST) || !is_prepared(self)) {
+    if (!has_arguments(nargs, nargs == LAST + 1 ? nargs : LAST) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = roll_out(self, playing, args);
+    PyObject *result = roll_out(self, playing, args, nargs > LAST ? args[LAST] : NULL);
     Py_DECREF(playing);
     return result;
 }
