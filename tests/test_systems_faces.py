@@ -355,7 +355,6 @@ class TestCommandLine:
     def test_from_an_archive_to_a_task_and_an_episode(self, archive, tmp_path, capsys):
         path = tmp_path / "new.toml"
         assert main(["new", str(archive), "--output", str(path)]) == 0
-        assert main(["validate", str(path)]) == 0
         run = ["simulate", str(path), "--steps", "3", "--output", str(tmp_path / "run.csv")]
         assert main(run) == 0
         header = (tmp_path / "run.csv").read_text().splitlines()[0]
@@ -365,6 +364,10 @@ class TestCommandLine:
         assert "(fmugym.FMUEnv)" in program.read_text()
         assert main(["bench", str(archive), "--envs", "2", "--seconds", "0.1"]) == 0
         capsys.readouterr()
+
+    def test_validation_of_an_archive(self, archive, capsys):
+        assert main(["validate", str(archive)]) == 0
+        assert "repetition" in capsys.readouterr().out
 
     def test_an_archive_that_is_none(self, tmp_path, capsys):
         (tmp_path / "x.ssp").write_text("x")
