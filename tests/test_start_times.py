@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 import wine_tools
+from test_rollouts import WAYS
 
 import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
@@ -193,13 +194,6 @@ class Sun(FMUEnv):
 
 
 ACTION = np.zeros(1, np.float32)
-WAYS = {
-    "compiled": {"hooks": "compiled"},
-    "array": {"hooks": "array"},
-    "per_env": {"hooks": "per_env"},
-    "python": {"backend": "python"},
-    "process": {"isolation": "process"},
-}
 all_ways = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 
