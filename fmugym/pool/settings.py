@@ -115,6 +115,16 @@ def library_settings(
         "paths": place.paths,
         "states": description.capabilities.can_get_and_set_fmu_state,
         "categories": tuple(c.encode() for c in description.error_categories),
+    } | _structural_settings(description)
+
+
+def _structural_settings(description: ModelDescription) -> dict[str, bytes]:
+    """The value references and the values of structural parameters."""
+    references = [variable.value_reference for variable, _ in description.structure]
+    values = [value for _, value in description.structure]
+    return {
+        "structural_references": np.array(references, np.uint32).tobytes(),
+        "structural_values": np.array(values, np.uint64).tobytes(),
     }
 
 

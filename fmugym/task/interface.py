@@ -13,6 +13,7 @@ from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.fmi.access import unlisted
 from fmugym.pool.spec import (
     FIXED_STEP_SOLVERS,
     START_TIME,
@@ -30,6 +31,7 @@ __all__ = [
     "resolve",
     "start_values",
     "start_variable",
+    "structural_values",
 ]
 
 _Value = TypeVar("_Value")
@@ -224,7 +226,9 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     Raises:
         ConfigError: If a name is unknown, or its variable cannot be used in that role.
     """
-    given = start_values(description, config.model_parameters)
+    structural = structural_values(description, config.model_parameters)
+    starts = {n: value for n, value in config.model_parameters.items() if n not in structural}
+    given = start_values(description, starts)
     drawn = {"start_time": config.start_time} if config.draws_start_time else {}
     inputs = _resolved(description, config.model_input_names, _check_input)
     read = outputs_named(description, config.model_output_names + config.monitor_names)
@@ -232,6 +236,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     outputs = read[: len(read) - len(monitors)]
     bounded = inputs + outputs
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
+    _check_rest_is_known(inputs)
     _check_no_arrays_beside_clocks(description, inputs)
     return Interface(
         inputs=inputs,
@@ -348,7 +353,36 @@ def start_values(
             found.setdefault(variable.name, pair)
             if variable.name == name:
                 elements[name] = pair
+    _check_rest_is_known([variable for variable, _ in found.values()])
     return [elements.get(name, pair) for name, pair in found.items()]
+
+
+def _check_rest_is_known(variables: Sequence[Variable]) -> None:
+    """Elements that are not written keep their start values, but who knows those of a new size?"""
+    for missing in unlisted(variables):
+        array = missing.array
+        if array is not None and array.start is None and array.dimensions:
+            raise ConfigError(
+                f"there is no value of {missing.name!r}: {array.name!r} has a size of its own, "
+                f"{array.shape}, for which the FMU has no start values; give all elements"
+            )
+
+
+def structural_values(description: ModelDescription, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the given values that are of structural parameters, by which arrays get their sizes.
+
+    Raises:
+        ConfigError: If one is a distribution: the sizes of spaces do not change.
+    """
+    found = {n: v for n, v in given.items() if n in description.variables}
+    found = {n: v for n, v in found.items() if description.variables[n].is_structural}
+    for name, value in found.items():
+        if is_distribution(value):
+            raise ConfigError(
+                f"{name!r} is a structural parameter: it cannot be drawn, since spaces keep their "
+                f"sizes; expected an integer, got {shown(value)}"
+            )
+    return found
 
 
 def spread(name: str, scalars: Sequence[Variable], value: Any) -> list[Any]:
@@ -464,6 +498,11 @@ def _check_start(variable: Variable, value: Any) -> None:
     name = variable.name
     if variable.ticking:
         raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
+    if variable.is_structural:
+        raise ConfigError(
+            f"{name!r} cannot be set here: it is a structural parameter, which is set under "
+            "'model_parameters' of the config"
+        )
     if not variable.settable_at_start:
         raise ConfigError(
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "

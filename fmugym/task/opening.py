@@ -22,6 +22,7 @@ from fmugym.pool.spec import ISOLATIONS
 from fmugym.systems import FMUSystem
 from fmugym.systems.fmu import SystemFMU
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.interface import structural_values
 from fmugym.trial.opening import make_pool
 
 __all__ = ["PoolOpening", "deferred_pools", "env_numbers", "open_fmu", "pools_are_deferred"]
@@ -85,6 +86,11 @@ def open_fmu(
         "probe_timeout": config.probe_timeout,
         "interface": _interface_of(cls, config.interface, interface),
     }
+    fmu = _shared((file, repr(arguments)), lambda: FMU(file, **arguments))
+    sizes = structural_values(fmu.description, config.model_parameters)
+    if not sizes:
+        return fmu
+    arguments |= {"sizes": sizes}
     return _shared((file, repr(arguments)), lambda: FMU(file, **arguments))
 
 

@@ -199,6 +199,7 @@ static void pool_dealloc(PyObject *object) {
 typedef struct {
     PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
+    Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, manner, private_libraries, logging, can_save;
     int restores, rebuilds, reloads, one_initialization;
@@ -222,11 +223,14 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "manner",  "model",  "token",      "resources", "paths",
-                            "private", "logging", "states", "categories", "mark", "solving", "system", NULL};
+                            "private", "logging", "states", "categories", "mark", "solving", "system",
+                            "structural_references", "structural_values", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iiyyyO!pppO!OOO:library", names, &a->version, &a->manner, &s->model,
+    return parse_group(group, "$iiyyyO!pppO!OOOy#y#:library", names, &a->version, &a->manner, &s->model,
                        &s->token, &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system);
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system,
+                       &s->experiment.structural_references, &a->size_of_references,
+                       &s->experiment.structural_values, &a->size_of_values);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -439,6 +443,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     Settings *s = &self->pool.settings;
 
     s->fmi = fmi_of(a->version, a->manner);
+    s->experiment.number_of_structural = (size_t)a->size_of_values / sizeof(uint64_t);
     s->system = self->system;
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;

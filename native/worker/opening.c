@@ -164,7 +164,12 @@ static void read_library(Reader *reader, Settings *s) {
     s->logging = read_flag(reader);
     s->can_save = read_flag(reader);
     s->categories = read_texts(reader, &s->number_of_categories);
-    reader->sound = reader->sound && s->fmi != NULL && paths == 1;
+    size_t size;
+    s->experiment.structural_references = read_block(reader, &size);
+    s->experiment.number_of_structural = size / sizeof(uint32_t);
+    s->experiment.structural_values = read_block(reader, &size);
+    reader->sound = reader->sound && s->fmi != NULL && paths == 1 &&
+                    size == s->experiment.number_of_structural * sizeof(uint64_t);
     if (reader->sound) {
         s->can_save = s->can_save && s->fmi->get_state != NULL;
     }

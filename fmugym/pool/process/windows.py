@@ -345,6 +345,8 @@ def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) 
     _write_texts(writer, library["paths"])
     writer.flags(log_level <= logging.INFO, library["states"])
     _write_texts(writer, library["categories"])
+    for name in ("structural_references", "structural_values"):
+        writer.block(library[name])
 
 
 def _write_solving(writer: _Writer, solving: tuple[Any, ...] | None) -> None:
