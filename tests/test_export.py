@@ -271,6 +271,49 @@ class TestSensors:
         assert texts[0] == texts[1]
 
 
+class TestExternal:
+    """Data that the agent is given instead of having them in tables."""
+
+    def test_takes_the_place_of_tables(self, tmp_path):
+        env, names = made("fmugym/House-v0"), ["T_out", "sun", "price"]
+        network = network_for(env)
+        agent = agent_of(env, network, external=names)
+        controller = compiled(agent, tmp_path)
+        assert "house_table" not in (tmp_path / "agent.c").read_text()
+        plain = [one.name for one in agent.logic.measurements]
+        assert plain[:5] == ["T_op", "T_w", "T_out_given", "T_out_in_7200_s", "T_out_in_14400_s"]
+        assert len(plain) == 2 + 3 * 7
+        places = [
+            i for i, one in enumerate(env.observation_names) if one.partition("[")[0] in names
+        ]
+        order = sorted(
+            places, key=lambda i: names.index(env.observation_names[i].partition("[")[0])
+        )
+        observation, _ = env.reset(seed=2)
+        controller.begin(clock=env.variables["clock"])
+        for _ in range(100):
+            given = [env.out["T_op"], env.out["T_w"], *observation[order]]
+            actions = controller.step(given)
+            observation, *_ = env.step(network.action(observation))
+            assert actions == pytest.approx([env.inputs[0]], abs=1e-5)
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("name", "fact"), [("T_outt", "'T_out'"), ("people", "'people'"), ("hour", "'hour'")]
+    )
+    def test_mistakes(self, name, fact):
+        env = made("fmugym/House-v0")
+        with pytest.raises(ConfigError, match=fact):
+            agent_of(env, network_for(env), external=[name])
+        env.close()
+
+    def test_hooks_by_hand_have_no_data(self):
+        env = Filtered()
+        with pytest.raises(ConfigError, match="task file"):
+            agent_of(env, network_for(env), external=["goal"])
+        env.close()
+
+
 class TestFiles:
     def test_measurements_and_actions_have_names_and_units(self, tmp_path):
         env = made("fmugym/House-v0")

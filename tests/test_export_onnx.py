@@ -86,6 +86,20 @@ class TestEpisodes:
         assert difference(env, network, path, 192, **known) <= 1e-5
         env.close()
 
+    def test_of_data_that_are_given(self, tmp_path):
+        env = made("House")
+        network = network_for(env)
+        agent = agent_of(env, network, external=["T_set"])
+        runner = Runner(write_onnx(agent, tmp_path / "agent.onnx"))
+        places = [i for i, one in enumerate(env.observation_names) if one.startswith("T_set")]
+        observation, _ = env.reset(seed=2)
+        runner.memory["clock"][:] = env.variables["clock"]
+        for _ in range(50):
+            actions = runner.step([[env.out["T_op"], env.out["T_w"], *observation[places]]])
+            observation, *_ = env.step(network.action(observation))
+            assert actions[0, 0] == pytest.approx(env.inputs[0], abs=1e-5)
+        env.close()
+
     def test_of_hooks_by_hand(self, tmp_path):
         env = Filtered()
         network = network_for(env)

@@ -144,7 +144,8 @@ class _Model:
             number = waiting.pop()
             if number not in closure and number not in self._names:
                 closure.add(number)
-                waiting.extend(self._graph.nodes[number].operands)
+                if number not in self._logic.loads:
+                    waiting.extend(self._graph.nodes[number].operands)
         for number in sorted(closure):
             self._names[number] = self._expression(number, self._graph.nodes[number])
 

@@ -44,6 +44,13 @@ def add_export(commands: Commands) -> None:
         help="also write inputs that no action changes, such as weather from data",
     )
     command.add_argument(
+        "--external",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="data of the task that the agent is given, instead of having them in tables",
+    )
+    command.add_argument(
         "--fmi", choices=FMI_VERSIONS, default="2.0", help="version of an FMU; default 2.0"
     )
     command.add_argument(
@@ -65,9 +72,8 @@ def _export(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{shown(str(output.parent))} is no folder")
     model, normalization = load_agent(arguments.agent, arguments.algorithm)
     with closing(maker_of(arguments.task)()) as env:
-        agent = agent_of(
-            env, model, normalization, name=output.stem, all_inputs=arguments.all_inputs
-        )
+        options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
+        agent = agent_of(env, model, normalization, name=output.stem, **options)
     files = _WRITERS[output.suffix](agent, output, arguments)
     _show(agent, files, arguments)
 
