@@ -349,6 +349,13 @@ class TestFiles:
         with pytest.raises(ConfigError, match="nowhere"):
             write_c(agent, tmp_path / "nowhere")
 
+    @pytest.mark.parametrize("name", ["math", "fmi2", "a-b", "ä", "2a", ""])
+    def test_names_that_are_none(self, name):
+        env = made("fmugym/CartPole-v0")
+        with pytest.raises(ConfigError, match="name"):
+            agent_of(env, network_for(env), name=name)
+        env.close()
+
     @pytest.mark.parametrize("bad", [np.nan, np.inf])
     def test_a_measurement_that_is_not_finite_changes_nothing(self, bad, tmp_path):
         env = heating("history")
