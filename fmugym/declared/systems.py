@@ -18,6 +18,7 @@ from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, shown, unknown_name
 from fmugym.systems import Component, Connection, FMUSystem
 from fmugym.systems.fmu import SystemFMU
+from fmugym.task.interface import structural_values
 
 __all__ = ["describe", "fmu_of", "system_of"]
 
@@ -154,9 +155,18 @@ def describe(task: Task, source: Path | FMUSystem) -> ModelDescription:
     entry = task.root.child("fmu")
     status = _status(entry, source)
     try:
-        return _read_description(source, status.st_mtime_ns, status.st_size)
+        description = _read_description(source, status.st_mtime_ns, status.st_size)
     except FMULoadError as error:
         raise type(error)(str(entry.error(error))) from error
+    return _resized(description, task.root.child("parameters"))
+
+
+def _resized(description: ModelDescription, parameters: Entry) -> ModelDescription:
+    """Give arrays the sizes that the task gives to structural parameters."""
+    given = parameters.value if isinstance(parameters.value, dict) else {}
+    with parameters.placing():
+        sizes = structural_values(description, given)
+        return description.resized(sizes) if sizes else description
 
 
 def _status(entry: Entry, path: Path) -> Any:

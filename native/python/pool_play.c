@@ -486,6 +486,19 @@ static bool take_starts_at_ends(PyPool *self, const Playing *playing, PyObject *
            take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n);
 }
 
+/* Takes memory that must have so many bytes, whatever its items are: that of arrays that the caller
+ * has just made. To tell their types, numpy would describe them in text, which takes as long as all
+ * other checks together. */
+static bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
+    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
+        return false;
+    }
+    if ((size_t)buffer->len != size) {
+        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
+    }
+    return (size_t)buffer->len == size;
+}
+
 /* The observations are one array that the pool fills itself, or those that the program stores. */
 static bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t) {
     const Settings *s = &self->pool.settings;
@@ -493,8 +506,8 @@ static bool take_observations(PyPool *self, const Playing *playing, PyObject *se
     if (playing->judgement.program.number_of_seen > 0 || PyTuple_Check(seen)) {
         return take_seen(&playing->judgement, seen, t->seen_buffers, t->seen);
     }
-    return take_matrix(seen, &t->buffers[SEEN], WRITTEN, "observations", ITEM_FLOAT32,
-                       (Py_ssize_t)s->count, (Py_ssize_t)s->num_observed);
+    return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
+                      s->count * s->num_observed * sizeof(float));
 }
 
 /* Whether the items of a buffer are of the kind that a letter stands for: d for floats, q for
@@ -532,16 +545,16 @@ static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn
 }
 
 static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
+    const size_t n = self->pool.settings.count;
     Py_buffer *b = t->buffers;
 
     return take_given_actions(playing, args[ACTIONS], t) &&
            take_observations(self, playing, args[SEEN], t) &&
-           take_vector(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, n) &&
-           take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
-           take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
-           take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)playing->play.draws->count, n) &&
+           take_bytes(args[REWARDS], &b[REWARDS], PyBUF_WRITABLE, n * sizeof(double)) &&
+           take_bytes(args[TERMINATED], &b[TERMINATED], PyBUF_WRITABLE, n) &&
+           take_bytes(args[TRUNCATED], &b[TRUNCATED], PyBUF_WRITABLE, n) &&
+           take_bytes(args[DRAWN], &b[DRAWN], PyBUF_WRITABLE,
+                      playing->play.draws->count * n * sizeof(double)) &&
            take_starts_at_ends(self, playing, args[LAST], args[STARTED], t);
 }
 
@@ -690,17 +703,6 @@ static void do_rollout(PyPool *self, bool alone, void *context) {
         t->troubled =
             pool_rollout(&self->pool, &t->call, r->horizon, r->left_out, &t->ends.outside);
     }
-}
-
-/* Takes memory that must have so many bytes, whatever its items are. */
-static bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
-    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
-        return false;
-    }
-    if ((size_t)buffer->len != size) {
-        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
-    }
-    return (size_t)buffer->len == size;
 }
 
 static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObject *seen,
