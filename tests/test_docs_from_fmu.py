@@ -75,7 +75,7 @@ def test_its_commands_run(tmp_path, monkeypatch, capsys):
     assert "<html" in Path("frost.html").read_text(encoding="utf-8")[:500].lower()
 
 
-MEASURED = re.compile(r"takes|first meeting|this machine|recommended for a training")
+MEASURED = re.compile(r"takes|first meeting|this machine|episodes begin|recommended for a training")
 """Lines with times of this machine, or what earlier runs have shown on it."""
 
 
