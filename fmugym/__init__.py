@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fmugym.linearization import LinearModel, linearize
     from fmugym.pool import Backend, Paced
     from fmugym.recording import Recorder, Recording, replay
+    from fmugym.systems import Component, Connection, FMUSystem
     from fmugym.task.snapshot import Snapshot
     from fmugym.vector import FMUVectorEnv
     from fmugym.vector.sensitivities import derivatives
@@ -41,7 +42,9 @@ __all__ = [
     "ArchiveLimits",
     "Backend",
     "Choice",
+    "Component",
     "ConfigError",
+    "Connection",
     "ContractError",
     "EnvConfig",
     "FMI1CSEnv",
@@ -53,6 +56,7 @@ __all__ = [
     "FMUEnv",
     "FMUGymError",
     "FMULoadError",
+    "FMUSystem",
     "FMUVectorEnv",
     "LicenceError",
     "LinearModel",
@@ -96,6 +100,7 @@ _MODULES = {
     "fmi.status": ["Status"],
     "pool": ["Backend", "Paced"],
     "recording": ["Recorder", "Recording", "replay"],
+    "systems": ["Component", "Connection", "FMUSystem"],
     "task.snapshot": ["Snapshot"],
     "linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
@@ -105,7 +110,7 @@ _MODULES = {
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),
     *("errors", "fmi", "identification", "lab", "pool", "registration", "rendering", "sb3"),
-    *("single", "task", "testing", "tools", "trial", "vector"),
+    *("single", "systems", "task", "testing", "tools", "trial", "vector"),
 ]
 """Modules and packages that ``fmugym.name`` imports."""
 

@@ -20,6 +20,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
+from fmugym.systems import FMUSystem
 from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode, EpisodePlan
@@ -72,7 +73,8 @@ class FMUEnv(Constructed):
     the action space.
 
     Args:
-        fmu_path: The FMU; a relative path is relative to the file of the class.
+        fmu_path: The FMU, or a system: the path of an ``.ssp`` file, or an ``FMUSystem``. A
+            relative path is relative to the file of the class.
         config: See ``EnvConfig``.
         log_level: Level of this class's logger, which gets the FMU's messages.
         render_mode: One of the class's ``metadata["render_modes"]``, or None. For another mode of
@@ -133,7 +135,7 @@ class FMUEnv(Constructed):
 
     def __init__(
         self,
-        fmu_path: str | os.PathLike[str],
+        fmu_path: str | os.PathLike[str] | FMUSystem,
         config: Mapping[str, Any] | EnvConfig,
         log_level: int = logging.WARNING,
         *,

@@ -37,7 +37,16 @@ from fmugym.task.snapshot import require_scope
 
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
 
-__all__ = ["Recorder", "Recording", "Report", "replay", "surroundings"]
+__all__ = [
+    "FACTS",
+    "Recorder",
+    "Recording",
+    "Report",
+    "element_from",
+    "flat_element",
+    "replay",
+    "surroundings",
+]
 
 _VERSION: Final = 1
 
@@ -90,7 +99,7 @@ class Recording:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the recording to a file, in the format ``npz`` of numpy."""
         fields = {name: getattr(self, name) for name in _ARRAYS}
-        header = {name: getattr(self, name) for name in _FACTS}
+        header = {name: getattr(self, name) for name in FACTS}
         text = json.dumps({"version": _VERSION, **header}).encode()
         with Path(path).open("wb") as file:
             np.savez_compressed(file, header=np.frombuffer(text, np.uint8), **fields)
@@ -109,14 +118,16 @@ class Recording:
             if header.pop("version") != _VERSION:
                 raise ValueError("it is of another version of the format")
             header["stream"] = tuple(header["stream"])
-            return cls(**{name: header[name] for name in _FACTS}, **arrays)
+            return cls(**{name: header[name] for name in FACTS}, **arrays)
         except Exception as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"{shown(str(path))} is no recording of an episode: {error}"
             ) from None
 
 
-_FACTS: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
+FACTS: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
+"""What a recording holds besides arrays."""
+
 _ARRAYS: Final = ("actions", "observations", "rewards", "terminated", "truncated")
 
 
@@ -150,7 +161,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._inner._np_random, self._inner._np_random_seed = np_random(seed)
         stream = _stream_of(self._inner)
         observation, info = self.env.reset(options=options)
-        first = _flat(self.env.observation_space, observation)
+        first = flat_element(self.env.observation_space, observation)
         self._start = {"seed": seed, "stream": stream, "options": text, "first": first}
         self._start["drawn"] = {name: float(value) for name, value in info["drawn"].items()}
         self._rows = []
@@ -158,9 +169,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Do a step, and record it; see ``FMUEnv.step``."""
-        flat = np.array(_flat(self.env.action_space, action))
+        flat = np.array(flat_element(self.env.action_space, action))
         observation, reward, terminated, truncated, info = self.env.step(action)
-        seen = _flat(self.env.observation_space, observation)
+        seen = flat_element(self.env.observation_space, observation)
         self._rows.append((flat, seen, float(reward), bool(terminated), bool(truncated)))
         return observation, reward, terminated, truncated, info
 
@@ -233,7 +244,9 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
     inner.np_random = generator
     observation, info = env.reset(options=json.loads(recording.options))
     drawn = {name: float(value) for name, value in info["drawn"].items()}
-    found = _difference_of_starts(recording, drawn, _flat(env.observation_space, observation))
+    found = _difference_of_starts(
+        recording, drawn, flat_element(env.observation_space, observation)
+    )
     steps = 0
     while not found and steps < len(recording):
         found = _difference_of_step(recording, env, steps)
@@ -251,9 +264,9 @@ def _difference_of_starts(
 
 
 def _difference_of_step(recording: Recording, env: gymnasium.Env[Any, Any], step: int) -> str:
-    action = _unflat(env.action_space, recording.actions[step])
+    action = element_from(env.action_space, recording.actions[step])
     observation, reward, terminated, truncated, _ = env.step(action)
-    seen, when = _flat(env.observation_space, observation), f"step {step + 1}: the "
+    seen, when = flat_element(env.observation_space, observation), f"step {step + 1}: the "
     return (
         _difference(f"{when}observation", seen, recording.observations[step + 1])
         or _difference(f"{when}reward", np.float64(reward), recording.rewards[step])
@@ -298,14 +311,15 @@ def _as_json(options: Any) -> str:
         raise ConfigError(f"the options of reset cannot be recorded: {error}") from None
 
 
-def _flat(space: gymnasium.Space[Any], value: Any) -> npt.NDArray[Any]:
+def flat_element(space: gymnasium.Space[Any], value: Any) -> npt.NDArray[Any]:
     """An element of a space as an array of its own type."""
     if isinstance(value, Mapping | tuple):
         return np.asarray(flatten(space, value))
     return np.array(value)
 
 
-def _unflat(space: gymnasium.Space[Any], values: npt.NDArray[Any]) -> Any:
+def element_from(space: gymnasium.Space[Any], values: npt.NDArray[Any]) -> Any:
+    """The element of a space that ``flat_element`` has made an array of."""
     composed = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
     if composed:
         return unflatten(space, values)

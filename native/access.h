@@ -72,6 +72,11 @@ const char *listing_take(Listing *listing, const char *types, size_t count, cons
 bool access_open(Access *access, const Fmi *fmi, const Listing *listing);
 void access_close(Access *access);
 
+/* Whether the variables are scalars of type double, each in its place. */
+static inline bool access_is_plain(const Access *access) {
+    return access->direct && access->groups[0].count == access->groups[0].size;
+}
+
 /* Both functions use typed as scratch memory for width doubles and return the worst
  * status. They stop after the first type whose status is worse than a warning. They restore the
  * floating-point environment after each call into the FMU. */

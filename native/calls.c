@@ -61,9 +61,10 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     return troubled;
 }
 
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside) {
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside) {
     const size_t runs = (pool->settings.count + RUN - 1) / RUN;
-    Task task = {.pool = pool, .call = call, .operation = ROLLOUT, .horizon = horizon};
+    Task task = {.pool = pool, .call = call, .operation = ROLLOUT, .horizon = horizon,
+                 .left_out = left_out};
     const size_t troubled = schedule_run(&task, runs);
 
     *outside = atomic_get(&task.outside) != 0;

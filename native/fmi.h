@@ -56,6 +56,10 @@ typedef struct {
     double tolerance;
     bool has_stop_time;
     bool has_tolerance;
+    /* FMI 3.0: the structural parameters that get other values than their start values. */
+    size_t number_of_structural;
+    const char *structural_references; /* 32-bit integers, not aligned */
+    const char *structural_values;     /* 64-bit integers, not aligned */
 } Experiment;
 
 /* Callbacks for initialization; each returns a status. */
@@ -82,7 +86,6 @@ typedef struct {
  * after. places gives the row of each instance in the inputs and outputs. */
 typedef struct {
     const uint32_t *input_references, *output_references;
-    size_t number_of_input_references, number_of_output_references;
     size_t number_of_inputs, number_of_outputs;
     double step;
     bool no_return; /* see do_step */
@@ -115,7 +118,7 @@ typedef struct Fmi {
     /* no_return promises that no state from before this time will be restored. */
     Status (*do_step)(const Library *library, void *component, double time, double step,
                       bool no_return);
-    /* Does steps whose inputs and outputs are all FLOAT64. Each version implements it with
+    /* Does steps whose inputs and outputs are all scalars of type FLOAT64. Each version implements it with
      * exchange_by. Returns whether all steps are OK. */
     bool (*exchange)(const Library *library, const Exchange *exchange);
     /* size is the number of values; in FMI 3.0 a value reference may be that of an array. */
@@ -147,9 +150,15 @@ typedef struct Fmi {
 } Fmi;
 
 /* How an FMU is run. fmugym/pool/settings.py has the same numbers. */
-typedef enum { CO_SIMULATION_ALONE, MODEL_EXCHANGE_SOLVED, CO_SIMULATION_WITH_EVENTS } Manner;
+typedef enum {
+    CO_SIMULATION_ALONE,
+    MODEL_EXCHANGE_SOLVED,
+    CO_SIMULATION_WITH_EVENTS,
+    CO_SIMULATION_WITH_RAMPS,
+    NUMBER_OF_MANNERS
+} Manner;
 
-extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
+extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3, ramped1, ramped2;
 /* Of systems. */
 extern const Fmi composite;
 
@@ -169,15 +178,14 @@ static inline Outcome exchange_once(const Fmi *fmi, const Library *library, cons
     Outcome outcome = {.stage = SETTING_INPUTS};
 
     outcome.status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
-                              e->number_of_input_references, inputs, e->number_of_inputs);
+                              e->number_of_inputs, inputs, e->number_of_inputs);
     if (outcome.status <= STATUS_WARNING) {
         outcome.stage = DOING_STEP;
         outcome.status = fmi->do_step(library, component, e->times[index], e->step, e->no_return);
     }
     if (has_outputs(outcome)) {
         const Status got = fmi->get(library, component, TYPE_FLOAT64, e->output_references,
-                                    e->number_of_output_references, outputs,
-                                    e->number_of_outputs);
+                                    e->number_of_outputs, outputs, e->number_of_outputs);
         outcome = got > STATUS_WARNING ? (Outcome){got, READING_OUTPUTS} : outcome;
     }
     return outcome;

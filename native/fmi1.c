@@ -38,6 +38,7 @@ static const Binding bindings[] = {
     ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),
     ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
     {"SetString", offsetof(Functions, older.set_string), false},
+    {"SetRealInputDerivatives", offsetof(Functions, older.set_derivatives), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {

@@ -10,6 +10,7 @@ static const Binding bindings[] = {
     {"DoStep", offsetof(Functions, do_step), true},
     {"GetBooleanStatus", offsetof(Functions, get_boolean_status), false},
     {"GetRealStatus", offsetof(Functions, get_real_status), false},
+    {"SetRealInputDerivatives", offsetof(Functions, older.set_derivatives), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {

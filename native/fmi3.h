@@ -4,6 +4,7 @@
 #define FMUGYM_FMI3_H
 
 #include <stdlib.h>
+#include <string.h>
 
 #include "fmi.h"
 #include "log.h"
@@ -27,6 +28,8 @@ typedef struct {
     int (*enter_initialization)(void *instance, bool has_tolerance, double tolerance,
                                 double start_time, bool has_stop_time, double stop_time);
     int (*exit_initialization)(void *instance);
+    int (*enter_configuration)(void *instance);
+    int (*exit_configuration)(void *instance);
     Get3 *get[NUMBER_OF_TYPES];
     Set3 *set[NUMBER_OF_TYPES];
     int (*set_string)(void *instance, const uint32_t *references, size_t number_of_references,
@@ -75,6 +78,8 @@ typedef struct {
     {"FreeInstance", offsetof(Functions, common.free_instance), true},                             \
     {"EnterInitializationMode", offsetof(Functions, enter_initialization), true},                  \
     {"ExitInitializationMode", offsetof(Functions, exit_initialization), true},                    \
+    {"EnterConfigurationMode", offsetof(Functions, enter_configuration), false},                   \
+    {"ExitConfigurationMode", offsetof(Functions, exit_configuration), false},                     \
     {"Terminate", offsetof(Functions, common.terminate), false},                                   \
     {"Reset", offsetof(Functions, common.reset), false},                                           \
     VALUES("Float64", TYPE_FLOAT64),                                                               \
@@ -112,12 +117,36 @@ static inline Status choose_messages(const Library *library, void *instance,
                : sane(f->set_debug_logging(instance, count > 0, count, categories));
 }
 
+/* Sets structural parameters, by which arrays get their sizes. */
+static inline Status configure(const Functions *f, void *instance, const Experiment *e) {
+    Set3 *set = f->set[TYPE_UINT64];
+    Status status = f->enter_configuration == NULL || f->exit_configuration == NULL || set == NULL
+                        ? STATUS_ERROR
+                        : sane(f->enter_configuration(instance));
+
+    for (size_t i = 0; i < e->number_of_structural && status <= STATUS_WARNING; i++) {
+        uint32_t reference;
+        uint64_t value;
+        memcpy(&reference, e->structural_references + i * sizeof reference, sizeof reference);
+        memcpy(&value, e->structural_values + i * sizeof value, sizeof value);
+        status = sane(set(instance, &reference, 1, &value, 1));
+    }
+    return status > STATUS_WARNING ? status : sane(f->exit_configuration(instance));
+}
+
 static inline Status initialize(const Library *library, void *instance,
                                 const Experiment *e, StartValues start_values, const char **doing) {
     const Functions *f = functions_of(library);
+    Status status = STATUS_OK;
 
-    *doing = "setting the start values";
-    Status status = start_values.set(start_values.context);
+    if (e->number_of_structural > 0) {
+        *doing = "setting the structural parameters";
+        status = configure(f, instance, e);
+    }
+    if (status <= STATUS_WARNING) {
+        *doing = "setting the start values";
+        status = start_values.set(start_values.context);
+    }
     if (status <= STATUS_WARNING) {
         *doing = "entering initialization";
         status = sane(f->enter_initialization(instance, e->has_tolerance, e->tolerance,

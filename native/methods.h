@@ -41,6 +41,9 @@ typedef struct Solving {
     const Clock *clocks;
     const Clocked *clocked;
     size_t number_of_clocks, number_of_clocked;
+    const uint32_t *ramped_references; /* inputs that change linearly */
+    size_t number_of_ramps;
+    double ramp_duration;
 } Solving;
 
 #endif

@@ -118,8 +118,8 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     pool->step_size = settings->time_step / (double)settings->substeps;
     pool->no_return = !settings->restores && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 &&
-                   settings->sampling == NULL && settings->inputs->direct &&
-                   settings->outputs->direct;
+                   settings->sampling == NULL && access_is_plain(settings->inputs) &&
+                   access_is_plain(settings->outputs);
     pool->open = true;
     pool->floats = floats_now();
     link_pool(pool);

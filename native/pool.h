@@ -296,7 +296,7 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends);
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
 /* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside);
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside);
 
 /* A serialized FMU state after initialization. */
 typedef struct {

@@ -90,10 +90,13 @@ static void leave_out(Position *p, size_t first, size_t count) {
 
 static size_t roll_out(Position *p, const Task *task, size_t first, size_t count,
                        Scratch scratch) {
-    uint8_t over[RUN] = {0};
+    uint8_t over[RUN];
     size_t troubled = 0;
 
     begin_at_first_step(p, task);
+    for (size_t j = 0; j < count; j++) {
+        over[j] = is_in(task->left_out, first + j);
+    }
     for (size_t step = 0; step < task->horizon && troubled == 0; step++) {
         if (memchr(over, 0, count) == NULL) {
             leave_out(p, first, count);

@@ -250,8 +250,6 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
     const Exchange e = {
         .input_references = in->groups[0].references,
         .output_references = out->groups[0].references,
-        .number_of_input_references = in->groups[0].count,
-        .number_of_output_references = out->groups[0].count,
         .number_of_inputs = in->count,
         .number_of_outputs = out->count,
         .step = pool->step_size,

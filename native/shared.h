@@ -29,6 +29,8 @@ typedef struct {
     Set *set[NUMBER_OF_TYPES];
     int (*set_string)(void *component, const uint32_t *references, size_t count,
                       const char *const *values);
+    int (*set_derivatives)(void *component, const uint32_t *references, size_t count,
+                           const int *orders, const double *values);
 } Older;
 
 #define COUNT_OF(array) (sizeof(array) / sizeof *(array))

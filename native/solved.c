@@ -8,7 +8,7 @@
  * need no event. */
 typedef struct {
     const uint32_t *references;
-    size_t size, room;
+    size_t count, size, room; /* the sizes in bytes */
     char *bytes;
 } LastSet;
 
@@ -21,12 +21,8 @@ typedef struct {
 typedef struct {
     void *state; /* of the FMU */
     Memory memory;
-    Ticks ticks[]; /* one for each clock */
+    char kept[]; /* ticks and ramps */
 } SolvedState;
-
-static size_t size_of_ticks(const Solver *me) {
-    return me->solving->number_of_clocks * sizeof(Ticks);
-}
 
 static const Fmi *fmi_of(const Solver *me) {
     return me->model->fmi;
@@ -44,7 +40,7 @@ static void forget_last(Solved *me) {
 
 static void forget(Solved *me) {
     memset(&me->solver.memory, 0, sizeof me->solver.memory);
-    memset(me->solver.ticks, 0, size_of_ticks(&me->solver));
+    memset(me->solver.kept, 0, solver_kept_size(&me->solver));
     me->solver.memory.next_event = INFINITY;
     me->solver.stale = true;
     forget_last(me);
@@ -121,6 +117,11 @@ Status solved_initialize(const Library *library, void *component, const Experime
     if (!good(status)) {
         return status;
     }
+    if (me->model->update == NULL) {
+        *doing = "reading the inputs";
+        me->memory.mode = IN_CONTINUOUS_TIME;
+        return ramps_begin(me);
+    }
     *doing = "the initial event";
     me->memory.mode = IN_EVENTS;
     return solver_settle(me);
@@ -156,8 +157,8 @@ static size_t size_of(const Fmi *fmi, Type type) {
 }
 
 /* Notes values; returns whether they are the same as those noted before. */
-static bool is_repeated(LastSet *last, const uint32_t *references, const void *values,
-                        size_t size) {
+static bool is_repeated(LastSet *last, const uint32_t *references, size_t count,
+                        const void *values, size_t size) {
     if (last->references == references && last->size == size &&
         memcmp(last->bytes, values, size) == 0) {
         return true;
@@ -169,21 +170,25 @@ static bool is_repeated(LastSet *last, const uint32_t *references, const void *v
     }
     last->references = last->room < size ? NULL : references;
     last->size = size;
+    last->count = count;
     if (last->references != NULL) {
         memcpy(last->bytes, values, size);
     }
     return false;
 }
 
-/* Sets some of the values that were last set, all of them scalars: those of inputs with this clock, or, if there is no
- * such clock, those of inputs without clocks. */
+/* Sets some of the values that were last set, all of them scalars: those of inputs with this clock,
+ * or, if there is no such clock, those of inputs without clocks. */
 static Status set_one_by_one(Solved *me, Type type, size_t clock) {
     const Solving *s = me->solver.solving;
     const Fmi *fmi = fmi_of(&me->solver);
     const LastSet *last = &me->last[type];
-    const size_t size = size_of(fmi, type), count = last->references == NULL ? 0 : last->size / size;
+    const size_t size = size_of(fmi, type), count = last->references == NULL ? 0 : last->count;
     Status status = STATUS_OK;
 
+    if (count > 0 && last->size != count * size) {
+        return solver_fail(&me->solver, "arrays cannot be set together with inputs that have clocks");
+    }
     for (size_t i = 0; i < count && good(status); i++) {
         bool due = clock == SIZE_MAX && !clocks_own(&me->solver, last->references[i]);
         for (size_t j = 0; j < s->number_of_clocked; j++) {
@@ -218,6 +223,25 @@ static Status set_clocks(Solver *me, const uint32_t *references, size_t count,
     return any && me->memory.mode == IN_CONTINUOUS_TIME ? solver_enter_events(me) : STATUS_OK;
 }
 
+/* Sets what has no ramp, and lets the others aim at their values. */
+static Status set_beside_ramps(Solver *me, Type type, const uint32_t *references, size_t count,
+                               const void *values) {
+    const Fmi *fmi = fmi_of(me);
+    const size_t size = size_of(fmi, type);
+    Status status = STATUS_OK;
+
+    if (type == TYPE_FLOAT64) {
+        ramps_aim(me, references, count, values);
+    }
+    for (size_t i = 0; i < count && good(status); i++) {
+        if (type != TYPE_FLOAT64 || !ramps_own(me, references[i])) {
+            status = fmi->set(me->library, me->component, type, &references[i], 1,
+                              (const char *)values + i * size, 1);
+        }
+    }
+    return status;
+}
+
 /* New values of inputs and parameters are an event: they may jump. */
 Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
                   size_t count, const void *values, size_t size) {
@@ -228,8 +252,11 @@ Status solved_set(const Library *library, void *component, Type type, const uint
     if (type == TYPE_CLOCK) {
         return set_clocks(&me->solver, references, count, values);
     }
+    if (me->solver.model->update == NULL && me->solver.memory.mode != BEFORE_EVENTS) {
+        return set_beside_ramps(&me->solver, type, references, count, values);
+    }
     if (me->solver.memory.mode != BEFORE_EVENTS) {
-        if (is_repeated(&me->last[type], references, values, size * size_of(fmi, type))) {
+        if (is_repeated(&me->last[type], references, count, values, size * size_of(fmi, type))) {
             return STATUS_OK;
         }
         if (me->solver.memory.mode == IN_CONTINUOUS_TIME) {
@@ -277,7 +304,7 @@ Status solved_get_state(const Library *library, void *component, void **state) {
     const Status status = fmi_of(me)->get_state(library, me->component, &inner);
 
     if (old == NULL || old->state != inner) {
-        saved = malloc(sizeof *saved + size_of_ticks(me));
+        saved = malloc(sizeof *saved + solver_kept_size(me));
         free(saved == NULL ? NULL : old);
     }
     if (saved == NULL) {
@@ -285,7 +312,7 @@ Status solved_get_state(const Library *library, void *component, void **state) {
     }
     saved->state = inner;
     saved->memory = me->memory;
-    memcpy(saved->ticks, me->ticks, size_of_ticks(me));
+    memcpy(saved->kept, me->kept, solver_kept_size(me));
     *state = saved;
     if (!good(status) && inner == NULL) {
         free(saved);
@@ -300,7 +327,7 @@ Status solved_set_state(const Library *library, void *component, void *state) {
 
     forget(component);
     me->memory = saved->memory;
-    memcpy(me->ticks, saved->ticks, size_of_ticks(me));
+    memcpy(me->kept, saved->kept, solver_kept_size(me));
     return fmi_of(me)->set_state(library, me->component, saved->state);
 }
 
@@ -316,7 +343,7 @@ Status solved_free_state(const Library *library, void *component, void **state) 
 
 /* Of what is serialized beside the FMU's state. */
 static size_t size_of_memory(const Solver *me) {
-    return sizeof(Memory) + size_of_ticks(me);
+    return sizeof(Memory) + solver_kept_size(me);
 }
 
 size_t solved_state_size(const Library *library, void *component, void *state) {
@@ -333,7 +360,7 @@ Status solved_serialize(const Library *library, void *component, void *state, ch
 
     const size_t own = size_of_memory(me);
     memcpy(bytes, &saved->memory, sizeof(Memory));
-    memcpy(bytes + sizeof(Memory), saved->ticks, size_of_ticks(me));
+    memcpy(bytes + sizeof(Memory), saved->kept, solver_kept_size(me));
     return fmi_of(me)->serialize(library, me->component, saved->state, bytes + own, size - own);
 }
 
@@ -341,13 +368,13 @@ Status solved_deserialize(const Library *library, void *component, const char *b
                           void **state) {
     const Solver *me = component;
     const size_t own = size_of_memory(me);
-    SolvedState *saved = size < own ? NULL : calloc(1, sizeof *saved + size_of_ticks(me));
+    SolvedState *saved = size < own ? NULL : calloc(1, sizeof *saved + solver_kept_size(me));
 
     if (saved == NULL) {
         return STATUS_ERROR;
     }
     memcpy(&saved->memory, bytes, sizeof(Memory));
-    memcpy(saved->ticks, bytes + sizeof(Memory), size_of_ticks(me));
+    memcpy(saved->kept, bytes + sizeof(Memory), solver_kept_size(me));
     const Status status = fmi_of(me)->deserialize(library, me->component, bytes + own, size - own,
                                                   &saved->state);
     *state = saved;

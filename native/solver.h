@@ -1,5 +1,6 @@
 /* Model exchange: the pool integrates the FMU's equations and handles its events. In co-simulation
- * with event mode the FMU does its steps, and the pool handles the events between them.
+ * with event mode the FMU does its steps, and the pool handles the events between them; with ramps
+ * it only sets the inputs between them.
  *
  * Everything above sees an instance that can do steps, as in co-simulation: solved.h. */
 
@@ -8,6 +9,7 @@
 
 #include "fmi.h"
 #include "methods.h"
+#include "ramps.h"
 
 /* What the FMU tells after one update of its discrete states. */
 typedef struct {
@@ -33,6 +35,7 @@ typedef struct {
 typedef struct Model {
     const Fmi *fmi;   /* of the FMU itself */
     size_t equations; /* where they are in the library's table of functions */
+    /* NULL if there is no event mode. */
     Status (*update)(const Library *library, void *component, Events *events);
     /* Tells the FMU that a step is complete. It may want an event, or to stop. */
     Status (*complete)(const Library *library, void *component, bool *event, bool *terminate);
@@ -70,6 +73,7 @@ typedef struct Solver {
     const Floats *floats;
     uint64_t environment; /* for messages */
     Memory memory;
+    bool is_there;         /* whether the FMU is at the time of the memory and at x */
     bool stale;            /* whether x and the nominal values must be read */
     bool knows_rates;      /* whether rates are those at x */
     bool knows_indicators; /* whether z are those at x */
@@ -86,9 +90,14 @@ typedef struct Solver {
     double *stages;     /* n for each stage of the method */
     double *jacobian, *matrix, *slope; /* for methods that need them */
     uint32_t *pivots;
+    char *kept;   /* the memory of ticks and ramps, which is saved with the state */
     Ticks *ticks; /* one for each clock */
+    Ramp *ramps;
     bool *active; /* whether each clock ticks in this event, or is to tick in the next one */
 } Solver;
+
+/* Of the memory of ticks and ramps. */
+size_t solver_kept_size(const Solver *me);
 
 /* Allocates the arrays. Returns whether there was enough memory. */
 bool solver_open(Solver *me);

@@ -3,13 +3,14 @@
 import json
 import logging
 from contextlib import closing
+from functools import partial
 
-import building
 import exchange_tools
 import fmpy
 import fmu_tools
 import numpy as np
 import pytest
+from source_tools import BOTH, build_description, write_source_fmu
 
 from fmugym import FMU, ConfigError, FMULoadError
 from fmugym.pool import PoolSpec
@@ -18,56 +19,11 @@ from fmugym.tools.cli import main
 from fmugym.tools.compiling import compile_fmu
 from fmugym.trial import opening
 
-FILES = ("core.c", "usual.c", "dahlquist.c")
-BOTH = ("CoSimulation", "ModelExchange")
-
-
-def sources(version):
-    """The source code of a model, by its place in the FMU."""
-    folder = building.HERE / "exchange"
-    names = (*FILES, f"fmi{version}.c", "exchange.h")
-    found = {f"sources/code/{name}": (folder / name).read_bytes() for name in names}
-    stubs = fmu_tools.stubs(version, f"fmi{version}", folder / f"fmi{version}.c")
-    return found | {"sources/headers/stubs.h": stubs.encode()}
-
-
-def build_description(version, **changes):
-    names = [f"code/{name}" for name in (*FILES, f"fmi{version}.c")]
-    attributes = {"modelIdentifier": "Model", "language": "C99"} | changes
-    return f"""<fmiBuildDescription fmiVersion="3.0">
-      <BuildConfiguration modelIdentifier="Other"/>
-      <BuildConfiguration modelIdentifier="{attributes["modelIdentifier"]}">
-        <SourceFileSet language="{attributes["language"]}">
-          {"".join(f'<SourceFile name="{name}"/>' for name in names)}
-          <PreprocessorDefinition name="STUBS" value="&quot;stubs.h&quot;"/>
-          <PreprocessorDefinition name="FMI_VERSION" value="{version}"/>
-          <PreprocessorDefinition name="BROKEN" optional="true" value="x"/>
-          <IncludeDirectory name="headers"/>
-        </SourceFileSet>
-        <Library name="m"/>
-      </BuildConfiguration>
-    </fmiBuildDescription>"""
-
 
 @pytest.fixture
 def source_fmu(tmp_path):
     """Make an FMU without a library."""
-
-    def make(version=3, add=None, described=True):
-        files = sources(version)
-        xml = exchange_tools.describe("dahlquist", version, BOTH)
-        if described:
-            files["sources/buildDescription.xml"] = build_description(version).encode()
-        else:
-            names = (*(f"code/{name}" for name in FILES), "code/shim.c")
-            text = '#define FMI_VERSION 2\n#define STUBS "../headers/stubs.h"\n#include "fmi2.c"\n'
-            files["sources/code/shim.c"] = text.encode()
-            listing = "".join(f'<File name="{name}"/>' for name in names)
-            xml = xml.replace("/><", f"><SourceFiles>{listing}</SourceFiles></CoSimulation><", 1)
-        files["modelDescription.xml"] = xml
-        return fmu_tools.write_fmu(tmp_path / "with sources.fmu", files | (add or {}))
-
-    return make
+    return partial(write_source_fmu, tmp_path / "with sources.fmu")
 
 
 def simulated(path, interface):

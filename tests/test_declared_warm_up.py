@@ -99,6 +99,23 @@ def test_a_schedule_acts_by_the_clock():
     later.close()
 
 
+@pytest.mark.parametrize("name", ["thermostat", "hysteresis"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"agent": {"observations": ["T", "T_set", "T_out"]}},
+        {"setpoints": {"T_set": {"schedule": {"06:00": 21, "22:00": 18}, "of": "T"}}},
+    ],
+)
+def test_a_thermostat_whose_arguments_the_task_tells(name, change):
+    full = "hysteresis of=T setpoint=T_set band=0 below=1 above=0"
+    env, same = fmugym.load(house(name, **change)), fmugym.load(house(full, **change))
+    assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
+    assert env._values == same._values
+    env.close()
+    same.close()
+
+
 def test_named_controllers_and_constants():
     named = house("thermostat", controllers={"thermostat": THERMOSTAT, "half": 0.5})
     for task, controller in ((named, THERMOSTAT), (house(0.5), "schedule 00:00=0.5")):
@@ -157,6 +174,41 @@ def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
         ended = results[0][2]
     for env in (envs, *singles):
         env.close()
+
+
+@pytest.mark.parametrize("controller", [PID, THERMOSTAT, "schedule 05:00=0.7 21:00=0.3", 0.5])
+@pytest.mark.parametrize("kind", ACTIONS)
+def test_the_pass_of_the_pool_equals_python(kind, controller, monkeypatch):
+    agent, action = ACTIONS[kind]
+    noisy = {"T": HOUSE["variables"]["T"] | {"noise": 0.1, "bias": 0.2}}
+    task = house(controller, agent, action, clock=CLOCKS)
+    task["variables"] = task["variables"] | noisy
+    told = []
+    for steps in (10**9, 0):
+        monkeypatch.setattr(warm_ups, "STEPS_BEFORE", steps)
+        envs = FMUVectorEnv(partial(fmugym.load, task), 3, autoreset_mode="disabled")
+        env = fmugym.load(task)
+        seen = [envs.reset(seed=2)[0].tolist(), env.reset(seed=2)[0].tolist()]
+        envs.action_space.seed(1)
+        for mask in ([True, False, True], [False, True, False]):
+            observations = envs.step(envs.action_space.sample()).observations
+            before = envs.call("inputs")
+            options = {"reset_mask": np.array(mask)}
+            seen += [observations.tolist(), envs.reset(options=options)[0].tolist()]
+            kept = [one for one, has_begun in zip(before, mask, strict=True) if not has_begun]
+            assert kept == [o for o, m in zip(envs.call("inputs"), mask, strict=True) if not m]
+            seen += [envs._pool.outputs.tolist(), env.reset()[0].tolist(), env._values, env.inputs]
+        assert (envs._engine.env._warm_ups._in_pass is None) == (steps > 0)
+        assert (env._warm_ups._in_pass is None) == (steps > 0)
+        told.append(seen)
+        envs.close()
+        env.close()
+    assert told[0] == told[1]
+
+
+def test_a_fault_in_the_pass_is_an_error(monkeypatch):
+    monkeypatch.setattr(warm_ups, "STEPS_BEFORE", 0)
+    test_a_fault_in_it_is_an_error()
 
 
 def test_histories_hold_what_was_before_the_episode():
@@ -312,7 +364,8 @@ class TestCache:
         ({"period": "1d", "controler": 0}, "'controller'"),
         ({"period": "40min", "controller": 0}, "2400 s"),
         ({"period": "1d", "controller": "thermostt"}, "thermostat"),
-        ({"period": "1d", "controller": "pid of=T"}, "'setpoint'"),
+        ({"period": "1d", "controller": "pid of=T"}, "'setpoint'.*pid of=T setpoint=21 kp="),
+        ({"period": "1d", "controller": "hysteresis"}, "'of'.*of=T setpoint=T_set band=.*below=1"),
         ({"period": "1d", "controller": "pid of=TT setpoint=1 kp=1"}, "'T'"),
         ({"period": "1d", "controller": "hysteresis of=T setpoint=T_sot band=1"}, "'T_set'"),
         ({"period": "1d", "controller": {"v": 0}}, "'u'"),

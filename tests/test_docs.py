@@ -30,6 +30,7 @@ CLASS_ATTRIBUTES = {"metadata", "render_size", "reset_options", "steps_after_end
 EXTRAS = {
     "deploy.md": "torch",
     "stable-baselines3.md": "stable_baselines3",
+    "datasets.md": "minari",
     "train-rllib.md": "ray.rllib",
     "train-torchrl.md": "torchrl",
 }  # what a document's Python needs
@@ -74,7 +75,9 @@ def test_python_runs(document, tmp_path):
     script = tmp_path / f"{document.stem}.py"
     script.write_text(program(document))
     warnings = (
-        "ignore" if document.name in {"train-rllib.md", "train-torchrl.md"} else "error"
+        "ignore"
+        if document.name in {"datasets.md", "train-rllib.md", "train-torchrl.md"}
+        else "error"
     )  # those of TorchRL itself
     command = [sys.executable, "-W", warnings, script.name]
     done = subprocess.run(

@@ -1,13 +1,24 @@
 """Exported agents do what the originals do: in C, in a loop with the plant."""
 
+import ctypes
+
 import gymnasium
 import numpy as np
 import pytest
-from export_tools import COMPILERS, compiled, network_for, plant_of
+from export_tools import (
+    COMPILERS,
+    FUNCTIONS,
+    arguments_of,
+    built,
+    compiled,
+    network_for,
+    plant_of,
+)
 
 import fmugym
 from fmugym import ConfigError
 from fmugym.export import Activation, Layer, Network, agent_of, write_c
+from fmugym.export.operations import HELPERS, TYPES, constant, expression
 
 BALANCING = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.5, 10.0, 2.0]], np.float32)
 """The second action of a cart-pole is better than the first one where this feedback is positive."""
@@ -260,6 +271,49 @@ class TestSensors:
         assert texts[0] == texts[1]
 
 
+class TestExternal:
+    """Data that the agent is given instead of having them in tables."""
+
+    def test_takes_the_place_of_tables(self, tmp_path):
+        env, names = made("fmugym/House-v0"), ["T_out", "sun", "price"]
+        network = network_for(env)
+        agent = agent_of(env, network, external=names)
+        controller = compiled(agent, tmp_path)
+        assert "house_table" not in (tmp_path / "agent.c").read_text()
+        plain = [one.name for one in agent.logic.measurements]
+        assert plain[:5] == ["T_op", "T_w", "T_out_given", "T_out_in_7200_s", "T_out_in_14400_s"]
+        assert len(plain) == 2 + 3 * 7
+        places = [
+            i for i, one in enumerate(env.observation_names) if one.partition("[")[0] in names
+        ]
+        order = sorted(
+            places, key=lambda i: names.index(env.observation_names[i].partition("[")[0])
+        )
+        observation, _ = env.reset(seed=2)
+        controller.begin(clock=env.variables["clock"])
+        for _ in range(100):
+            given = [env.out["T_op"], env.out["T_w"], *observation[order]]
+            actions = controller.step(given)
+            observation, *_ = env.step(network.action(observation))
+            assert actions == pytest.approx([env.inputs[0]], abs=1e-5)
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("name", "fact"), [("T_outt", "'T_out'"), ("people", "'people'"), ("hour", "'hour'")]
+    )
+    def test_mistakes(self, name, fact):
+        env = made("fmugym/House-v0")
+        with pytest.raises(ConfigError, match=fact):
+            agent_of(env, network_for(env), external=[name])
+        env.close()
+
+    def test_hooks_by_hand_have_no_data(self):
+        env = Filtered()
+        with pytest.raises(ConfigError, match="task file"):
+            agent_of(env, network_for(env), external=["goal"])
+        env.close()
+
+
 class TestFiles:
     def test_measurements_and_actions_have_names_and_units(self, tmp_path):
         env = made("fmugym/House-v0")
@@ -305,6 +359,57 @@ class TestFiles:
         before = controller._state.raw
         assert controller.step([bad]) is None
         assert controller._state.raw == before
+
+
+class TestFunctions:
+    """The functions of numpy as expressions in C."""
+
+    @pytest.mark.parametrize("letter", "df")
+    def test_of_numpy(self, letter, tmp_path):
+        helpers, lines, kind = {}, [], TYPES[letter]
+
+        def use(name, letter):
+            return helpers.setdefault(name, f"own_{name}")
+
+        for ufunc in FUNCTIONS:
+            text = expression(ufunc, ["x", "y"][: ufunc.nin], letter * ufunc.nin, use)
+            lines.append(f"double f_{ufunc.__name__}({kind} x, {kind} y) {{")
+            lines.append(f"    (void)y;\n    return (double)({text});\n}}")
+        suffix = "f" if letter == "f" else ""
+        own = [HELPERS[h].format(T=kind, name=n, f=suffix) for h, n in helpers.items()]
+        library = built("\n".join(["#include <math.h>", *own, *lines]), tmp_path)
+        number = ctypes.c_double if letter == "d" else ctypes.c_float
+        tolerance = 1e-13 if letter == "d" else 1e-6
+        for ufunc in FUNCTIONS:
+            values = arguments_of(ufunc, np.dtype(letter))
+            function = library[f"f_{ufunc.__name__}"]
+            function.argtypes, function.restype = [number, number], ctypes.c_double
+            second = values[1] if ufunc.nin > 1 else np.zeros(len(values[0]))
+            found = [function(x, y) for x, y in zip(values[0], second, strict=True)]
+            with np.errstate(all="ignore"):
+                wanted = ufunc(*values).astype(float)
+            name = ufunc.__name__
+            np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance, err_msg=name)
+
+    def test_others_are_refused(self):
+        with pytest.raises(ConfigError, match="nextafter"):
+            expression(np.nextafter, ["x", "y"], "dd", None)
+
+    @pytest.mark.parametrize(
+        ("value", "letter"),
+        [
+            *((0.1, "d"), (1e300, "d"), (-5e-324, "d"), (np.inf, "d"), (np.nan, "d"), (-0.0, "d")),
+            *((np.float32(0.1), "f"), (np.float32(1e-45), "f"), (-np.inf, "f"), (True, "?")),
+            *((-(2**63), "q"), (2**64 - 1, "Q"), (2**40, "q"), (-3, "i")),
+        ],
+    )
+    def test_constants_keep_all_bits(self, value, letter, tmp_path):
+        kind, text = TYPES[letter], constant(value, letter)
+        includes = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>"
+        library = built(f"{includes}\n{kind} value = {text};", tmp_path)
+        dtype = np.dtype(letter)
+        found = (ctypes.c_char * dtype.itemsize).in_dll(library, "value").raw
+        assert found == np.array(value, dtype).tobytes()
 
 
 class TestNetworks:

@@ -16,6 +16,7 @@ from export_tools import network_for, plant_of
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
+from test_export import heating
 
 import fmugym
 from fmugym import ConfigError
@@ -188,6 +189,52 @@ class TestClosedLoop:
         for index, variable in enumerate(env._interface.inputs):
             assert result[variable.name][1:] == pytest.approx([w[index] for w in wanted], abs=1e-5)
             assert result[variable.name][0] == result[variable.name][1]  # known at the beginning
+
+
+class TestSystems:
+    """The exported agent and the plant as components of a system."""
+
+    @pytest.mark.parametrize("task", ["history", "memory", "levels"])
+    def test_the_agent_controls_the_plant(self, task, version, tmp_path):
+        env = heating(task)
+        network = network_for(env, scaled=False)
+        agent = agent_of(env, network, name="agent")
+        path = write_fmu(agent, tmp_path / "agent.fmu", fmi_version=version)
+        system = fmugym.FMUSystem(
+            {"agent": path, "plant": fmugym.bundled_fmu("House", "2.0")},
+            ["plant.T_op -> agent.T_op", "agent.u -> plant.u"],
+            step_size=900.0,
+        )
+        assert system.findings == ()
+        observation, _ = env.reset(seed=0)
+        together = Together(system, {"plant.T_m_0": env.parameters["T_m_0"]})
+        together.reset()
+        worst = 0.0
+        for _ in range(96):
+            action = network.action(observation)
+            observation, *_ = env.step(int(action[0]) if task == "levels" else action)
+            together.step(np.array([300.0]))  # the heat of people, as it is by default
+            own = np.array([together.out["plant.T_op"], together.out["agent.u"]])
+            worst = max(worst, np.abs(own - [env.out["T_op"], env.inputs[0]]).max())
+        assert worst <= 1e-4
+        together.close()
+        env.close()
+
+
+class Together(fmugym.FMUEnv):
+    """A system in which an exported agent acts."""
+
+    def __init__(self, system, parameters):
+        config = {
+            "model_input_names": ["plant.Q_int"],
+            "model_output_names": ["plant.T_op", "agent.u"],
+            "model_parameters": parameters,
+            "time_step": 900.0,
+        }
+        super().__init__(system, config)
+
+    def _is_done(self):
+        return False
 
 
 class TestSteps:

@@ -229,6 +229,22 @@ class TestCommand:
         assert main(["info", str(output)]) == 0
         assert "heater" in capsys.readouterr().out
 
+    def test_to_onnx(self, tmp_path, capsys):
+        runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
+        env = made("fmugym/CartPole-v0")
+        model = model_of("PPO", env)
+        model.save(tmp_path / "model.zip")
+        env.close()
+        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/CartPole-v0"]
+        assert main([*command, "--output", str(tmp_path / "agent.onnx")]) == 0
+        assert "action f N" in capsys.readouterr().out
+        session = runtime.InferenceSession(str(tmp_path / "agent.onnx"))
+        seen = np.random.default_rng(0).normal(size=(100, 4))
+        count = np.zeros(100, np.int64)
+        (actions,) = session.run(["actions"], {"measurements": seen, "count": count})
+        best, _ = model.predict(seen.astype(np.float32), deterministic=True)
+        assert actions[:, 0].tolist() == np.where(best, 10.0, -10.0).tolist()
+
     def test_of_a_model_file(self, tmp_path, capsys):
         env = made("fmugym/Pendulum-v0")
         model_of("SAC", env).save(tmp_path / "model.zip")

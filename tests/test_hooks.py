@@ -1,5 +1,6 @@
 """Hooks that return something odd, or raise: the error, the fault, and what follows."""
 
+import contextlib
 import math
 from decimal import Decimal
 
@@ -359,6 +360,40 @@ class TestKindsOfObservations:
             env.reset()
 
 
+CALLS = []
+
+
+class SpoiledGoals(fmugym.FMI2CSEnv):
+    """Notes the calls of a hook; another one writes to what it gets."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": ["tau"],
+            "model_output_names": ["q", "q_dot"],
+            "time_step": 0.02,
+            "bounds": {"tau": (-0.1, 0.1)},
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum"), config)
+
+    def _get_observation_space(self):
+        part = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+        return spaces.Dict({"achieved_goal": part, "desired_goal": part})
+
+    def _is_done(self):
+        return np.abs(self.out["q_dot"]) > 30.0
+
+    def _get_observation(self):
+        CALLS.append(type(self.out["q"]))
+        return {
+            "achieved_goal": np.array([self.out["q"]]),
+            "desired_goal": np.array([0.0 * self.out["q"]]),
+        }
+
+    def _goal_reward(self, achieved_goal, desired_goal):
+        achieved_goal[...] = 5.0
+        return desired_goal[..., 0] - achieved_goal[..., 0]
+
+
 class TestGoals:
     def test_without_goals_in_the_observation(self, make_env):
         cls = type("Goal", (PlainEnv,), {"_goal_reward": lambda self, a, d: 0.0})
@@ -366,6 +401,25 @@ class TestGoals:
         env.reset()
         with pytest.raises(ConfigError, match=r"_get_observation.*'achieved_goal'"):
             env.step(0.0)
+
+    def test_a_step_asks_once_for_the_observation_which_the_reward_cannot_change(self):
+        with SpoiledGoals() as env:
+            env.reset(seed=0)
+            CALLS.clear()
+            observation, reward, *_ = env.step(env.action_space.sample())
+            assert [float] == CALLS
+            assert (reward, observation["achieved_goal"]) == (-5.0, env.state[0])
+
+    def test_so_does_a_step_on_arrays(self):
+        with contextlib.closing(fmugym.FMUVectorEnv(SpoiledGoals, 3, hooks="array")) as envs:
+            envs.reset(seed=0)
+            CALLS.clear()
+            observations, rewards, *_ = envs.step(envs.action_space.sample())
+            assert [np.ndarray] == CALLS
+            assert rewards.tolist() == [-5.0] * 3
+            np.testing.assert_array_equal(
+                observations["achieved_goal"][:, 0], [state[0] for state in envs.get_attr("state")]
+            )
 
 
 class TestPictures:

@@ -11,7 +11,7 @@ PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
     {"errors", "caching", "lazy", "signals", "_native"},
-    {"checks", "wine"},
+    {"checks", "extras", "wine"},
     {"archive", "distributions", "rendering"},
     {"systems"},
     {"fmi"},
@@ -23,8 +23,8 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
-    {"export"},
-    {"envs", "rllib", "tools"},
+    {"export", "logs", "minari"},
+    {"envs", "pettingzoo", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]
 """From the ground floor up: a room imports rooms of lower storeys and itself only."""

@@ -350,7 +350,7 @@ def attempt():
     limited = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
     return fmu, spec, limited
 
-for extra in range(0, 120, 3):
+for extra in range(0, 160, 4):
     fmu, spec, size = attempt()
     limit = size + extra * 2**20
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))

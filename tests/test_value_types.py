@@ -1,6 +1,7 @@
 """Values of every type, and arrays, in all pools: against closed forms and FMPy."""
 
 import fmpy
+import model_tools
 import numpy as np
 import pytest
 import values_tools
@@ -11,6 +12,7 @@ import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
 from fmugym.series import RecordSeries
 from fmugym.testing import check_fmu_env
+from fmugym.tools import cli
 
 STEP = 0.1
 POOLS = {
@@ -419,9 +421,203 @@ def test_a_task_file_names_elements(state_space, tmp_path):
     env.close()
 
 
+def test_a_task_file_gives_sizes(sized, tmp_path):
+    task = {
+        "fmu": str(sized),
+        "time_step": 0.1,
+        "agent": {"actions": ["u[1]", "u[2]"], "observations": ["y[1]", "x[3]"]},
+        "reward": {"near": "-1.0"},
+        "parameters": dict(LARGER),
+    }
+    env = fmugym.load(task)
+    env.reset(seed=0)
+    env.step(np.array([0.5, -0.25], np.float32))
+    wanted = larger(1, np.array([0.5, -0.25]))
+    assert [env.out["y[1]"], env.out["x[3]"]] == pytest.approx([wanted[0], wanted[3]], abs=1e-7)
+    env.close()
+    task["parameters"]["A"] = [[1, 2]]
+    with pytest.raises(ConfigError, match=r"'A'.*\(3, 3\)"):
+        fmugym.load(task)
+
+
+@pytest.mark.parametrize("words", [(), ("--class",)], ids=["task", "class"])
+def test_fmugym_new_knows_elements(state_space, tmp_path, words):
+    path = tmp_path / ("new.py" if words else "new.toml")
+    assert cli.main(["new", str(state_space), "--output", str(path), *words]) == 0
+    text = path.read_text()
+    for name in ("u[1]", "y[1]", "y[2]", "y[3]", "x[1]", "x[2]"):
+        assert f'"{name}"' in text
+    assert "[[-1.0, 0.5], [0.0, -2.0]]" in text
+    if not words:
+        env = fmugym.load(path)
+        env.reset()
+        env.step(env.action_space.sample())
+        env.close()
+
+
+# Strings and Binary
+
+
+@versions
+@pools
+def test_strings_are_set(feedthrough, version, options):
+    env = Writing(
+        feedthrough[version],
+        [],
+        model_input_names=[],
+        model_output_names="length",
+        model_parameters={"String_parameter": "bluish", "String_in": "green"},
+        **options,
+    )
+    for _ in range(3):
+        env.reset()
+        env.step(0)
+        assert env.state == (len("bluish"),)
+    env.close()
+
+
+@versions
+@pools
+def test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, options):
+    path = model_tools.model_fmu(
+        tmp_path / "Resource.fmu",
+        "resource",
+        version,
+        "{resource}",
+        [("y", "output", "")],
+        add={"resources/y.txt": "42.5"},
+    )
+
+    def make():
+        return Writing(path, [], model_input_names=[], model_output_names="y", **options)
+
+    envs, env = FMUVectorEnv(make, 2), make()
+    assert env.reset()[0].tolist() == [42.5]
+    assert envs.reset()[0].tolist() == [[42.5]] * 2
+    env.close()
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({"model_input_names": "String_in"}, r"'String_in'.*input.*String.*model_parameters"),
+        ({"model_output_names": "String_out"}, r"'String_out'.*output.*String.*number"),
+        ({"model_parameters": {"String_parameter": 3}}, r"'String_parameter'.*String.*3"),
+        ({"model_input_names": "Binary_in"}, r"'Binary_in'.*input.*Binary.*numbers"),
+        ({"model_parameters": {"Binary_in": "00"}}, r"'Binary_in'"),
+    ],
+)
+def test_refused_types(feedthrough, changes, facts):
+    config = {"model_input_names": "v", "model_output_names": "w", "bounds": {"v": (0, 1)}}
+    with pytest.raises(ConfigError, match=facts):
+        Env(feedthrough[3], **(config | changes))
+
+
 def test_the_contract(state_space):
     env = state_space_env(state_space, model_parameters={"A": [[-1, 0.5], [0, -2]]})
     check_fmu_env(env, num_steps=20)
+
+
+# Sizes
+
+LARGER = {
+    "n": 3,
+    "m": 2,
+    "r": 1,
+    "A": [[-1, 0.5, 0], [0, -2, 1], [0.1, 0, -3]],
+    "B": [[1, 0], [0, 1], [1, 1]],
+    "C": [[1, 1, 1]],
+    "D": [[0.5, 0]],
+    "x_0": [1, 2, 3],
+}
+
+
+@pytest.fixture(scope="module")
+def sized(tmp_path_factory):
+    return values_tools.state_space_fmu(tmp_path_factory.mktemp("ss") / "S.fmu")
+
+
+def larger(steps, u):
+    """The outputs and states of the larger model after some steps with constant inputs."""
+    block = np.zeros((5, 5))
+    block[:3, :3], block[:3, 3:] = LARGER["A"], LARGER["B"]
+    x = (expm(block * STEP * steps) @ np.append(LARGER["x_0"], u))[:3]
+    return np.append(np.dot(LARGER["C"], x) + np.dot(LARGER["D"], u), x)
+
+
+@pytest.mark.parametrize("probe", [None, 60.0], ids=["", "tried"])
+@ways
+def test_structural_parameters_give_arrays_their_sizes(sized, options, probe):
+    config = {"model_parameters": LARGER, "probe_timeout": probe} | options
+    envs = FMUVectorEnv(lambda: state_space_env(sized, **config), 2)
+    env = state_space_env(sized, **config)
+    assert env.action_space.shape == (2,)
+    assert env.observation_names == ("y[1]", "x[1]", "x[2]", "x[3]")
+    u = np.array([0.5, -0.25], np.float32)
+    for _ in range(3):
+        env.reset()
+        envs.reset()
+        for steps in (1, 2):
+            env.step(u)
+            rows = envs.step(np.stack([u, u]))[0]
+            assert env.state == pytest.approx(larger(steps, u), abs=1e-7)
+            assert rows.tolist() == [np.float32(env.state).tolist()] * 2
+    env.close()
+    envs.close()
+
+
+def test_sizes_of_an_opened_fmu(sized):
+    fmu = fmugym.FMU(sized, sizes={"n": 3})
+    assert [fmu.variable(name).shape for name in ("A", "B", "C", "u")] == [
+        (3, 3),
+        (3, 1),
+        (3, 3),
+        (1,),
+    ]
+    assert fmugym.FMU.of(fmu).variable("x").shape == (3,)
+    assert fmugym.FMU(sized).variable("x").shape == (2,)
+
+
+def test_arrays_without_elements(sized):
+    given = {"m": 0, "x_0": [1, 1], "A": -np.eye(2)}
+    env = Writing(sized, [], model_input_names="u", model_output_names="x", model_parameters=given)
+    env.reset()
+    env.step(0)
+    assert env.state == pytest.approx([np.exp(-STEP)] * 2, abs=1e-9)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({"model_parameters": {"n": 9}}, "'n'.*0 to 8.*9"),
+        ({"model_parameters": {"n": -1}}, "'n'.*0 to 8.*-1"),
+        ({"model_parameters": {"n": 2.5}}, "'n'.*0 to 8.*2.5"),
+        ({"model_parameters": {"n": Choice([2, 3])}}, "'n'.*drawn"),
+        ({"model_parameters": {"n": 3, "A[1,1]": 2}}, r"'A\[1,2\]'.*\(3, 3\)"),
+        ({"model_parameters": {"n": 3, "x_0": [1, 2]}}, r"'x_0'.*\(3,\).*\(2,\)"),
+        ({"model_input_names": "n"}, "'n'.*structuralParameter"),
+    ],
+)
+def test_wrong_sizes(sized, changes, facts):
+    with pytest.raises(ConfigError, match=facts):
+        state_space_env(sized, **changes)
+
+
+def test_sizes_cannot_change_from_episode_to_episode(sized):
+    env = state_space_env(sized)
+    with pytest.raises(ConfigError, match=r"'n'.*structural"):
+        env.reset(options={"model_parameters": {"n": 3}})
+    env.close()
+
+
+def test_a_parameter_that_gives_no_size(sized):
+    with pytest.raises(ConfigError, match=r"'x_0'.*parameter"):
+        fmugym.FMU(sized, sizes={"x_0": 3})
+
+
+# Mistakes
 
 
 @pytest.mark.parametrize(

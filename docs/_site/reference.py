@@ -24,6 +24,7 @@ PAGES: Final = {
     "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
     "Recordings": ("Recorder", "Recording", "replay"),
     "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
+    "Systems": ("FMUSystem", "Component", "Connection"),
     "Rigs": ("Backend", "Paced"),
     "Errors": (),  # and all other exceptions
 }
@@ -31,7 +32,10 @@ MODULES: Final = {
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
+    "PettingZoo": "fmugym.pettingzoo",
     "RLlib": "fmugym.rllib",
+    "Plant logs": "fmugym.logs",
+    "Minari": "fmugym.minari",
     "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",
     "Identification": "fmugym.identification",

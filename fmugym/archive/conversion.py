@@ -105,6 +105,8 @@ def _model_exchange(source: Any, root: Any) -> ModelExchange:
         _needs_completed_step(source, root),
         tuple(int(state.valueReference) for state in states) if scalar else (),
         tuple(int(variable.valueReference) for variable in derivatives) if scalar else (),
+        tuple(variable.name for variable in derivatives),
+        tuple(unknown.variable.name for unknown in source.eventIndicators or ()),
     )
 
 
@@ -227,6 +229,9 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         offer.canBeInstantiatedOnlyOncePerProcess,
         offer.needsExecutionTool,
         _provides(root, _ELEMENTS[interface], "Adjoint"),
+        interface == "co_simulation"
+        and source.fmiVersion.startswith("2")
+        and offer.canInterpolateInputs,
     )
 
 
@@ -250,6 +255,7 @@ def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
         or flag("canHandleVariableCommunicationStepSize"),
         can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
         needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
+        can_interpolate_inputs=interface == "co_simulation" and flag("canInterpolateInputs"),
     )
 
 
@@ -279,12 +285,22 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         nominal=_nominal(source),
         description=source.description or "",
         items=_items(source),
-        shape=tuple(source.shape or ()),
+        shape=_shape(source),
+        dimensions=tuple(
+            "" if d.start is not None else d.variable.name for d in source.dimensions or ()
+        ),
         clocks=tuple(map(int, (element.get("clocks") or "").split())),
         ticking=ticking,
         interval=_clock_time(element, "interval") if ticking else math.nan,
         shift=_shift(element, ticking),
     )
+
+
+def _shape(source: Any) -> tuple[int, ...]:
+    shape = tuple(source.shape or ())
+    if any(length < 0 for length in shape):
+        raise FMULoadError(f"the array {source.name!r} has the shape {shape}")
+    return shape
 
 
 def _ticking(source: Any, element: Any) -> str:

@@ -16,7 +16,8 @@ from typing import Any, Final
 
 import fmpy
 
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.checks import integer_of
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
     "CLOCK_KINDS",
@@ -49,6 +50,8 @@ _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 
 MOST_ELEMENTS: Final = 100_000
 """How many elements an array may have of which elements are named."""
 
+_LARGEST_SIZE: Final = 2**31 - 1
+
 _ELEMENT: Final = re.compile(r"(.+)\[(\d{1,9}(?:, ?\d{1,9})*)\]")
 """The name of an element: that of its array, and its indices."""
 
@@ -75,6 +78,8 @@ class Variable:
         nominal: None where neither the variable nor its declared type gives a finite number.
         items: Names and values of an enumeration.
         shape: The shape of an array (FMI 3.0); () for a scalar.
+        dimensions: Of an array, for each dimension the structural parameter that gives its length;
+            "" for a fixed length.
         array: Of an element of an array, the array; None for other variables.
         place: Of an element, its place in the array, in row-major order.
         clocks: The value references of the clocks that must tick whenever the value changes.
@@ -97,6 +102,7 @@ class Variable:
     description: str = ""
     items: tuple[tuple[str, int], ...] = ()
     shape: tuple[int, ...] = ()
+    dimensions: tuple[str, ...] = ()
     array: Variable | None = None
     place: int = 0
     clocks: tuple[int, ...] = ()
@@ -121,6 +127,11 @@ class Variable:
     def is_number(self) -> bool:
         """Whether float64 can hold its value, or those of its elements."""
         return self.kind in {"real", "integer", "boolean", "enumeration"}
+
+    @property
+    def is_structural(self) -> bool:
+        """Whether it is a structural parameter: arrays get their sizes by it."""
+        return self.causality == "structuralParameter"
 
     @property
     def settable_at_start(self) -> bool:
@@ -150,8 +161,6 @@ class Variable:
         Raises:
             ConfigError: If it is not a finite number.
         """
-        if self.array is not None:
-            return self.array.start_numbers[self.place]
         return _number(self.name, "0" if self.start is None else self.start)
 
     @cached_property
@@ -161,17 +170,9 @@ class Variable:
         A single start value is that of all elements; without any they are 0.
 
         Raises:
-            ConfigError: If their number is neither, or one is not a finite number.
+            ConfigError: If there is another number of them, or one is not a finite number.
         """
-        texts = (self.start or "0").split()
-        if len(texts) == 1:
-            texts *= self.size
-        if len(texts) != self.size:
-            raise ConfigError(
-                f"{self.name!r} is an array of {self.size} elements and has {len(texts)} start "
-                "values in the FMU"
-            )
-        return tuple(_number(self.name, text) for text in texts)
+        return tuple(element.start_number for element in self.elements)
 
     @property
     def size(self) -> int:
@@ -194,10 +195,38 @@ class Variable:
                 f"{self.name!r} is an array of {self.size} elements, at most {MOST_ELEMENTS} can "
                 "be used"
             )
+        places = list(product(*map(range, self.shape)))
+        starts = self._starts_of(len(places))
         return tuple(
-            replace(self, name=f"{self.name}[{_index(place)}]", shape=(), array=self, place=number)
-            for number, place in enumerate(product(*map(range, self.shape)))
+            replace(
+                self,
+                name=f"{self.name}[{_index(place)}]",
+                shape=(),
+                dimensions=(),
+                array=self,
+                place=number,
+                start=starts[number],
+            )
+            for number, place in enumerate(places)
         )
+
+    def _starts_of(self, count: int) -> list[str | None]:
+        """The start value of each element; all of them where their number is wrong."""
+        texts = (self.start or "").split()
+        return [*texts] if len(texts) == count else [self.start] * count
+
+    def resized(self, sizes: Mapping[str, int]) -> Variable:
+        """The same variable with these values of structural parameters.
+
+        The start values of an array of another size are those of the FMU, and not known.
+        """
+        if self.name in sizes:
+            return replace(self, start=str(sizes[self.name]))
+        pairs = zip(self.dimensions, self.shape, strict=True) if self.dimensions else ()
+        shape = tuple(sizes.get(name, length) for name, length in pairs)
+        if not self.dimensions or shape == self.shape:
+            return self
+        return replace(self, shape=shape, start=None)
 
     @property
     def integer_limits(self) -> tuple[int, int]:
@@ -206,6 +235,11 @@ class Variable:
             return 0, 2 ** int(self.type[4:]) - 1
         bits = _INTEGER_BITS[self.type]
         return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+def _whole(value: Any) -> int | None:
+    """Return a number as an int if it is whole, also if it is a float, as those of files are."""
+    return int(value) if isinstance(value, float) and value.is_integer() else integer_of(value)
 
 
 def _number(name: str, text: str) -> float:
@@ -246,6 +280,7 @@ class Capabilities:
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
     provides_adjoint_derivatives: bool = False
+    can_interpolate_inputs: bool = False
 
     @property
     def provides_derivatives(self) -> bool:
@@ -261,6 +296,8 @@ class ModelExchange:
         number_of_states: Continuous states.
         number_of_event_indicators: An indicator that changes its sign is an event.
         needs_completed_integrator_step: Whether the FMU wants to know of each complete step.
+        derivatives, indicators: The names of the variables that hold the derivatives of the states,
+            and of those that hold event indicators; empty where the XML gives only their numbers.
         state_references, derivative_references: The value references of the states and their
             derivatives in the order of the states; empty if the XML does not tell them.
     """
@@ -270,6 +307,16 @@ class ModelExchange:
     needs_completed_integrator_step: bool
     state_references: tuple[int, ...] = ()
     derivative_references: tuple[int, ...] = ()
+    derivatives: tuple[str, ...] = ()
+    indicators: tuple[str, ...] = ()
+
+    def resized(self, variables: Mapping[str, Variable]) -> ModelExchange:
+        """The same for arrays of other sizes."""
+        return replace(
+            self,
+            number_of_states=sum(variables[name].size for name in self.derivatives),
+            number_of_event_indicators=sum(variables[name].size for name in self.indicators),
+        )
 
 
 @dataclass(frozen=True)
@@ -310,6 +357,7 @@ class ModelDescription:
         error_categories: The declared log categories of errors and warnings.
         units: The units that the XML defines, by name.
         has_event_mode: Whether the FMU offers event mode in co-simulation.
+        structure: The structural parameters that get other values than in the XML, and the values.
     """
 
     fmi_version: str
@@ -333,6 +381,7 @@ class ModelDescription:
     interface: str = "co_simulation"
     model_exchange: ModelExchange | None = None
     has_event_mode: bool = False
+    structure: tuple[tuple[Variable, int], ...] = ()
 
     @cached_property
     def fmi_major_version(self) -> int:
@@ -402,6 +451,40 @@ class ModelDescription:
         match = _ELEMENT.fullmatch(name) if isinstance(name, str) else None
         array = None if match is None else self.variables.get(match[1])
         return (array, match[2]) if array and match and array.shape else (None, "")
+
+    def resized(self, sizes: Mapping[str, int]) -> ModelDescription:
+        """The same FMU with other values of structural parameters, and with arrays of these sizes.
+
+        Args:
+            sizes: Values of structural parameters by name.
+
+        Raises:
+            ConfigError: If there is no such structural parameter, or it cannot have the value.
+        """
+        chosen = {name: self._checked_size(name, size) for name, size in sizes.items()}
+        variables = {name: v.resized(chosen) for name, v in self.variables.items()}
+        solved = self.model_exchange
+        return replace(
+            self,
+            variables=variables,
+            structure=tuple((variables[name], size) for name, size in chosen.items()),
+            model_exchange=None if solved is None else solved.resized(variables),
+        )
+
+    def _checked_size(self, name: str, size: Any) -> int:
+        variable, number = self.variable(name), _whole(size)
+        if variable.causality != "structuralParameter" or variable.type != "UInt64":
+            raise ConfigError(
+                f"{name!r} is no structural parameter of type UInt64: it is a "
+                f"{variable.causality} of type {variable.type}"
+            )
+        low, high = max(0, variable.minimum), min(_LARGEST_SIZE, variable.maximum)
+        if number is None or not low <= number <= high:
+            raise ConfigError(
+                f"{name!r} is a structural parameter: expected an integer from {low:g} to "
+                f"{high:g}, got {shown(size)}"
+            )
+        return number
 
     def find(self, name: str) -> Variable | None:
         """Do what ``variable`` does, but return None if there is no such variable."""

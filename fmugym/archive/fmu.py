@@ -12,7 +12,7 @@ import os
 import shlex
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -25,10 +25,11 @@ from fmugym.archive.description import INTERFACES, ModelDescription, Variable
 from fmugym.archive.executable import check_library
 from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
-from fmugym.archive.reading import read_model_description
+from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
+from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
-from fmugym.checks import check_option, check_path
+from fmugym.checks import check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
@@ -171,6 +172,7 @@ class FMU(LoadableFMU):
             own; None to do without. See ``fmugym.trial``.
         interface: ``"co_simulation"`` or ``"model_exchange"``; by default co-simulation where the
             FMU offers it.
+        sizes: Values of structural parameters by name; arrays get the sizes that follow.
 
     Attributes:
         path: The file's absolute path.
@@ -179,6 +181,7 @@ class FMU(LoadableFMU):
             as texts.
         limits, preload, probe_timeout: As given; ``preload`` a tuple with absolute paths.
         interface: As given; ``description.interface`` is the one in use.
+        sizes: As given.
 
     Raises:
         ConfigError: If an argument does not fit.
@@ -193,6 +196,7 @@ class FMU(LoadableFMU):
         preload: Sequence[str | os.PathLike[str]] = (),
         probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT,
         interface: str | None = None,
+        sizes: Mapping[str, int] | None = None,
     ) -> None:
         file = check_path("the path of an FMU", path).absolute()
         self.limits = ArchiveLimits() if limits is None else limits
@@ -206,6 +210,9 @@ class FMU(LoadableFMU):
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
         description = read_model_description(self._archive, self.limits, interface)
+        self.sizes = {} if sizes is None else check_mapping("sizes", sizes)
+        if self.sizes:
+            description = description.resized(self.sizes)
         super().__init__(file, description, libraries)
         self._library_place, note = self._choose_library()
         self.findings = (*self._archive.notes, *note, *self.description.findings)
@@ -246,11 +253,21 @@ class FMU(LoadableFMU):
             preload=self.preload,
             probe_timeout=self.probe_timeout,
             interface=self.interface,
+            sizes=self.sizes,
         )
 
     def variable(self, name: str) -> Variable:
         """Look a variable up by name; see ``ModelDescription.variable``."""
         return self.description.variable(name)
+
+    @cached_property
+    def feedthrough(self) -> Feedthrough:
+        """Which inputs act on which outputs at once, as the model description tells it.
+
+        Raises:
+            FMULoadError: If the archive has been changed or removed.
+        """
+        return read_feedthrough(read_root(self._archive, self.limits), self.description)
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:

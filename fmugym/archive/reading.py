@@ -19,7 +19,7 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, over_limit
 from fmugym.errors import FMULoadError, reason
 
-__all__ = ["read_model_description"]
+__all__ = ["parse_xml", "read_model_description", "read_root", "read_xml"]
 
 _XML: Final = "modelDescription.xml"
 _MARKUP_PER_VARIABLE: Final = 25
@@ -60,11 +60,8 @@ def read_model_description(
         FMULoadError: If the XML is missing, too large or unreadable, or lacks the interface.
     """
     name = archive.path.name
-    content = _read_xml(archive, limits.max_xml_bytes)
-    _check_markup(name, content, limits.max_variables)
-    content = _without_dependencies(content)
-    root = _parse(name, content)
-    _check_root(name, root, limits.max_variables)
+    content = _without_dependencies(_read_content(archive, limits))
+    root = _parse_content(name, content, limits)
     try:
         return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
@@ -75,19 +72,58 @@ def read_model_description(
         ) from error
 
 
-def _read_xml(archive: SafeZip, limit: int) -> bytes:
+def read_root(archive: SafeZip, limits: ArchiveLimits) -> Any:
+    """Read the XML of an FMU with the dependencies, which no environment of one FMU needs.
+
+    Returns:
+        The root, an element of lxml.
+
+    Raises:
+        FMULoadError: If the XML is missing, too large or unreadable.
+    """
+    return _parse_content(archive.path.name, _read_content(archive, limits), limits)
+
+
+def _read_content(archive: SafeZip, limits: ArchiveLimits) -> bytes:
     if _XML not in archive.files:
         raise FMULoadError(f"{archive.path.name} is not an FMU: it has no {_XML}{_hint(archive)}")
-    content = archive.read(_XML, limit)
+    content = read_xml(archive, _XML, limits.max_xml_bytes)
+    _check_size(archive.path.name, content, limits.max_variables)
+    return content
+
+
+def _parse_content(name: str, content: bytes, limits: ArchiveLimits) -> Any:
+    root = parse_xml(name, _XML, content)
+    _check_root(name, root, limits.max_variables)
+    return root
+
+
+def read_xml(archive: SafeZip, place: str, limit: int) -> bytes:
+    """Read an XML file of an archive.
+
+    Args:
+        archive: The archive.
+        place: The place of the file.
+        limit: The most bytes that it may have.
+
+    Returns:
+        The text in UTF-8.
+
+    Raises:
+        FMULoadError: If it is too large, its encoding is unknown, or it has a DOCTYPE.
+    """
+    name = archive.path.name
+    content = archive.read(place, limit)
     if len(content) > limit:
-        size = max(len(content), archive.files[_XML].file_size)
-        raise over_limit(f"{archive.path.name}: {_XML} has {size} bytes", limit, "max_xml_bytes")
+        size = max(len(content), archive.files[place].file_size)
+        raise over_limit(f"{name}: {place} has {size} bytes", limit, "max_xml_bytes")
     try:
-        return _as_utf_8(content)
+        content = _as_utf_8(content)
     except (UnicodeError, LookupError) as error:
-        raise FMULoadError(
-            f"{archive.path.name}: {_XML} is not valid XML: {reason(error)}"
-        ) from None
+        raise FMULoadError(f"{name}: {place} is not valid XML: {reason(error)}") from None
+    if re.search(rb"<!\s*DOCTYPE", content, re.IGNORECASE):  # its entities could grow without end
+        raise FMULoadError(f"{name}: {place} has a DOCTYPE, which FMI and SSP forbid")
+    return content
 
 
 def _hint(archive: SafeZip) -> str:
@@ -126,9 +162,7 @@ def _encoding_of(content: bytes) -> str:
     return encoding
 
 
-def _check_markup(name: str, content: bytes, max_variables: int) -> None:
-    if re.search(rb"<!\s*DOCTYPE", content, re.IGNORECASE):  # its entities could grow without end
-        raise FMULoadError(f"{name}: {_XML} has a DOCTYPE, which FMI forbids")
+def _check_size(name: str, content: bytes, max_variables: int) -> None:
     count = content.count(b"<") + content.count(b"=")
     limit = _MARKUP_PER_VARIABLE * max_variables + 1000
     if count > limit:
@@ -149,12 +183,25 @@ def _without_dependencies(content: bytes) -> bytes:
     return content[:start] + rest
 
 
-def _parse(name: str, content: bytes) -> Any:
+def parse_xml(name: str, place: str, content: bytes) -> Any:
+    """Parse the text of an XML file.
+
+    Args:
+        name: The name of the archive, for errors.
+        place: The place of the file, for errors.
+        content: What ``read_xml`` returned.
+
+    Returns:
+        The root, an element of lxml.
+
+    Raises:
+        FMULoadError: If it is no XML.
+    """
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         return etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        raise FMULoadError(f"{name}: {_XML} is not valid XML: {reason(error)}") from None
+        raise FMULoadError(f"{name}: {place} is not valid XML: {reason(error)}") from None
 
 
 def _check_root(name: str, root: Any, max_variables: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +15,52 @@ from fmugym.lazy import scipy_module
 from fmugym.linearization import LinearModel
 from fmugym.vector.trajectories import discrete
 
-__all__ = ["LQR", "PID", "Hysteresis"]
+__all__ = ["LQR", "PID", "Hysteresis", "Law"]
 
 
-class Hysteresis(Controller):
+class Law(Controller):
+    """A controller of one value, whose next action follows from a few numbers.
+
+    Attributes:
+        of: The name of what is measured.
+        setpoint: What it shall be: a name or a constant.
+        starts: The numbers that it remembers, at the beginning of an episode.
+    """
+
+    of: str
+    setpoint: Signal
+    starts: tuple[Numbers, ...]
+
+    @abstractmethod
+    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+        """Compute the action, before it is limited; element by element.
+
+        Args:
+            value: What is measured.
+            setpoint: What it shall be.
+            state: What the controller remembers, in the order of ``starts``.
+
+        Returns:
+            The action, and what the controller remembers then.
+        """
+
+    def _prepare(self) -> None:
+        self._check_signal("of", self.of)
+        self._check_signal("setpoint", self.setpoint)
+        self._state = tuple(np.full(self.count, start) for start in self.starts)
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        pairs = zip(self.starts, self._state, strict=True)
+        self._state = tuple(np.where(mask, start, now) for start, now in pairs)
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
+        action: FloatArray
+        action, self._state = self.law(value, setpoint, self._state)
+        return action
+
+
+class Hysteresis(Law):
     """Switches between two actions, as a thermostat does.
 
     Each number may be an array of shape (N,), with one for each environment.
@@ -36,26 +79,23 @@ class Hysteresis(Controller):
         self.of, self.setpoint = of, setpoint
         self.band = check_numbers("band", band, minimum=0.0)
         self.below, self.above = check_numbers("below", below), check_numbers("above", above)
+        self.starts = (self.above,)
 
     def _prepare(self) -> None:
         self._limits()
-        self._check_signal("of", self.of)
-        self._check_signal("setpoint", self.setpoint)
         for name in ("band", "below", "above"):
             self._check_size(name, getattr(self, name))
-        self._action = np.full(self.count, self.above)
+        super()._prepare()
 
-    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
-        self._action = np.where(mask, self.above, self._action)
-
-    def _decide(self, rows: FloatArray) -> FloatArray:
-        error = self._column(rows, self.of) - self._column(rows, self.setpoint)
-        kept = np.where(error > self.band, self.above, self._action)
-        self._action = np.where(error < -self.band, self.below, kept)
-        return self._action
+    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+        """See ``Law.law``; the controller remembers its action."""
+        error = value - setpoint
+        kept = np.where(error > self.band, self.above, state[0])
+        action = np.where(error < -self.band, self.below, kept)
+        return action, (action,)
 
 
-class PID(Controller):
+class PID(Law):
     """A PID controller on one value, with limits and anti-windup.
 
     With the error e = setpoint - measured value y, the action is
@@ -92,33 +132,27 @@ class PID(Controller):
         self.ti = None if ti is None else check_numbers("ti", ti, minimum=0.0, positive=True)
         self.td = check_numbers("td", td, minimum=0.0)
         self.offset = check_numbers("offset", offset)
+        self.starts = (0.0, np.nan)
 
     def _prepare(self) -> None:
         self._low, self._high = self._limits()
-        self._check_signal("of", self.of)
-        self._check_signal("setpoint", self.setpoint)
         for name in ("kp", "ti", "td", "offset"):
             self._check_size(name, getattr(self, name))
-        self._integral = np.zeros(self.count)
-        self._last = np.full(self.count, np.nan)
+        super()._prepare()
 
-    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
-        self._integral = np.where(mask, 0.0, self._integral)
-        self._last = np.where(mask, np.nan, self._last)
-
-    def _decide(self, rows: FloatArray) -> FloatArray:
-        value = self._column(rows, self.of)
-        error = self._column(rows, self.setpoint) - value
-        change = np.where(np.isnan(self._last), 0.0, value - self._last)
-        self._last = value
+    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+        """See ``Law.law``; the controller remembers the integral and the last value."""
+        integral, last = state
+        error = setpoint - value
+        change = np.where(np.isnan(last), 0.0, value - last)
         rest = self.offset + self.kp * (error - self.td * change / self.time_step)
         if self.ti is None:
-            return rest
+            return rest, (integral, value)
         growth = self.kp * error * self.time_step / self.ti
-        wanted = rest + self._integral + growth
+        wanted = rest + integral + growth
         beyond = wanted - np.clip(wanted, self._low, self._high)
-        self._integral = np.where(beyond * growth > 0, self._integral, self._integral + growth)
-        return rest + self._integral
+        integral = np.where(beyond * growth > 0, integral, integral + growth)
+        return rest + integral, (integral, value)
 
 
 class LQR(Controller):

@@ -97,7 +97,9 @@ class Schedule(Controller):
         Args:
             time: In seconds since any midnight.
         """
-        return self._actions[np.searchsorted(self._times, time % _DAY, side="right") - 1]
+        places = np.searchsorted(self._times, time % _DAY, side="right") - 1
+        found: FloatArray = np.take(self._actions, places % len(self._actions))
+        return found
 
 
 def _seconds(time: Any) -> float:

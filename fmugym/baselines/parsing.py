@@ -22,6 +22,11 @@ __all__ = ["Search", "controller_of", "search_of"]
 
 _KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "pid": PID}
 
+_EXAMPLES: Final[dict[type[Controller], str]] = {
+    Hysteresis: "hysteresis of=T setpoint=21 band=0.5",
+    PID: "pid of=T setpoint=21 kp=0.5",
+}
+
 _DECADE: Final = 10.0
 """Ranges whose ends differ by this factor are searched on a logarithmic scale."""
 
@@ -172,5 +177,7 @@ def _made(cls: type[Controller], arguments: dict[str, Any]) -> Controller:
             raise unknown_name(f"argument of {cls.__name__}", name, parameters)
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in arguments:
-            raise ConfigError(f"{cls.__name__} needs the argument {name!r}")
+            raise ConfigError(
+                f"{cls.__name__} needs the argument {name!r}, as in {_EXAMPLES[cls]!r}"
+            )
     return cls(**arguments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import keyword
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -106,8 +107,8 @@ class Declarations:
         root.required("agent").table(AGENT_KEYS)
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
-        declared.warm_up = read_warm_up(root, declared.actions)
         declared.observed = list(declared._read_observed())
+        declared.warm_up = read_warm_up(root, declared.actions, declared._controlled())
         declared.rewards = _terms(root.child("reward"), ("expr", "weight"))
         declared.costs = _terms(root.child("costs"), ("expr", "limit"))
         declared.kpis = {e.name: read_kpi(e) for e in section_of(root, "kpis")}
@@ -241,6 +242,18 @@ class Declarations:
             entry = self.root.child("setpoints").child(deviation.setpoint).child("of")
             if deviation.of not in self.own_names:
                 self.records.find(entry, deviation.of, "variable", self.own_names)
+
+    def _controlled(self) -> list[tuple[str, str]]:
+        """What is measured and its set point, in pairs, as far as the task tells.
+
+        Without set points ``of`` something, the only one is that of the only observed variable.
+        """
+        if self.deviations:
+            return [(one.of, one.setpoint) for one in self.deviations.values()]
+        written = {*self.own_names, *(record.alias for record in self.actions)}
+        measured = [name for _, name in self.observed if name not in written]
+        setpoints = [entry.name for entry in section_of(self.root, "setpoints")]
+        return list(product(measured, setpoints))
 
     def _listed(self, key: str) -> list[Entry]:
         """The names in a list of the agent; a bare name stands for one."""

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import logging
-from functools import lru_cache
-from pathlib import Path
 from types import MethodType
 from typing import Any, Final, Never
 
-from fmugym.archive.bundled import bundled_fmu
-from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import FMU
-from fmugym.declared.entries import Entry
 from fmugym.declared.plan import Plan
+from fmugym.declared.systems import describe, fmu_of
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, FMULoadError, shown, unknown_argument, unknown_name
+from fmugym.errors import ConfigError, unknown_argument
 
-__all__ = ["TaskEnv", "fmu_path"]
+__all__ = ["TaskEnv"]
 
 
 _ARGUMENTS: Final = (
@@ -63,9 +58,9 @@ class TaskEnv(FMUEnv):
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
         self.task = Task.of(config)
-        path = fmu_path(self.task)
+        source = fmu_of(self.task)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
-        plan = Plan(self.task, _description(self.task.root.child("fmu"), path), needs_reward)
+        plan = Plan(self.task, describe(self.task, source), needs_reward)
         self._quantities_of_task = plan.quantities
         self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
         if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
@@ -79,7 +74,7 @@ class TaskEnv(FMUEnv):
                 setattr(self, name, MethodType(function, self))
         with self.task.root.placing():
             super().__init__(
-                path,
+                source,
                 plan.config,
                 log_level,
                 render_mode=render_mode,
@@ -118,37 +113,3 @@ def _own_hooks(cls: type[TaskEnv]) -> set[str]:
     """The names of everything that classes between ``TaskEnv`` and this one define."""
     classes = cls.__mro__[: cls.__mro__.index(TaskEnv)]
     return {name for one in classes for name in vars(one)}
-
-
-def fmu_path(task: Task) -> Path:
-    """Find the FMU of a task.
-
-    Raises:
-        ConfigError: If the task names none, or there is no bundled FMU of this name.
-    """
-    entry = task.root.required("fmu")
-    if isinstance(entry.value, str):
-        return Path(entry.value)
-    table = entry.table(("bundled", "fmi_version"))
-    version: Any = table["fmi_version"].value if "fmi_version" in table else "2.0"
-    with entry.placing():
-        return bundled_fmu(entry.required("bundled").text(), version)
-
-
-def _description(entry: Entry, path: Path) -> ModelDescription:
-    try:
-        status = path.stat()
-    except (OSError, ValueError):  # there is none, or no file could have such a name
-        near = sorted(file.name for file in path.parent.glob("*.fmu"))
-        folder = shown(str(path.parent))
-        raise entry.error(f"{unknown_name('FMU', path.name, near)}; looked in {folder}") from None
-    try:
-        return _read_description(path, status.st_mtime_ns, status.st_size)
-    except FMULoadError as error:
-        raise type(error)(str(entry.error(error))) from error
-
-
-@lru_cache(maxsize=16)
-def _read_description(path: Path, changed: int, size: int) -> ModelDescription:
-    """Read a model description, once for all environments of a task."""
-    return FMU(path).description

@@ -27,7 +27,7 @@ VERSION: Final = 1
 """The version of the format; it is raised when a key changes its meaning."""
 
 KEYS: Final = (
-    *("version", "extends", "description", "fmu", "class", "arguments"),
+    *("version", "extends", "description", "fmu", "system", "class", "arguments"),
     *("time_step", "substeps", "episode_length", "warm_up", "start_time", "clock", "scenarios"),
     *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
     "controllers",
@@ -286,7 +286,9 @@ def _relative_path(path: str, folder: Path) -> str:
 
 
 def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
-    fmu, data = document.get("fmu"), document.get("data")
+    fmu, data, system = document.get("fmu"), document.get("data"), document.get("system")
+    if isinstance(system, dict):
+        document = document | {"system": _mapped_system(system, function)}
     if isinstance(fmu, str):
         document = document | {"fmu": function(fmu)}
     if isinstance(data, dict):
@@ -294,6 +296,21 @@ def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
             "data": {name: _mapped_path(d, function) for name, d in data.items()}
         }
     return document
+
+
+def _mapped_system(system: dict[str, Any], function: Any) -> dict[str, Any]:
+    """Map the paths of the FMUs of components: texts, or texts in tables."""
+    components = system.get("components")
+    if not isinstance(components, dict):
+        return system
+    return system | {"components": {n: _mapped_fmu(c, function) for n, c in components.items()}}
+
+
+def _mapped_fmu(component: Any, function: Any) -> Any:
+    if isinstance(component, str):
+        return function(component)
+    fmu = component.get("fmu") if isinstance(component, dict) else None
+    return component | {"fmu": function(fmu)} if isinstance(fmu, str) else component
 
 
 def _mapped_path(column: Any, function: Any) -> Any:

@@ -19,6 +19,9 @@ __all__ = ["WARM_UP_KEYS", "WarmUpTable", "period_of", "read_warm_up", "signals_
 WARM_UP_KEYS: Final = ("period", "controller", "cache")
 """The keys of a warm-up."""
 
+THERMOSTATS: Final = ("thermostat", "hysteresis")
+"""The names of a controller whose arguments the task may tell."""
+
 
 @dataclass(frozen=True)
 class WarmUpTable:
@@ -55,8 +58,15 @@ def period_of(entry: Entry) -> float:
     return (entry.required("period") if isinstance(entry.value, Mapping) else entry).check(duration)
 
 
-def read_warm_up(root: Entry, actions: Sequence[Record]) -> WarmUpTable:
+def read_warm_up(
+    root: Entry, actions: Sequence[Record], controlled: Sequence[tuple[str, str]]
+) -> WarmUpTable:
     """Read the warm-up of a task.
+
+    Args:
+        root: The task.
+        actions: Its actions.
+        controlled: What is measured and its set point, in pairs, for a thermostat.
 
     Raises:
         ConfigError: If it has no period, or a controller of no action.
@@ -72,7 +82,13 @@ def read_warm_up(root: Entry, actions: Sequence[Record]) -> WarmUpTable:
     caches = "cache" in table and table["cache"].flag()
     given = table.get("controller")
     entries = {} if given is None else _by_action(given, actions)
-    controllers = {name: _controller(one, known) for name, one in entries.items()}
+    records = {record.alias: record for record in actions}
+    controllers = {
+        name: _thermostat(one, records[name], controlled)
+        if _is_bare_thermostat(one, known)
+        else _controller(one, known)
+        for name, one in entries.items()
+    }
     return WarmUpTable(entry, period, controllers, caches)
 
 
@@ -83,6 +99,34 @@ def _named_controllers(root: Entry) -> dict[str, Entry]:
     for one in known.values():
         _controller(one, {})
     return known
+
+
+def _is_bare_thermostat(entry: Entry, known: Mapping[str, Entry]) -> bool:
+    return entry.value in THERMOSTATS and entry.value not in known
+
+
+def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, str]]) -> Controller:
+    """A thermostat whose arguments the task tells: it heats with the highest action.
+
+    Raises:
+        ConfigError: If it is not known what to measure, or its set point. The text gives a
+            controller to write instead.
+    """
+    from fmugym.baselines import Hysteresis
+
+    low, high = (
+        (min(record.levels), max(record.levels)) if record.levels else (record.low, record.high)
+    )
+    if len(controlled) == 1:
+        (of, setpoint), *_ = controlled
+        with entry.placing():
+            return Hysteresis(of, setpoint, 0.0, below=high, above=low)
+    of, setpoint = controlled[0] if controlled else ("T", "21")
+    raise entry.error(
+        f"{shown(entry.value)} alone needs one set point with the key 'of', and the task has "
+        f"{len(controlled) or 'none'}; write for example "
+        f'"hysteresis of={of} setpoint={setpoint} band=0.5 below={high:g} above={low:g}"'
+    )
 
 
 def _by_action(entry: Entry, actions: Sequence[Record]) -> dict[str, Entry]:

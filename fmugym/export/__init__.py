@@ -7,6 +7,7 @@ and ``write_onnx`` write it. See ``docs/deploy.md``.
 from fmugym.export.agent import Agent, agent_of
 from fmugym.export.fmus import write_fmu
 from fmugym.export.network import Activation, Layer, Network, Scaling, network_of
+from fmugym.export.onnx_model import write_onnx
 from fmugym.export.writing import write_c
 
 __all__ = [
@@ -19,4 +20,5 @@ __all__ = [
     "network_of",
     "write_c",
     "write_fmu",
+    "write_onnx",
 ]

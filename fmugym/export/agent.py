@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
@@ -63,6 +63,7 @@ def agent_of(
     *,
     name: str = "agent",
     all_inputs: bool = False,
+    external: Collection[str] = (),
 ) -> Agent:
     """Put an agent together from its task and its policy.
 
@@ -73,6 +74,8 @@ def agent_of(
         name: What functions and files are called by: letters, digits and _.
         all_inputs: Whether the agent also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
+        external: The names of data that the agent is given as measurements, forecasts of them
+            included, instead of looking them up in the task's tables.
 
     Raises:
         ConfigError: If the policy or the task cannot be exported; the text names what cannot.
@@ -81,7 +84,7 @@ def agent_of(
         raise ConfigError(f"the name must have letters, digits and _ only, got {shown(name)}")
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     with without_imperfections(env) as ideal:
-        logic = logic_of(ideal, all_inputs=all_inputs)
+        logic = logic_of(ideal, all_inputs=all_inputs, external=external)
     return Agent(name, logic, network, _notes(env, model), env.fmu.description.units)
 
 

@@ -98,8 +98,10 @@ def field_names(agent: Agent) -> list[str]:
 
 
 def _fields(agent: Agent) -> Iterator[str]:
+    settable = {agent.logic.kept[one.field].name for one in agent.logic.parameters}
     for name, kept in zip(field_names(agent), agent.logic.kept, strict=True):
-        yield f"    {c_type(kept.dtype)} {name}[{len(kept.starts)}];"
+        told = " /* a parameter: set it after the beginning */" if kept.name in settable else ""
+        yield f"    {c_type(kept.dtype)} {name}[{len(kept.starts)}];{told}"
 
 
 def source(agent: Agent) -> str:
@@ -145,7 +147,7 @@ class _Source:
 
     def _counted_uses(self) -> Counter[int]:
         uses: Counter[int] = Counter()
-        for number in self._logic.needed:
+        for number in self._logic.needed - self._logic.loads.keys():
             uses.update(self._graph.nodes[number].operands)
         uses.update(self._logic.observation)
         uses.update(self._logic.input_nodes)
@@ -166,7 +168,7 @@ class _Source:
                 value = self._value(node)
                 self._texts[number] = constant(value, letter)
                 continue
-            if node.kind in {"take"}:
+            if node.kind == "take":
                 yield from self._checked_place(node)
             text = self._expression(number, node)
             is_short = len(text) <= _LONGEST_INLINE and self._uses[number] < 2
@@ -183,7 +185,8 @@ class _Source:
             number = waiting.pop()
             if number not in found and number not in self._texts:
                 found.add(number)
-                waiting.extend(self._graph.nodes[number].operands)
+                if number not in self._logic.loads:
+                    waiting.extend(self._graph.nodes[number].operands)
         return found
 
     def _value(self, node: Node) -> Any:

@@ -177,7 +177,8 @@ class _Writer2:
         for name in ("Outputs", "InitialUnknowns"):
             group = ElementTree.SubElement(section, name)
             for index in _outputs(ports):  # the time is the first variable
-                ElementTree.SubElement(group, "Unknown", index=str(index + 1))
+                facts = {"index": str(index + 1)} | _dependencies(name)
+                ElementTree.SubElement(group, "Unknown", facts)
 
 
 class _Writer3:
@@ -212,11 +213,17 @@ class _Writer3:
     def add_structure(self, section: Any, ports: Sequence[Port]) -> None:
         for name in ("Output", "InitialUnknown"):
             for reference in _outputs(ports):
-                ElementTree.SubElement(section, name, valueReference=str(reference))
+                facts = {"valueReference": str(reference)} | _dependencies(name)
+                ElementTree.SubElement(section, name, facts)
+
+
+def _dependencies(section: str) -> dict[str, str]:
+    """Outputs depend on all inputs in the initialization, and on none between two steps."""
+    return {} if section.startswith("Initial") else {"dependencies": ""}
 
 
 def _outputs(ports: Sequence[Port]) -> Iterator[int]:
-    """The value references of the outputs; each depends on all inputs."""
+    """The value references of the outputs."""
     return (number for number, port in enumerate(ports, 1) if port.causality == "output")
 
 

@@ -7,8 +7,8 @@ and the episode variables that ``_update`` writes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from gymnasium import spaces
 from fmugym.archive.description import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.export.external import found_in
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive
@@ -108,16 +109,19 @@ class Logic:
     def needed(self) -> frozenset[int]:
         """The nodes that one sample computes."""
         updates = (node for kept in self.kept for node in kept.updates)
-        return _closure(self.graph, [*self.observation, *self.input_nodes, *updates])
+        roots = [*self.observation, *self.input_nodes, *updates]
+        return _closure(self.graph, roots, self.loads)
 
 
-def logic_of(env: FMUEnv, *, all_inputs: bool = False) -> Logic:
+def logic_of(env: FMUEnv, *, all_inputs: bool = False, external: Collection[str] = ()) -> Logic:
     """Trace what a task does between measurements and observation, and from action to inputs.
 
     Args:
         env: The environment. It is not stepped.
         all_inputs: Whether the controller also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
+        external: The names of data that the controller is given as measurements, forecasts of
+            them included, instead of looking them up in the task's tables.
 
     Raises:
         ConfigError: If a hook does what cannot be translated, or reads what a controller does not
@@ -134,7 +138,7 @@ def logic_of(env: FMUEnv, *, all_inputs: bool = False) -> Logic:
     try:
         with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
             traced = _ControllerTracer(env, {}).traced()
-        return _Assembly(env, traced, all_inputs).logic()
+        return _Assembly(env, traced, all_inputs, external).logic()
     except UntraceableError as error:
         raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
 
@@ -190,11 +194,14 @@ class _ControllerTracer(Tracer):
 class _Assembly:
     """Makes a ``Logic`` of what was traced: only what the actions depend on is kept."""
 
-    def __init__(self, env: FMUEnv, traced: _Traced, all_inputs: bool) -> None:
+    def __init__(
+        self, env: FMUEnv, traced: _Traced, all_inputs: bool, external: Collection[str]
+    ) -> None:
         self._env, self._traced, self._graph = env, traced, traced.graph
         rng = np.random.default_rng(_SEED)
         self._episode = env._plan.draw(rng)
         self._drawn = set(env._plan.drawn_names)
+        self._external = self._given(external)
         self._inputs = [
             (variable, node)
             for variable, node in zip(env._interface.inputs, traced.inputs, strict=True)
@@ -206,17 +213,28 @@ class _Assembly:
         self._fields: dict[str, int] = {}
         self._parameters: list[Parameter] = []
 
+    def _given(self, names: Collection[str]) -> dict[int, Variable]:
+        """What the controller is given, by node; names differ from those of the plant's inputs."""
+        found = found_in(self._env, names, self._graph, self._traced.observation)
+        taken = {variable.name for variable in self._env._interface.inputs}
+        return {
+            one.node: replace(one.variable, name=f"{one.variable.name}_given")
+            if one.variable.name in taken
+            else one.variable
+            for one in found
+        }
+
     def _is_chosen(self, node: int) -> bool:
-        nodes = (self._graph.nodes[number] for number in _closure(self._graph, [node]))
+        nodes = (self._graph.nodes[number] for number in self._closure([node]))
         return any(_is_row(one, _CHOSEN) for one in nodes)
 
     def logic(self) -> Logic:
         """Find all that the observation and the inputs depend on, from sample to sample."""
         roots = [*self._traced.observation, *(node for _, node in self._inputs)]
-        needed = _closure(self._graph, roots)
+        needed = self._closure(roots)
         while True:
             found = [*roots, *self._next_values(needed)]
-            longer = _closure(self._graph, found)
+            longer = self._closure(found)
             if longer == needed:
                 break
             needed = longer
@@ -229,7 +247,7 @@ class _Assembly:
         return Logic(
             self._graph,
             loads,
-            tuple(outputs[place] for place in places),
+            (*(outputs[place] for place in places), *self._external.values()),
             tuple(variable for variable, _ in self._inputs),
             tuple(node for _, node in self._inputs),
             self._traced.observation,
@@ -239,6 +257,9 @@ class _Assembly:
             env.observation_space,
             env.action_space,
         )
+
+    def _closure(self, roots: Iterable[int]) -> frozenset[int]:
+        return _closure(self._graph, roots, self._external)
 
     def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:
         return (self._graph.nodes[number] for number in sorted(needed))
@@ -343,6 +364,8 @@ class _Assembly:
         """Where a node's value comes from; None if it is computed, or a constant."""
         node = self._graph.nodes[number]
         what: Any = node.what
+        if number in self._external:
+            return "measurement", len(places) + list(self._external).index(number)
         match node.kind:
             case "missing" | "stopped":
                 raise UntraceableError(f"{what or 'it reads whether the FMU has stopped'}")
@@ -380,13 +403,13 @@ def _is_row(node: Node, kind: str) -> bool:
     return node.kind == "row" and what[0] == kind
 
 
-def _closure(graph: Graph, roots: Iterable[int]) -> frozenset[int]:
-    """Some nodes, and all that they are computed from."""
+def _closure(graph: Graph, roots: Iterable[int], known: Container[int]) -> frozenset[int]:
+    """Some nodes, and all that they are computed from, as far as they are not known."""
     found: set[int] = set()
     waiting = list(roots)
     while waiting:
         number = waiting.pop()
         if number not in found:
             found.add(number)
-            waiting.extend(graph.nodes[number].operands)
+            waiting.extend(() if number in known else graph.nodes[number].operands)
     return frozenset(found)

@@ -22,6 +22,7 @@ typeid typename union unsigned using virtual void volatile wchar_t while xor xor
 
 def identifier(text: str) -> str:
     """A name of C for a text, such as the name of a variable."""
+    text = text.replace("[+", "_in_").replace("[-", "_before_")  # of forecasts and histories
     name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_") or "x"
     name = f"n{name}" if name[0].isdigit() else name
     return f"{name}_" if name in _WORDS.split() else name

@@ -136,6 +136,8 @@ def constant(value: Any, letter: str) -> str:
     number = int(value)
     if letter in "QL":
         return f"UINT64_C({number})"
+    if number == -(2**63):  # C has no literal of it
+        return f"({constant(number + 1, letter)} - 1)"
     text = str(number) if abs(number) < 2**31 else f"INT64_C({number})"
     return text if number >= 0 else f"({text})"
 

@@ -264,12 +264,26 @@ class Instance(ABC):
         self._require(Phase.INSTANTIATED, "initialize")
         Instance.initializations += 1
         try:
+            self._configure()
             self._initialize(Span(start_time, stop_time, tolerance), set_start_values)
         except BaseException:  # initialization is incomplete: only a reset is legal now
             if self.phase is Phase.INSTANTIATED:
                 self.phase = Phase.FAILED
             raise
         self.phase = Phase.STEPPING
+
+    def _configure(self) -> None:
+        """Set structural parameters, by which arrays get their sizes."""
+        if not self._description.structure:
+            return
+        enter, leave = map(self._function, ("EnterConfigurationMode", "ExitConfigurationMode"))
+        self.check("entering the configuration mode", enter(self._component))
+        for variable, value in self._description.structure:
+            reference = np.array([variable.value_reference], np.uint32)
+            number = np.array([value], self.dtypes[variable.type])
+            _, set_, arguments = Instance.prepare_access(self, variable.type, reference, number)
+            self.check(f"setting {variable.name!r}", set_(*arguments))
+        self.check("leaving the configuration mode", leave(self._component))
 
     def reset(self) -> None:
         """Return to the state just after instantiation, start values included.

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import fmpy
 
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.events import FMI3EventsInstance
@@ -23,6 +24,7 @@ from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import Hearing
+from fmugym.fmi.ramps import RAMPED_CLASSES
 from fmugym.fmi.solver import Solving
 
 __all__ = ["Library"]
@@ -36,6 +38,14 @@ _INSTANCE_CLASSES: Final[dict[tuple[int, str], type[Instance]]] = {
     (3, "model_exchange"): FMI3ExchangeInstance,
 }
 _load_lock = threading.Lock()
+
+
+def _instance_class(description: ModelDescription, solving: Solving | None) -> type[Instance]:
+    if description.uses_event_mode:
+        return FMI3EventsInstance
+    if solving is not None and solving.ramps:
+        return RAMPED_CLASSES[description.fmi_major_version]
+    return _INSTANCE_CLASSES[description.fmi_major_version, description.interface]
 
 
 class Library:
@@ -54,11 +64,7 @@ class Library:
         self, fmu: LoadableFMU, target: logging.Logger, solving: Solving | None = None
     ) -> None:
         description = fmu.description
-        self._instance_class = (
-            FMI3EventsInstance
-            if description.uses_event_mode
-            else _INSTANCE_CLASSES[description.fmi_major_version, description.interface]
-        )
+        self._instance_class = _instance_class(description, solving)
         self._solving = solving
         self._fmu = fmu
         self._target = target

@@ -43,11 +43,15 @@ class Solving:
         solver: The method, one of ``METHODS``.
         tolerance: Relative.
         max_step: The longest step in seconds; infinite for no limit.
+        ramps: The value references of inputs that change linearly, in co-simulation.
+        ramp_duration: How long each change takes, in seconds.
     """
 
     solver: str = "dormand_prince"
     tolerance: float = 1e-6
     max_step: float = math.inf
+    ramps: tuple[int, ...] = ()
+    ramp_duration: float = 1.0
 
 
 _MEMORY: Final = struct.Struct("=dddqq")

@@ -102,17 +102,29 @@ def _place_of_resources(folder: Path, version: int) -> Path:
     return folder if version == 1 else folder / "resources"
 
 
-def library_settings(description: ModelDescription, place: PlaceOfFMU) -> dict[str, Any]:
+def library_settings(
+    description: ModelDescription, spec: PoolSpec, place: PlaceOfFMU
+) -> dict[str, Any]:
     """What to load, and what is known of it."""
     return {
         "version": table_of(description),
-        "manner": manner_of(description),
+        "manner": manner_of(description, spec),
         "model": description.model_identifier.encode(),
         "token": description.instantiation_token.encode(),
         "resources": place.resources,
         "paths": place.paths,
         "states": description.capabilities.can_get_and_set_fmu_state,
         "categories": tuple(c.encode() for c in description.error_categories),
+    } | _structural_settings(description)
+
+
+def _structural_settings(description: ModelDescription) -> dict[str, bytes]:
+    """The value references and the values of structural parameters."""
+    references = [variable.value_reference for variable, _ in description.structure]
+    values = [value for _, value in description.structure]
+    return {
+        "structural_references": np.array(references, np.uint32).tobytes(),
+        "structural_values": np.array(values, np.uint64).tobytes(),
     }
 
 
@@ -150,9 +162,11 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
     model = description.model_exchange
     clocks = clocks_of(description)
     if model is None:
-        if not description.uses_event_mode:
+        if not description.uses_event_mode and not spec.ramped:
             return None
-        return (b"by_fmu", 1.0, math.inf, 0, 0, False, None, None, *clocks)
+        ramps = np.array([v.value_reference for v in spec.ramped], np.uint32).tobytes()
+        by_fmu = b"by_fmu", 1.0, math.inf, 0, 0, False, None, None
+        return (*by_fmu, *clocks, ramps, spec.time_step)
     solving, states, rates = spec.solving, None, None
     if description.capabilities.provides_directional_derivatives and model.state_references:
         states = np.array(model.state_references, np.uint32).tobytes()
@@ -167,14 +181,18 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
         states,
         rates,
         *clocks,
+        b"",
+        spec.time_step,
     )
 
 
-def manner_of(description: ModelDescription) -> int:
+def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
     """The number of the way in which the FMU is run, one of ``enum Manner`` of ``native/fmi.h``."""
     if description.model_exchange is not None:
         return 1
-    return 2 if description.uses_event_mode else 0
+    if description.uses_event_mode:
+        return 2
+    return 3 if spec.ramped else 0
 
 
 def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:

@@ -137,6 +137,7 @@ class PoolSpec:
         solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
         max_step: The longest step of the solver, in seconds; None for no limit other than the
             communication step.
+        ramped: The inputs that change linearly within each step, from the value of the last one.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
             FMU's states can be saved; see ``fmugym.pool.saving``.
     """
@@ -167,6 +168,7 @@ class PoolSpec:
     records: bool = False
     solver: str = SOLVERS[0]
     max_step: float | None = None
+    ramped: tuple[Variable, ...] = ()
 
     def communication_point(self, count: int, start_time: float | None = None) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift.
@@ -196,7 +198,8 @@ class PoolSpec:
     def solving(self) -> Solving:
         """How the equations of FMUs of model exchange are solved."""
         tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
-        return Solving(self.solver, tolerance, self.max_step or math.inf)
+        ramps = tuple(v.value_reference for v in self.ramped)
+        return Solving(self.solver, tolerance, self.max_step or math.inf, ramps, self.time_step)
 
     @property
     def communication_step_size(self) -> float:

@@ -50,7 +50,7 @@ def system_settings(
 def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
     description = part.description
     version = description.fmi_major_version
-    known = library_settings(description, PlaceOfFMU.here(folder, (), version))
+    known = library_settings(description, spec, PlaceOfFMU.here(folder, (), version))
     label = part.label
     numbers = [(v, float(x)) for v, x in part.starts if v.numeric]
     texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
@@ -60,7 +60,7 @@ def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
             label.encode(),
             f"{label}, whose outputs are not finite".encode(),
         ),
-        (version, manner_of(description), part.has_mode),
+        (version, manner_of(description, spec), part.has_mode),
         (known["model"], known["token"], known["resources"]),
         known["categories"],
         part.component.steps,

@@ -16,7 +16,7 @@ import numpy as np
 
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError
-from fmugym.series.store import imported
+from fmugym.extras import imported
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 

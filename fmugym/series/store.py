@@ -8,17 +8,17 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
 
 from fmugym.errors import ConfigError, shown
+from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
 from fmugym.task.quantity import Quantity
 
-__all__ = ["FAULT", "WHOLE", "Block", "Memory", "Store", "heading", "imported", "open_store"]
+__all__ = ["FAULT", "WHOLE", "Block", "Memory", "Store", "heading", "open_store"]
 
 FAULT: Final = "fault"
 """The last column: the reason of a fault, a text."""
@@ -192,18 +192,3 @@ class ParquetStore:
                 self._write()
             self._writer.close()
             self._file.close()
-
-
-def imported(module: str, extra: str) -> Any:
-    """Import a library of an extra.
-
-    Raises:
-        ConfigError: If it is missing.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise ConfigError(
-            f"this needs {module.partition('.')[0]}, which cannot be imported; install the extra: "
-            f"pip install 'fmugym-toolbox[{extra}]'"
-        ) from error

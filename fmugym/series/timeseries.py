@@ -12,8 +12,9 @@ import numpy as np
 
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
-from fmugym.series.store import FAULT, WHOLE, Block, imported, open_store
+from fmugym.series.store import FAULT, WHOLE, Block, open_store
 from fmugym.task.quantity import Quantity
 
 __all__ = ["TimeSeries"]

@@ -1,4 +1,11 @@
 """Systems: several FMUs that run as one.
 
-``plan`` says what a master executes, ``fmu`` makes a system look like an FMU.
+``system`` holds what users make, ``plan`` says what a master executes, ``fmu`` makes a system look
+like an FMU.
 """
+
+from fmugym.systems.components import Component
+from fmugym.systems.connections import Connection
+from fmugym.systems.system import FMUSystem
+
+__all__ = ["Component", "Connection", "FMUSystem"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import count
 from typing import Final
@@ -113,7 +113,12 @@ def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabi
     }
     restrictions = ("can_be_instantiated_only_once_per_process", "needs_execution_tool")
     able |= {name: any(getattr(one, name) for one in flags) for name in restrictions}
-    return replace(Capabilities(**able), provides_directional_derivatives=False)
+    return replace(
+        Capabilities(**able),
+        provides_directional_derivatives=False,
+        provides_adjoint_derivatives=False,
+        can_interpolate_inputs=False,
+    )
 
 
 def _units(parts: Iterable[ModelDescription]) -> dict[str, Unit]:
@@ -128,13 +133,13 @@ def _variables(
     plan: SystemPlan, parts: Sequence[ModelDescription]
 ) -> tuple[dict[str, Variable], tuple[tuple[PartVariable, ...], ...]]:
     numbers = count()
-    linked = {(link.target, link.input) for link in plan.links}
+    driven = _driven(plan)
     variables: dict[str, Variable] = {}
     ends: list[tuple[PartVariable, ...]] = []
     for index, (component, part) in enumerate(zip(plan.components, parts, strict=True)):
-        for own in _scalars(part):
-            is_linked = (component.name, own.name) in linked
-            variable = _renamed(own, f"{component.name}.{own.name}", next(numbers), is_linked)
+        for own in _scalars(part, component.starts):
+            is_driven = (component.name, own.name) in driven
+            variable = _renamed(own, f"{component.name}.{own.name}", next(numbers), is_driven)
             variables[variable.name] = variable
             ends.append((PartVariable(index, own),))
     for connector in plan.connectors:
@@ -146,15 +151,40 @@ def _variables(
     return variables, tuple(ends)
 
 
-def _scalars(part: ModelDescription) -> Iterator[Variable]:
+def _driven(plan: SystemPlan) -> set[tuple[str, str]]:
+    """What a link or a connector of the system sets: it cannot be set by another name."""
+    driven = {(link.target, link.input) for link in plan.links}
+    for connector in plan.connectors:
+        if connector.causality != "output":
+            driven |= {(end.component, end.variable) for end in connector.ends}
+    return driven
+
+
+def _scalars(
+    part: ModelDescription, starts: Sequence[tuple[str, float | str]]
+) -> Iterator[Variable]:
     """Arrays, binary values and clocks cannot be variables of a system."""
-    return (v for v in part.variables.values() if v.numeric or (v.kind == "string" and not v.shape))
+    values = dict(starts)
+    for variable in part.variables.values():
+        if variable.numeric or (variable.kind == "string" and not variable.shape):
+            yield _started(variable, values)
 
 
-def _renamed(own: Variable, name: str, reference: int, is_linked: bool) -> Variable:
-    """An input that another component drives cannot be set from outside."""
+def _started(variable: Variable, values: Mapping[str, float | str]) -> Variable:
+    """The variable with the start value that the system gives it, as the XML would have it."""
+    if variable.name not in values:
+        return variable
+    value = values[variable.name]
+    if variable.kind == "boolean":
+        return replace(variable, start="true" if value else "false")
+    is_whole = variable.kind in {"integer", "enumeration"}
+    return replace(variable, start=str(int(value)) if is_whole else str(value))
+
+
+def _renamed(own: Variable, name: str, reference: int, is_driven: bool) -> Variable:
+    """What something else drives cannot be set from outside."""
     variable = replace(own, name=name, value_reference=reference)
-    return replace(variable, causality="local", initial=None) if is_linked else variable
+    return replace(variable, causality="local", initial=None) if is_driven else variable
 
 
 def _behind(plan: SystemPlan, parts: Sequence[ModelDescription], end: End) -> PartVariable:
@@ -162,7 +192,9 @@ def _behind(plan: SystemPlan, parts: Sequence[ModelDescription], end: End) -> Pa
     if end.component not in names:
         raise unknown_name(f"component of {plan.name}", end.component, names)
     part = names.index(end.component)
-    return PartVariable(part, parts[part].variable(end.variable), end.gain, end.offset)
+    starts = dict(plan.components[part].starts)
+    variable = _started(parts[part].variable(end.variable), starts)
+    return PartVariable(part, variable, end.gain, end.offset)
 
 
 def _connector_variable(connector: Connector, first: PartVariable, reference: int) -> Variable:

@@ -20,6 +20,7 @@ from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, highest_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool import Pool, PoolSpec
+from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
@@ -81,7 +82,7 @@ class Constructed(Pictured):
 
     def _construct(
         self,
-        fmu_path: str | os.PathLike[str],
+        fmu_path: str | os.PathLike[str] | FMUSystem,
         config: Mapping[str, Any] | EnvConfig,
         log_level: int,
         render_mode: str | None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ class OwnHooks:
     get_observation: bool
     get_info: bool
     goal_reward: bool
+    reward_policy: bool
     get_action_space: bool
 
     @classmethod
@@ -53,6 +55,20 @@ def _is_own(env: Hooks, base: type[Any], name: str) -> bool:
     name = name if name in {"step", "reset"} else f"_{name}"
     found = getattr(env, name)
     return getattr(found, "__func__", found) is not getattr(base, name)
+
+
+def _environments_first(values: Any) -> Any:
+    """View an array with its last axis first."""
+    if type(values) is np.ndarray and values.ndim <= 2:
+        return values.T  # moveaxis takes ten times as long
+    return np.moveaxis(values, -1, 0)
+
+
+def _with_copied_goals(observation: Any) -> Any:
+    if type(observation) is not dict:
+        return observation
+    names = [name for name in ("achieved_goal", "desired_goal") if name in observation]
+    return observation | {name: copy(observation[name]) for name in names}
 
 
 class Hooks(gymnasium.Env[Any, Any], ABC):
@@ -130,8 +146,19 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
                 "'desired_goal'"
             ) from None
         if not isinstance(self.done, bool):
-            achieved, desired = np.moveaxis(achieved, -1, 0), np.moveaxis(desired, -1, 0)
+            achieved, desired = _environments_first(achieved), _environments_first(desired)
         return self._goal_reward(achieved, desired)
+
+    def _reward_and_observation(self) -> tuple[Any, Any]:
+        """Ask the hooks for both, and for the observation once.
+
+        ``_goal_reward`` gets copies: what it does to them must not change the observation.
+        """
+        if self._own.reward_policy or not self._own.goal_reward:
+            reward = self._reward_policy()
+            return reward, self._get_observation()
+        observation = self._get_observation()
+        return self._reward_for_goals(_with_copied_goals(observation)), observation
 
     def _fault_reward(self) -> Any:
         """The reward of a step that failed; by default ``fault_reward`` of the config.

@@ -13,6 +13,7 @@ from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.fmi.access import unlisted
 from fmugym.pool.spec import (
     FIXED_STEP_SOLVERS,
     START_TIME,
@@ -30,6 +31,7 @@ __all__ = [
     "resolve",
     "start_values",
     "start_variable",
+    "structural_values",
 ]
 
 _Value = TypeVar("_Value")
@@ -151,7 +153,33 @@ class Interface:
             samplings=self._samplings(),
             solver=config.solver,
             max_step=self._max_step(),
+            ramped=self._ramped(),
         )
+
+    def _ramped(self) -> tuple[Variable, ...]:
+        """The inputs that change linearly within a step.
+
+        Raises:
+            ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real.
+        """
+        names = self.config.ramped_inputs
+        if names and not self.description.capabilities.can_interpolate_inputs:
+            raise ConfigError(
+                f"config key 'input_interpolation': {self.description.model_name} "
+                f"(FMI {self.description.fmi_version}) cannot interpolate inputs, which is an "
+                "option of FMI 1.0 and 2.0 for co-simulation; its inputs can only hold"
+            )
+        inputs = {variable.name: variable for variable in self.inputs}
+        ramped = tuple(inputs[name] for name in names)
+        for variable in ramped:
+            found = variable.kind, variable.variability, variable.causality, variable.shape
+            if found != ("real", "continuous", "input", ()):
+                raise ConfigError(
+                    f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
+                    f"a {variable.variability} {variable.causality} of type {variable.type}, "
+                    "expected a continuous Real input"
+                )
+        return ramped
 
     def _max_step(self) -> float | None:
         """The config's, or else, for a solver of fixed steps, the FMU's default step size."""
@@ -198,7 +226,9 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     Raises:
         ConfigError: If a name is unknown, or its variable cannot be used in that role.
     """
-    given = start_values(description, config.model_parameters)
+    structural = structural_values(description, config.model_parameters)
+    starts = {n: value for n, value in config.model_parameters.items() if n not in structural}
+    given = start_values(description, starts)
     drawn = {"start_time": config.start_time} if config.draws_start_time else {}
     inputs = _resolved(description, config.model_input_names, _check_input)
     read = outputs_named(description, config.model_output_names + config.monitor_names)
@@ -206,6 +236,8 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     outputs = read[: len(read) - len(monitors)]
     bounded = inputs + outputs
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
+    _check_rest_is_known(inputs)
+    _check_no_arrays_beside_clocks(description, inputs)
     return Interface(
         inputs=inputs,
         outputs=outputs,
@@ -216,6 +248,19 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         description=description,
         limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
     )
+
+
+def _check_no_arrays_beside_clocks(
+    description: ModelDescription, inputs: Sequence[Variable]
+) -> None:
+    """Inputs are set one by one where some of them wait for clocks."""
+    arrays = [variable for variable in inputs if variable.array is not None]
+    if arrays and description.clocked_inputs:
+        raise ConfigError(
+            f"{arrays[0].name!r} cannot be an input: it belongs to an array, and "
+            f"{description.model_name} has inputs with clocks, such as "
+            f"{description.clocked_inputs[0].name!r}"
+        )
 
 
 def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
@@ -308,7 +353,36 @@ def start_values(
             found.setdefault(variable.name, pair)
             if variable.name == name:
                 elements[name] = pair
+    _check_rest_is_known([variable for variable, _ in found.values()])
     return [elements.get(name, pair) for name, pair in found.items()]
+
+
+def _check_rest_is_known(variables: Sequence[Variable]) -> None:
+    """Elements that are not written keep their start values, but who knows those of a new size?"""
+    for missing in unlisted(variables):
+        array = missing.array
+        if array is not None and array.start is None and array.dimensions:
+            raise ConfigError(
+                f"there is no value of {missing.name!r}: {array.name!r} has a size of its own, "
+                f"{array.shape}, for which the FMU has no start values; give all elements"
+            )
+
+
+def structural_values(description: ModelDescription, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the given values that are of structural parameters, by which arrays get their sizes.
+
+    Raises:
+        ConfigError: If one is a distribution: the sizes of spaces do not change.
+    """
+    found = {n: v for n, v in given.items() if n in description.variables}
+    found = {n: v for n, v in found.items() if description.variables[n].is_structural}
+    for name, value in found.items():
+        if is_distribution(value):
+            raise ConfigError(
+                f"{name!r} is a structural parameter: it cannot be drawn, since spaces keep their "
+                f"sizes; expected an integer, got {shown(value)}"
+            )
+    return found
 
 
 def spread(name: str, scalars: Sequence[Variable], value: Any) -> list[Any]:
@@ -360,11 +434,6 @@ def _check_input(description: ModelDescription, variable: Variable) -> None:
             f"{variable.name!r} cannot be an input: it is a {variable.variability} "
             f"{variable.causality}; only inputs and tunable parameters may be set between steps"
         )
-    if variable.array is not None and description.clocks:
-        raise ConfigError(
-            f"{variable.name!r} cannot be an input: it is an element of an array, and inputs of "
-            f"FMUs with clocks must be scalars, as in {description.model_name}"
-        )
 
 
 def output_variable(description: ModelDescription, name: str) -> Variable:
@@ -400,12 +469,26 @@ def _require_known_clock(description: ModelDescription, variable: Variable, role
 
 
 def _require_numeric(variable: Variable, role: str) -> None:
-    if not variable.numeric:
-        what = "an array" if variable.shape else f"of type {variable.type}"
+    if variable.numeric:
+        return
+    if variable.is_number:
         raise ConfigError(
-            f"{variable.name!r} cannot be {role}: it is {what}; expected a scalar Real, "
-            "Integer, Boolean or Enumeration"
+            f"{variable.name!r} cannot be {role}: it is an array; name its elements, as in "
+            f"'{variable.name}[1]'"
         )
+    element = "" if variable.array is None else "an element of an array "
+    raise ConfigError(
+        f"{variable.name!r} cannot be {role}: it is {element}of type {variable.type}; "
+        f"expected a Real, Integer, Boolean or Enumeration{_CURES.get(variable.type, '')}"
+    )
+
+
+_CURES: Final = {
+    "String": ". A scalar String can be given a text in 'model_parameters'; to read one, let the "
+    "FMU tell the same by a number or an Enumeration",
+    "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
+    "numbers",
+}
 
 
 def start_variable(description: ModelDescription, name: str, value: Any) -> Variable:
@@ -424,12 +507,17 @@ def _check_start(variable: Variable, value: Any) -> None:
     name = variable.name
     if variable.ticking:
         raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
+    if variable.is_structural:
+        raise ConfigError(
+            f"{name!r} cannot be set here: it is a structural parameter, which is set under "
+            "'model_parameters' of the config"
+        )
     if not variable.settable_at_start:
         raise ConfigError(
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "
             f"with initial={variable.initial!r}"
         )
-    if variable.kind == "string" and not variable.shape:
+    if variable.kind == "string" and not variable.shape and variable.array is None:
         _require_text(name, value)
     else:
         _require_numeric(variable, "given a start value")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -19,7 +19,10 @@ from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
+from fmugym.systems import FMUSystem
+from fmugym.systems.fmu import SystemFMU
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.interface import structural_values
 from fmugym.trial.opening import make_pool
 
 __all__ = ["PoolOpening", "deferred_pools", "env_numbers", "open_fmu", "pools_are_deferred"]
@@ -53,13 +56,16 @@ def pools_are_deferred() -> bool:
 
 
 def open_fmu(
-    cls: type, path: str | os.PathLike[str], config: EnvConfig, interface: str | None = None
+    cls: type,
+    path: str | os.PathLike[str] | FMUSystem,
+    config: EnvConfig,
+    interface: str | None = None,
 ) -> FMU:
     """Open the FMU of an environment; relative paths start at the folder of its class's file.
 
     Args:
         cls: The class of the environment.
-        path: The file.
+        path: The ``.fmu`` file, the ``.ssp`` file of a system, or a system.
         config: The environment's config.
         interface: The only interface that the class can use; None for any.
 
@@ -67,7 +73,12 @@ def open_fmu(
         ConfigError: If an argument is invalid.
         FMULoadError: If the file is missing or not a valid FMU.
     """
+    if isinstance(path, FMUSystem):
+        return _shared((path, config.probe_timeout), lambda: _open_system(path, config))
     file = _find_file(cls, check_path("fmu_path", path))
+    if file.suffix.lower() == ".ssp":
+        key = file, repr(config.archive_limits), config.probe_timeout
+        return _shared(key, lambda: _open_system(_read_system(file, config), config))
     preload = [_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload]
     arguments: dict[str, Any] = {
         "limits": config.archive_limits,
@@ -75,13 +86,35 @@ def open_fmu(
         "probe_timeout": config.probe_timeout,
         "interface": _interface_of(cls, config.interface, interface),
     }
+    fmu = _shared((file, repr(arguments)), lambda: FMU(file, **arguments))
+    sizes = structural_values(fmu.description, config.model_parameters)
+    if not sizes:
+        return fmu
+    arguments |= {"sizes": sizes}
+    return _shared((file, repr(arguments)), lambda: FMU(file, **arguments))
+
+
+def _shared(key: Any, open_it: Callable[[], FMU]) -> FMU:
+    """Open an FMU, unless an environment that is made in the same context has done so."""
     known = _fmus.get()
     if known is None:
-        return FMU(file, **arguments)
-    key = file, repr(arguments)
+        return open_it()
     if key not in known:
-        known[key] = FMU(file, **arguments)
+        known[key] = open_it()
     return known[key]
+
+
+def _read_system(file: Path, config: EnvConfig) -> FMUSystem:
+    return FMUSystem.read(file, config.archive_limits)
+
+
+def _open_system(system: FMUSystem, config: EnvConfig) -> FMU:
+    for key in ("preload", "interface"):
+        if getattr(config, key):
+            raise ConfigError(
+                f"config key {key!r} is for a single FMU; give it to a component of {system.name!r}"
+            )
+    return SystemFMU(system.plan, probe_timeout=config.probe_timeout)
 
 
 def _interface_of(cls: type, wanted: str | None, own: str | None) -> str | None:

@@ -96,9 +96,10 @@ def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) 
     env.done = done
     if own.is_truncated:
         cut_off = form.flags("_is_truncated", env._is_truncated()) | cut_off
-    reward = env._reward_policy()
+    if observed is None:
+        reward, observed = env._reward_and_observation()
+    else:
+        reward = env._reward_policy()
     if type(reward) is not form.reward_type:
         reward = form.rewards(reward)
-    if observed is None:
-        observed = env._get_observation()
     return observed, reward, done, cut_off

@@ -166,9 +166,8 @@ class LateDict(dict[str, Any]):
     @classmethod
     def of(cls, fill: Callable[..., Mapping[str, Any]], *arguments: Any) -> LateDict:
         """Make a dict in a third of the time that a Python constructor takes."""
-        late: LateDict = dict.__new__(cls)
+        late = cls(_EMPTY)
         late._fill = fill, arguments
-        dict.__setitem__(late, _UNFILLED, None)  # json.dumps writes {} for an empty dict
         return late
 
     def _filled(self) -> dict[str, Any]:
@@ -186,6 +185,7 @@ class LateDict(dict[str, Any]):
 
 
 _UNFILLED: Final = "fmugym: not filled yet"
+_EMPTY: Final = {_UNFILLED: None}  # json.dumps writes {} for a dict without items
 
 _NOT_OF_THE_ITEMS: Final = {
     *("__class_getitem__", "__getattribute__", "__hash__", "__init__", "__new__", "fromkeys"),

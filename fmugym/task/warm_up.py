@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, Final
@@ -25,12 +26,16 @@ from fmugym.pool.states import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
+from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.trial.trial import state_files
 
 __all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
 
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
+
+_COMPILER: Final = "fmugym.vector.warming"
+"""It lies above this room, and it takes a while to import."""
 
 _WARNING: Final = int(Status.WARNING)  # which is compared in less time
 
@@ -41,7 +46,7 @@ class WarmUp(ABC):
     """What happens in a warm-up.
 
     Its methods read the environment as hooks do. The readings are arrays with M environments on the
-    last axis, also in a single environment. ``step_count`` rises to 0.
+    last axis, also in a single environment, or symbols. ``step_count`` rises to 0.
 
     Attributes:
         steps: How many steps it has.
@@ -49,6 +54,7 @@ class WarmUp(ABC):
         depends_on: The episode variables on which it depends.
         writes: The episode variables that it writes.
         digest: Tells it from others that lead to other states.
+        starts: The numbers that its controllers remember, at the beginning.
     """
 
     steps: int
@@ -56,18 +62,24 @@ class WarmUp(ABC):
     depends_on: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     digest: str = ""
+    starts: tuple[float, ...] = ()
 
     @abstractmethod
-    def begin(self, count: int) -> None:
-        """Prepare for the warm-up of some environments.
+    def decide(self, env: Any, state: Sequence[Any]) -> tuple[Mapping[int, Any], tuple[Any, ...]]:
+        """Choose actions.
 
         Args:
-            count: M.
+            env: The environment.
+            state: What the controllers remember, in the order of ``starts``.
+
+        Returns:
+            The elements of the action that are chosen, by their places, and what the controllers
+            remember then.
         """
 
     @abstractmethod
     def inputs(self, env: Any) -> Any:
-        """Return the FMU's inputs for the next step, each a number or an array of shape (M,)."""
+        """Return the FMU's inputs that follow from the action, numbers or of shape (M,)."""
 
     @abstractmethod
     def update(self, env: Any) -> None:
@@ -139,6 +151,9 @@ class WarmUps:
         self._scope = b""
         self._keys: dict[int, bytes] = {}
         self._has_told = False
+        self._in_pass: Any = None
+        self._prepared_for: Pool | None = None
+        self._left = STEPS_BEFORE
 
     # States that are known
 
@@ -229,20 +244,46 @@ class WarmUps:
             SimulationError: If an FMU fails.
             ConfigError: If an input does not fit its type.
         """
-        count, warm_up = len(indices), self._warm_up
         skip = np.ones(pool.num_instances, np.bool_)
         skip[indices] = False
-        warm_up.begin(count)
+        compiled = self._compiled(pool, len(indices))
+        run = self._run_in_python if compiled is None else compiled.run
+        variables = run(pool, readings, indices, skip)
+        for index in indices[pool.statuses[indices] > _WARNING].tolist():
+            raise failed_reset(self._located(pool, index))
+        self._keep(pool, variables, indices)
+        return variables
+
+    def _compiled(self, pool: Pool, count: int) -> Any:
+        """What does warm-ups in the pool's pass; None until that is worth its time, or for good."""
+        if self._left > 0:
+            self._left -= count * self._warm_up.steps
+        elif self._prepared_for is not pool:
+            self._prepared_for = pool
+            self._in_pass = import_module(_COMPILER).compiled(self._env, self._warm_up, pool)
+        return self._in_pass
+
+    def _run_in_python(
+        self,
+        pool: Pool,
+        readings: Readings,
+        indices: IndexArray,
+        skip: npt.NDArray[np.bool_],
+    ) -> dict[str, Any]:
+        count, warm_up = len(indices), self._warm_up
+        state = tuple(np.full(count, start) for start in warm_up.starts)
         with reading(self._env, readings), np.errstate(all="ignore"):
             env: Any = self._env
             for step in range(-warm_up.steps, 0):
                 env.step_count = np.full(count, step)
+                chosen, state = warm_up.decide(env, state)
+                env.previous_action, env.action = env.action, np.array(env.action)
+                for place, value in chosen.items():
+                    env.action[place if env.action.ndim > 1 else ...] = value
                 self._step(pool, indices, skip)
                 env.step_count = np.full(count, step + 1)
                 warm_up.update(env)
-            variables = {name: env.variables[name] for name in warm_up.writes}
-        self._keep(pool, variables, indices)
-        return variables
+            return {name: env.variables[name] for name in warm_up.writes}
 
     def _step(self, pool: Pool, indices: IndexArray, skip: npt.NDArray[np.bool_]) -> None:
         env: Any = self._env

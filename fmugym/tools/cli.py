@@ -2,7 +2,7 @@
 
 ::
 
-    fmugym info model.fmu [--all] [--filter GLOB]
+    fmugym info model.fmu|system.ssp|task.toml [--all] [--filter GLOB] [--plot system.svg]
     fmugym new model.fmu [--class] [--output task.toml]
     fmugym validate TASK|model.fmu
     fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
@@ -12,12 +12,14 @@
         [KEY=VALUE ...]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
-    fmugym export AGENT --task TASK --output agent.c|agent.fmu [--algorithm PPO] [--all-inputs]
-        [--fmi 2.0|3.0] [--platform NAME ...]
+    fmugym export AGENT --task TASK --output agent.c|agent.fmu|agent.onnx [--algorithm PPO]
+        [--all-inputs] [--external NAME ...] [--fmi 2.0|3.0] [--platform NAME ...]
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
         [--every SECONDS]
     fmugym bench TASK|model.fmu [--envs N ...] [--seconds S]
+    fmugym dataset NAME --task TASK [--log plant.csv ... | --recording FILE ... | WHO] [EPISODES]
+    fmugym dataset NAME --output FOLDER
     fmugym demo [--seed N] [--output picture.png]
     fmugym skeleton model.fmu [--output my_env.py]
     fmugym stand-in model.fmu [--folder FOLDER]
@@ -62,6 +64,8 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
   ``nominal``, ``start`` (in the variable's type; a text for arrays and for what is malformed or not
   finite), ``items`` (each with ``name`` and ``value``), ``description``, ``settable_at_start`` and
   ``settable_in_step``
+- ``system``: for systems only: ``components``, ``connections``, ``connectors``, ``master``,
+  ``order`` (groups of components, each with ``is_loop``) and ``loops`` (lists of connections)
 """
 
 from __future__ import annotations
@@ -74,6 +78,7 @@ from importlib.metadata import version
 from typing import Final
 
 from fmugym.errors import FMUGymError
+from fmugym.tools.datasets import add_dataset
 from fmugym.tools.exporting import add_export
 from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import (
@@ -95,7 +100,8 @@ _INTERRUPTED: Final = 130
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
-    *(add_evaluate, add_record, add_bench, add_demo, add_skeleton, add_stand_in, add_compile),
+    *(add_evaluate, add_record, add_bench, add_dataset, add_demo),
+    *(add_skeleton, add_stand_in, add_compile),
 )
 
 

@@ -12,9 +12,9 @@ from typing import Any, Final
 from fmugym.checks import check_option, number_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.extras import imported
 from fmugym.series import RecordSeries, RecordVectorSeries
 from fmugym.series.pictures import COLOURS, drawing_style
-from fmugym.series.store import imported
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve"]

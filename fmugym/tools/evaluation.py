@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.env import FMUEnv
-from fmugym.series.store import imported
+from fmugym.extras import imported
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Policy, Summary, simulate

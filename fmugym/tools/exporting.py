@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from fmugym.archive.description import Variable
 from fmugym.errors import ConfigError, shown
-from fmugym.export import Agent, agent_of, write_c, write_fmu
+from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.tools.agents import load_agent
@@ -22,14 +22,18 @@ __all__ = ["add_export"]
 
 def add_export(commands: Commands) -> None:
     """Add ``export``."""
-    text = "write a trained agent as C or as an FMU, with everything around its network"
+    text = "write a trained agent as C, an FMU or ONNX, with everything around its network"
     command = add_command(commands, "export", _export, text)
     command.add_argument(
         "agent", type=Path, metavar="AGENT", help="a folder of train, or a zip file of a model"
     )
     command.add_argument("--task", required=True, metavar="TASK", help=HELP_OF_TASK)
     command.add_argument(
-        "--output", type=Path, required=True, metavar="FILE", help="a new file: agent.c, agent.fmu"
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="a new file: agent.c, agent.fmu or agent.onnx",
     )
     command.add_argument(
         "--algorithm", default="PPO", help="of a zip file: PPO (default), A2C, SAC, TD3, DQN ..."
@@ -38,6 +42,13 @@ def add_export(commands: Commands) -> None:
         "--all-inputs",
         action="store_true",
         help="also write inputs that no action changes, such as weather from data",
+    )
+    command.add_argument(
+        "--external",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="data of the task that the agent is given, instead of having them in tables",
     )
     command.add_argument(
         "--fmi", choices=FMI_VERSIONS, default="2.0", help="version of an FMU; default 2.0"
@@ -61,9 +72,8 @@ def _export(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{shown(str(output.parent))} is no folder")
     model, normalization = load_agent(arguments.agent, arguments.algorithm)
     with closing(maker_of(arguments.task)()) as env:
-        agent = agent_of(
-            env, model, normalization, name=output.stem, all_inputs=arguments.all_inputs
-        )
+        options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
+        agent = agent_of(env, model, normalization, name=output.stem, **options)
     files = _WRITERS[output.suffix](agent, output, arguments)
     _show(agent, files, arguments)
 
@@ -80,9 +90,14 @@ def _as_fmu(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[P
     return [write_fmu(agent, output, fmi_version=arguments.fmi, platforms=platforms)]
 
 
+def _as_onnx(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+    return [write_onnx(agent, output)]
+
+
 _WRITERS: Final[dict[str, Callable[[Agent, Path, argparse.Namespace], list[Path]]]] = {
     ".c": _as_c,
     ".fmu": _as_fmu,
+    ".onnx": _as_onnx,
 }
 
 

@@ -12,7 +12,7 @@ from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
 from fmugym.declared.writing import as_toml
 from fmugym.errors import ConfigError, shown
-from fmugym.series.store import imported
+from fmugym.extras import imported
 from fmugym.tools.options import (
     Commands,
     add_command,

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 from fmugym.archive.fmu import FMU
+from fmugym.errors import ConfigError
 from fmugym.tools.compiling import compile_fmu
 from fmugym.tools.options import (
     Commands,
@@ -22,6 +23,7 @@ from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.proposal import Proposal
 from fmugym.tools.skeleton import Skeleton
 from fmugym.tools.stand_in import build_stand_in
+from fmugym.tools.systems import as_text_of_system, open_model, open_system, overview_of_system
 from fmugym.tools.targets import maker_of
 from fmugym.tools.validation import validate
 
@@ -30,10 +32,16 @@ __all__ = ["add_compile", "add_info", "add_new", "add_skeleton", "add_stand_in",
 
 def add_info(commands: Commands) -> None:
     """Add ``info``."""
-    text = "say what an FMU is, where it runs, and which variables it has"
+    text = "say what an FMU or a system is, where it runs, and which variables it has"
     command = add_command(commands, "info", _info, text)
     _add_fmu(command)
     add_json(command)
+    command.add_argument(
+        "--plot",
+        type=Path,
+        metavar="FILE",
+        help="draw the system of an SSP archive or a task file, for example system.svg",
+    )
     command.add_argument("--all", action="store_true", help="list local and other variables too")
     command.add_argument(
         "--filter",
@@ -48,8 +56,18 @@ def _add_fmu(command: argparse.ArgumentParser) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    facts = overview(FMU(arguments.fmu), everything=arguments.all, pattern=arguments.filter)
-    say(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else as_text(facts))
+    system = open_system(arguments.fmu)
+    wanted = {"everything": arguments.all, "pattern": arguments.filter}
+    if system is None:
+        if arguments.plot is not None:
+            raise ConfigError("--plot is for systems; an FMU alone has no connections to draw")
+        facts = overview(FMU(arguments.fmu), **wanted)
+    else:
+        facts = overview_of_system(system, **wanted)
+        if arguments.plot is not None:
+            system.plot(arguments.plot)
+    text = as_text if system is None else as_text_of_system
+    say(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else text(facts))
 
 
 def add_new(commands: Commands) -> None:
@@ -75,7 +93,7 @@ def _new(arguments: argparse.Namespace) -> None:
         _skeleton(arguments)
         return
     output: Path | None = arguments.output
-    proposal = Proposal(FMU(arguments.fmu), None if output is None else output.parent)
+    proposal = Proposal(open_model(arguments.fmu), None if output is None else output.parent)
     text, notes = proposal.text(), list(proposal.notes())
     if not arguments.json:
         write_text(text, output, notes)
@@ -92,7 +110,7 @@ def add_skeleton(commands: Commands) -> None:
 
 
 def _skeleton(arguments: argparse.Namespace) -> None:
-    skeleton = Skeleton(FMU(arguments.fmu))
+    skeleton = Skeleton(open_model(arguments.fmu))
     text, notes = skeleton.text(), list(skeleton.notes())
     if not arguments.json:
         write_text(text, arguments.output, notes)

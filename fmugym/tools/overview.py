@@ -18,7 +18,7 @@ from fmugym.archive.packages import missing_tool, source_of
 from fmugym.errors import FMULoadError, printable
 from fmugym.trial.trial import known_verdict
 
-__all__ = ["as_text", "overview", "plain", "start_value"]
+__all__ = ["as_text", "overview", "plain", "start_value", "tables"]
 
 SCHEMA: Final = 1
 """Raised when a key goes or changes its meaning; new keys do not raise it."""
@@ -189,7 +189,16 @@ def as_text(facts: Mapping[str, Any]) -> str:
     Returns:
         Lines of printable ASCII.
     """
-    return "\n".join([*_heading(facts), *_findings(facts), *_tables(facts), *_not_listed(facts)])
+    return "\n".join([*_heading(facts), *tables(facts)])
+
+
+def tables(facts: Mapping[str, Any]) -> Iterator[str]:
+    """The part of an overview below the heading: findings, variables, and how many are not listed.
+
+    Args:
+        facts: What ``overview`` returned.
+    """
+    yield from (*_findings(facts), *_tables(facts), *_not_listed(facts))
 
 
 def _heading(facts: Mapping[str, Any]) -> Iterator[str]:

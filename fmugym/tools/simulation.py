@@ -135,7 +135,8 @@ def simulate(
         env: An ``FMUEnv``, or a wrapper around one.
         policy: Chooses the actions.
         seed: Of the episode, and of random actions.
-        most_steps: The steps after which to stop.
+        most_steps: The steps after which to stop. A registered id may have a lower limit, which
+            truncates the episode.
         advance: Is told of each step.
 
     Returns:
@@ -146,8 +147,10 @@ def simulate(
     policy.begin()
     observation, info = env.reset(seed=seed)
     total, cost, end, begin = 0.0, None, "stopped", inner.time
-    for _ in range(most_steps):
+    limit = inner.spec.max_episode_steps if inner.spec is not None else None
+    for step in range(1, most_steps + 1):
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+        truncated = truncated or step == limit
         total += float(reward)
         cost = float(info["cost"]) + (cost or 0.0) if "cost" in info else cost
         advance(1)

@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Final
+
+import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
@@ -25,6 +27,9 @@ MOST_PARAMETERS: Final = 40
 
 DEFAULT_STEP: Final = 0.01
 """The step size in seconds where the FMU tells nothing about its time."""
+
+MOST_ELEMENTS: Final = 100
+"""Larger arrays are left out."""
 
 MOST_LOCALS: Final = 8
 """Locals that replace outputs where the FMU has none."""
@@ -118,19 +123,18 @@ class Skeleton:
         self._description = fmu.description
         if not self.outputs:
             raise ConfigError(
-                f"{fmu.path.name} has no scalar Real, Integer, Boolean or Enumeration to observe"
+                f"{fmu.path.name} has no Real, Integer, Boolean or Enumeration to observe"
             )
 
     @cached_property
     def inputs(self) -> list[Variable]:
         """The numeric inputs."""
-        return [v for v in self._of("input") if v.numeric]
+        return _scalars(self._of("input"))
 
     @cached_property
     def outputs(self) -> list[Variable]:
         """The numeric outputs, or some locals if there are none."""
-        outputs = [v for v in self._of("output") if v.numeric]
-        return outputs or [v for v in self._of("local") if v.numeric][:MOST_LOCALS]
+        return _scalars(self._of("output")) or _scalars(self._of("local"))[:MOST_LOCALS]
 
     @cached_property
     def parameters(self) -> list[Variable]:
@@ -315,8 +319,16 @@ def _round_down(value: float) -> float:
     return float(f"{digit * power:.0e}")
 
 
+def _scalars(variables: Sequence[Variable]) -> list[Variable]:
+    """The numeric scalars, and the elements of numeric arrays that are not large."""
+    usable = (v for v in variables if v.is_number and v.size <= MOST_ELEMENTS)
+    return [element for variable in usable for element in variable.elements]
+
+
 def literal(variable: Variable) -> str:
     """The start value as the config takes it; empty if the config takes none."""
+    if variable.shape and variable.is_number and variable.start is not None:
+        return _array_literal(variable)
     value = start_value(variable)
     if variable.kind == "string" and not variable.shape and isinstance(value, str):
         return _quoted(value)
@@ -326,6 +338,15 @@ def literal(variable: Variable) -> str:
     if variable.items:
         return _quoted(names[0]) if names else ""
     return repr(value)
+
+
+def _array_literal(variable: Variable) -> str:
+    """Nested lists of the start values; empty if they are many, or are malformed."""
+    try:
+        numbers = variable.start_numbers if 0 < variable.size <= MOST_ELEMENTS else ()
+    except ConfigError:
+        numbers = ()
+    return repr(np.reshape(numbers, variable.shape).tolist()) if numbers else ""
 
 
 def _quoted(text: str) -> str:

@@ -7,37 +7,39 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import gymnasium
 
-from fmugym.archive.fmu import FMU
 from fmugym.declared import Task, load
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.proposal import Proposal
+from fmugym.tools.systems import open_model
 
 __all__ = ["maker_of", "scenarios_of"]
 
+_MODELS: Final = {".fmu", ".ssp"}
 
-def maker_of(target: str, scenario: str | None = None) -> Callable[[], FMUEnv]:
+
+def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
     """Find what a text names.
 
     Args:
-        target: The path of a task file or an FMU, a registered id, or ``"module:Class"``. For an
-            FMU it is the task that ``fmugym new`` proposes.
+        target: The path of a task file, an FMU or an SSP archive, a registered id, or
+            ``"module:Class"``. For an FMU or archive it is the task that ``fmugym new`` proposes.
         scenario: A scenario of the task file; None for any episodes.
 
     Returns:
-        A function that makes the environment.
+        A function that makes the environment. It takes arguments of the environment.
 
     Raises:
         ConfigError: If there is no such thing, or the task has a mistake.
         FMULoadError: If the FMU cannot be read.
     """
     path = Path(target)
-    if path.suffix.lower() == ".fmu":
-        return partial(load, Task.from_dict(tomllib.loads(Proposal(FMU(path)).text())))
+    if path.suffix.lower() in _MODELS:
+        return partial(load, Task.from_dict(tomllib.loads(Proposal(open_model(path)).text())))
     if path.suffix.lower() == ".toml" or path.is_file():
         return partial(load, Task.read(path), scenario=scenario)
     module, separator, name = target.partition(":")
@@ -55,7 +57,7 @@ def scenarios_of(target: str) -> list[str]:
         ConfigError: As ``maker_of``.
     """
     path = Path(target)
-    if path.is_file() and path.suffix.lower() != ".fmu":
+    if path.is_file() and path.suffix.lower() not in _MODELS:
         return _scenarios(Task.read(path))
     with closing(maker_of(target)()) as env:
         return _scenarios(getattr(env, "task", None))
@@ -65,14 +67,16 @@ def _scenarios(task: Task | None) -> list[str]:
     return [] if task is None else list(task.document.get("scenarios", {}))
 
 
-def _registered(env_id: str, arguments: dict[str, Any]) -> FMUEnv:
+def _registered(env_id: str, arguments: dict[str, Any], **more: Any) -> FMUEnv:
     try:
-        env = gymnasium.make(env_id, **arguments).unwrapped
+        made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:
         raise ConfigError(
             f"{shown(env_id)} is no task file, no class and no registered id: {error}"
         ) from None
+    env = made.unwrapped
     if not isinstance(env, FMUEnv):
         env.close()
         raise ConfigError(f"{shown(env_id)} is no environment of fmugym")
+    env.spec = made.spec  # with the time limit, which is a wrapper's
     return env

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.series.store import imported
+from fmugym.extras import imported
 
 __all__ = ["TRACKERS", "Tracker", "tracker_for"]
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, FMUGymError
-from fmugym.series.store import imported
+from fmugym.extras import imported
 from fmugym.tools.agents import algorithm_of
 from fmugym.tools.training import TRIALS, Plan, Watch, require_new, train
 

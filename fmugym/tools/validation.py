@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,8 @@ from gymnasium import spaces
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.tools.accuracy import Replay
+from fmugym.tools.advice import Advice, Doubt, advise, lines_of
 from fmugym.tools.overview import plain
 from fmugym.trial.trial import known_verdict
 from fmugym.vector import FMUVectorEnv
@@ -66,6 +68,7 @@ class Report:
         hooks: How a vector environment calls the hooks: ``compiled``, ``array`` or ``per_env``.
         reset_method: How episodes begin.
         recommended: Settings that suit the task, by name.
+        advices: Lines for the task file, of these settings.
     """
 
     findings: tuple[Finding, ...]
@@ -73,6 +76,7 @@ class Report:
     hooks: str
     reset_method: str
     recommended: Mapping[str, Any]
+    advices: tuple[Advice, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -90,6 +94,7 @@ class Report:
             "hooks": self.hooks,
             "reset_method": self.reset_method,
             "recommended": dict(self.recommended),
+            "lines": [asdict(one) | {"line": one.line} for one in self.advices],
         }
 
     def as_text(self) -> str:
@@ -103,8 +108,10 @@ class Report:
         lines.append(f"a step takes {step}, a reset {reset}, to restore a state {restore}")
         lines.append(f"episodes begin by {self.reset_method}")
         lines.append(f"hooks in a vector environment: {self.hooks}")
-        settings = (f"{name} = {value}" for name, value in self.recommended.items())
-        lines.append(f"recommended: {', '.join(settings)}")
+        if "envs" in self.recommended:
+            lines.append(f"recommended for a training: --envs {self.recommended['envs']}")
+        if self.advices:
+            lines += ["recommended for the task file:", *lines_of(self.advices)]
         return "\n".join(lines)
 
 
@@ -156,9 +163,45 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         }
         hooks = _hooks(make_env)
         recommended = _recommended(env, first.step_time, hooks, findings)
-        return Report(findings, costs, hooks, env.reset_method, recommended)
+        reset_method, replay = env.reset_method, Replay.of(env)
+        others = tuple(_other_advices(env, recommended))
     finally:
         env.close()
+    return _advised(Report(findings, costs, hooks, reset_method, recommended, others), replay)
+
+
+def _advised(report: Report, replay: Replay) -> Report:
+    """Add what repetitions of an episode tell."""
+    found = list(advise(replay))
+    advices = (*(one for one in found if isinstance(one, Advice)), *report.advices)
+    doubts = (one for one in found if isinstance(one, Doubt))
+    findings = (Finding("warning", "accuracy", one.text, one.cure) for one in doubts)
+    recommended = {**report.recommended, **{one.key: one.value for one in advices}}
+    return replace(
+        report,
+        findings=(*report.findings, *findings),
+        recommended=recommended,
+        advices=advices,
+    )
+
+
+def _isolates(env: FMUEnv) -> bool:
+    """Whether the FMU needs worker processes."""
+    verdict = known_verdict(env.fmu)
+    return verdict is not None and verdict.isolate
+
+
+def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advice]:
+    """Lines for what other checks have found."""
+    if recommended.get("normalize") and _has_limits(env.observation_space):
+        yield Advice("agent", "normalize", True, "observations are of very different sizes")
+    if "isolation" in recommended:
+        yield Advice("config", "isolation", "process", "instances disturb each other, or crash")
+
+
+def _has_limits(space: spaces.Space[Any]) -> bool:
+    """Whether observations can be normalized by their limits."""
+    return isinstance(space, spaces.Box) and bool(np.isfinite([space.low, space.high]).all())
 
 
 def _restore_time(env: FMUEnv) -> float | None:
@@ -184,8 +227,7 @@ def _recommended(
         settings["envs"] = next((n for most, n in _ENVS if step_time < most), _FEWEST_ENVS)
     if any("very different sizes" in finding.text for finding in findings):
         settings["normalize"] = True
-    verdict = known_verdict(env.fmu)
-    if verdict is not None and verdict.isolate:
+    if _isolates(env):
         settings["isolation"] = "process"
     return settings | {"reset_method": env.reset_method}
 

@@ -105,12 +105,14 @@ class Candidate:
     timeout: float | None
     interface: str = "co_simulation"
     plan: SystemPlan | None = None
+    sizes: tuple[tuple[str, int], ...] = ()
 
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
+        sizes = tuple(getattr(fmu, "sizes", {}).items())
         interface, plan = fmu.description.interface, getattr(fmu, "plan", None)
-        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, plan)
+        return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, plan, sizes)
 
     def open(self) -> FMU:
         """Open the FMU without another trial."""
@@ -122,6 +124,7 @@ class Candidate:
             preload=self.preload,
             probe_timeout=None,
             interface=self.interface,
+            sizes=dict(self.sizes),
         )
 
     @property
@@ -709,12 +712,13 @@ def _content_of_file(path: Path) -> str:
 
 
 def _content_key(candidate: Candidate) -> str:
-    """The scope of a verdict: content, interface, platform, and version of the package."""
+    """The scope of a verdict: content, interface, sizes, platform, and version of the package."""
     scope = f"{content_of(candidate)} {fmpy.platform_tuple} {_version()}"
-    interface = candidate.interface
-    return _digest(
-        f"{scope} {interface}".encode() if interface != "co_simulation" else scope.encode()
-    )
+    if candidate.interface != "co_simulation":
+        scope += f" {candidate.interface}"
+    if candidate.sizes:
+        scope += f" {sorted(candidate.sizes)}"
+    return _digest(scope.encode())
 
 
 @functools.lru_cache(maxsize=256)

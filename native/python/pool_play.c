@@ -419,8 +419,24 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
         playing_free(playing);
         return NULL;
     }
+    PyCapsule_SetContext(capsule, self); /* other pools have other arrays */
     replace_reference(&self->playing, capsule);
     Py_RETURN_NONE;
+}
+
+/* Puts what was prepared before in the place of what is prepared now, and returns that. */
+PyObject *py_exchange_play(PyObject *object, PyObject *other) {
+    PyPool *self = (PyPool *)object;
+    PyObject *present = Py_NewRef(self->playing == NULL ? Py_None : self->playing);
+
+    if (other != Py_None &&
+        (!PyCapsule_IsValid(other, PLAYING) || PyCapsule_GetContext(other) != self)) {
+        Py_DECREF(present);
+        PyErr_SetString(PyExc_TypeError, "expected what exchange_play has returned");
+        return NULL;
+    }
+    replace_reference(&self->playing, other == Py_None ? NULL : Py_NewRef(other));
+    return present;
 }
 
 /* Playing */
@@ -470,6 +486,19 @@ static bool take_starts_at_ends(PyPool *self, const Playing *playing, PyObject *
            take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n);
 }
 
+/* Takes memory that must have so many bytes, whatever its items are: that of arrays that the caller
+ * has just made. To tell their types, numpy would describe them in text, which takes as long as all
+ * other checks together. */
+static bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
+    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
+        return false;
+    }
+    if ((size_t)buffer->len != size) {
+        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
+    }
+    return (size_t)buffer->len == size;
+}
+
 /* The observations are one array that the pool fills itself, or those that the program stores. */
 static bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t) {
     const Settings *s = &self->pool.settings;
@@ -477,8 +506,8 @@ static bool take_observations(PyPool *self, const Playing *playing, PyObject *se
     if (playing->judgement.program.number_of_seen > 0 || PyTuple_Check(seen)) {
         return take_seen(&playing->judgement, seen, t->seen_buffers, t->seen);
     }
-    return take_matrix(seen, &t->buffers[SEEN], WRITTEN, "observations", ITEM_FLOAT32,
-                       (Py_ssize_t)s->count, (Py_ssize_t)s->num_observed);
+    return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
+                      s->count * s->num_observed * sizeof(float));
 }
 
 /* Whether the items of a buffer are of the kind that a letter stands for: d for floats, q for
@@ -516,16 +545,16 @@ static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn
 }
 
 static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
+    const size_t n = self->pool.settings.count;
     Py_buffer *b = t->buffers;
 
     return take_given_actions(playing, args[ACTIONS], t) &&
            take_observations(self, playing, args[SEEN], t) &&
-           take_vector(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, n) &&
-           take_vector(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN, n) &&
-           take_vector(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, n) &&
-           take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)playing->play.draws->count, n) &&
+           take_bytes(args[REWARDS], &b[REWARDS], PyBUF_WRITABLE, n * sizeof(double)) &&
+           take_bytes(args[TERMINATED], &b[TERMINATED], PyBUF_WRITABLE, n) &&
+           take_bytes(args[TRUNCATED], &b[TRUNCATED], PyBUF_WRITABLE, n) &&
+           take_bytes(args[DRAWN], &b[DRAWN], PyBUF_WRITABLE,
+                      playing->play.draws->count * n * sizeof(double)) &&
            take_starts_at_ends(self, playing, args[LAST], args[STARTED], t);
 }
 
@@ -648,6 +677,7 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
 typedef struct {
     PyTurn turn;
     size_t horizon;
+    Mask left_out;
 } PyRollout;
 
 static bool has_bad_action(const PyRollout *r) {
@@ -670,19 +700,9 @@ static void do_rollout(PyPool *self, bool alone, void *context) {
     t->ends.outside = false;
     t->bad_action = has_bad_action(r);
     if (!t->bad_action) {
-        t->troubled = pool_rollout(&self->pool, &t->call, r->horizon, &t->ends.outside);
+        t->troubled =
+            pool_rollout(&self->pool, &t->call, r->horizon, r->left_out, &t->ends.outside);
     }
-}
-
-/* Takes memory that must have so many bytes, whatever its items are. */
-static bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
-    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
-        return false;
-    }
-    if ((size_t)buffer->len != size) {
-        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
-    }
-    return (size_t)buffer->len == size;
 }
 
 static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObject *seen,
@@ -730,13 +750,25 @@ static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *
                        (Py_ssize_t)playing->play.draws->count, n);
 }
 
-static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
+static bool take_left_out(PyPool *self, PyObject *mask, PyRollout *r) {
+    Py_buffer *buffer = &r->turn.buffers[MASK];
+
+    if (!take_vector(mask, buffer, COPIED, "the mask", ITEM_BOOLEAN,
+                     (Py_ssize_t)self->pool.settings.count)) {
+        return false;
+    }
+    r->left_out = (Mask){buffer->buf, buffer->strides[0]};
+    return true;
+}
+
+/* The mask may be NULL. */
+static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args, PyObject *mask) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     PyRollout r = {.horizon = 0};
     bool done = false;
 
     clear_turn(playing, &r.turn);
-    if (take_rollout(self, playing, args, &r)) {
+    if (take_rollout(self, playing, args, &r) && (mask == NULL || take_left_out(self, mask, &r))) {
         settle_turn(self, playing, &r.turn);
         done = perform(self, NEVER_SHORT, do_rollout, &r) && !is_outside(&r.turn) &&
                report_messages(self);
@@ -752,11 +784,11 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, LAST) || !is_prepared(self)) {
+    if (!has_arguments(nargs, nargs == LAST + 1 ? nargs : LAST) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = roll_out(self, playing, args);
+    PyObject *result = roll_out(self, playing, args, nargs > LAST ? args[LAST] : NULL);
     Py_DECREF(playing);
     return result;
 }

@@ -199,6 +199,7 @@ static void pool_dealloc(PyObject *object) {
 typedef struct {
     PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance, *strings;
     PyAccess *inputs, *outputs;
+    Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, manner, private_libraries, logging, can_save;
     int restores, rebuilds, reloads, one_initialization;
@@ -222,11 +223,14 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "manner",  "model",  "token",      "resources", "paths",
-                            "private", "logging", "states", "categories", "mark", "solving", "system", NULL};
+                            "private", "logging", "states", "categories", "mark", "solving", "system",
+                            "structural_references", "structural_values", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iiyyyO!pppO!OOO:library", names, &a->version, &a->manner, &s->model,
+    return parse_group(group, "$iiyyyO!pppO!OOOy#y#:library", names, &a->version, &a->manner, &s->model,
                        &s->token, &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system);
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system,
+                       &s->experiment.structural_references, &a->size_of_references,
+                       &s->experiment.structural_values, &a->size_of_values);
 }
 
 static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
@@ -383,17 +387,17 @@ static bool take_method(const char *name, Solving *solving) {
 
 /* The references stay in the pool's arguments. */
 bool take_solving(PyObject *tuple, Solving *solving) {
-    const char *method, *states, *rates, *clocks, *clocked;
-    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size;
+    const char *method, *states, *rates, *clocks, *clocked, *ramps;
+    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size, ramps_size;
     int completes;
 
     if (tuple == Py_None) {
         return true;
     }
-    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#", &method, &solving->tolerance,
+    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#y#d", &method, &solving->tolerance,
                           &solving->max_step, &count, &indicators, &completes, &states,
                           &states_size, &rates, &rates_size, &clocks, &clocks_size, &clocked,
-                          &clocked_size)) {
+                          &clocked_size, &ramps, &ramps_size, &solving->ramp_duration)) {
         return false;
     }
     const Py_ssize_t wanted = count * (Py_ssize_t)sizeof(uint32_t);
@@ -411,6 +415,8 @@ bool take_solving(PyObject *tuple, Solving *solving) {
     solving->number_of_clocks = (size_t)clocks_size / sizeof(Clock);
     solving->clocked = (const Clocked *)(const void *)clocked;
     solving->number_of_clocked = (size_t)clocked_size / sizeof(Clocked);
+    solving->ramped_references = (const uint32_t *)(const void *)ramps;
+    solving->number_of_ramps = (size_t)ramps_size / sizeof(uint32_t);
     return take_method(method, solving);
 }
 
@@ -437,6 +443,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     Settings *s = &self->pool.settings;
 
     s->fmi = fmi_of(a->version, a->manner);
+    s->experiment.number_of_structural = (size_t)a->size_of_values / sizeof(uint64_t);
     s->system = self->system;
     s->private_libraries = a->private_libraries;
     s->logging = a->logging;
@@ -544,6 +551,7 @@ static PyMethodDef methods[] = {
      NULL},
     FAST("play", py_play),
     FAST("rollout", py_rollout),
+    {"exchange_play", py_exchange_play, METH_O, NULL},
     {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
      METH_VARARGS | METH_KEYWORDS, NULL},
     FAST("step_single", py_step_single),

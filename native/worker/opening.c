@@ -142,6 +142,9 @@ static void read_solving(Reader *reader, Solving *solving) {
     solving->rate_references = read_references(reader, solving->states);
     solving->clocks = read_copy(reader, sizeof(Clock), &solving->number_of_clocks);
     solving->clocked = read_copy(reader, sizeof(Clocked), &solving->number_of_clocked);
+    solving->ramped_references =
+        read_copy(reader, sizeof(uint32_t), &solving->number_of_ramps);
+    solving->ramp_duration = read_number(reader);
     reader->sound = reader->sound && solving->method != NULL;
 }
 
@@ -161,7 +164,12 @@ static void read_library(Reader *reader, Settings *s) {
     s->logging = read_flag(reader);
     s->can_save = read_flag(reader);
     s->categories = read_texts(reader, &s->number_of_categories);
-    reader->sound = reader->sound && s->fmi != NULL && paths == 1;
+    size_t size;
+    s->experiment.structural_references = read_block(reader, &size);
+    s->experiment.number_of_structural = size / sizeof(uint32_t);
+    s->experiment.structural_values = read_block(reader, &size);
+    reader->sound = reader->sound && s->fmi != NULL && paths == 1 &&
+                    size == s->experiment.number_of_structural * sizeof(uint64_t);
     if (reader->sound) {
         s->can_save = s->can_save && s->fmi->get_state != NULL;
     }

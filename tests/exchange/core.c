@@ -18,6 +18,7 @@ static const double INTERNAL_STEP = 1e-3;
 
 static void start(Model *me) {
     memset(me->v, 0, sizeof me->v);
+    memset(me->slope, 0, sizeof me->slope);
     me->mode = INSTANTIATED;
     me->stops = me->again = me->wants_event = false;
     me->next_event = me->stop = INFINITY;
@@ -156,6 +157,9 @@ static bool step_once(Model *me, double until) {
     for (size_t i = 0; i < STATES; i++) {
         me->v[i] += step * me->v[STATES + i];
     }
+    for (size_t i = 0; i < MOST; i++) {
+        me->v[i] += step * me->slope[i];
+    }
     me->time += step;
     model_rates(me);
     model_indicators(me, after);
@@ -166,6 +170,16 @@ static bool step_once(Model *me, double until) {
         model_event(me);
     }
     return me->time >= me->stop - 1e-12;
+}
+
+int core_set_slopes(Model *me, const unsigned *references, size_t count, const int *orders,
+                    const double *values) {
+    REQUIRE(me->mode == STEPPING);
+    for (size_t i = 0; i < count; i++) {
+        REQUIRE(orders[i] == 1);
+        me->slope[references[i]] = values[i];
+    }
+    return OK;
 }
 
 /* Does no more of a step than EARLY seconds. */

@@ -20,6 +20,7 @@ enum { MOST = 32 };
 
 typedef struct {
     double v[MOST]; /* the variables */
+    double slope[MOST]; /* of inputs, in co-simulation */
     double time;
     double completed; /* the time of the last complete step or event */
     double next_event;
@@ -60,6 +61,8 @@ int core_indicators(Model *me, double *z, size_t count);
 int core_nominals(Model *me, double *x, size_t count);
 int core_get(Model *me, const unsigned *references, size_t count, double *values);
 int core_set(Model *me, const unsigned *references, size_t count, const double *values);
+int core_set_slopes(Model *me, const unsigned *references, size_t count, const int *orders,
+                    const double *values);
 int core_do_step(Model *me, double time, double step);
 int core_get_state(Model *me, void **state);
 int core_set_state(Model *me, const void *state);

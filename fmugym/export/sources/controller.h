@@ -2,7 +2,7 @@
  *
  * A sample is taken at the beginning of a communication step, with the inputs that the importer has
  * set before. Its actions hold until the next sample. A communication step may be shorter or longer
- * than the time between two samples. Before the first one, the outputs show what it would be. */
+ * than the time between two samples. In the initialization, outputs show what the first one gives. */
 
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
@@ -98,7 +98,7 @@ static bool sample(const Controller *controller, AGENT_STATE *agent, double *act
 
 static bool get_action(const Controller *controller, unsigned place, double *value) {
     double actions[ACTIONS + 1];
-    if (controller->memory.samples > 0) {
+    if (controller->memory.mode >= STEPPING) {
         *value = controller->memory.actions[place];
         return true;
     }
@@ -107,6 +107,16 @@ static bool get_action(const Controller *controller, unsigned place, double *val
         return false;
     }
     *value = actions[place];
+    return true;
+}
+
+/* The outputs keep what the initialization has led to until the first step. */
+static bool end_initialization(Controller *controller) {
+    AGENT_STATE agent = controller->memory.agent;
+    if (!sample(controller, &agent, controller->memory.actions)) {
+        return false;
+    }
+    controller->memory.mode = STEPPING;
     return true;
 }
 

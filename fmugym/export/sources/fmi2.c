@@ -54,8 +54,7 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 }
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
-    ((Controller *)c)->memory.mode = STEPPING;
-    return fmi2OK;
+    return OR_ERROR(end_initialization((Controller *)c));
 }
 
 fmi2Status fmi2Terminate(fmi2Component c) {

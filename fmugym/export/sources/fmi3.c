@@ -68,8 +68,7 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance
 }
 
 fmi3Status fmi3ExitInitializationMode(fmi3Instance c) {
-    ((Controller *)c)->memory.mode = STEPPING;
-    return fmi3OK;
+    return OR_ERROR(end_initialization((Controller *)c));
 }
 
 fmi3Status fmi3Terminate(fmi3Instance c) {

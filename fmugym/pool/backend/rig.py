@@ -28,13 +28,15 @@ class Backend(Protocol):
     A method that fails raises an exception. The step then fails like that of an FMU, with the
     exception's text as the reason, and no step follows before the next reset.
 
-    A backend may offer two more things:
+    A backend may offer more:
 
     * ``hold()`` takes the safe action and keeps the session alive. It is called after a fault, and
       by `Paced` while nobody steps. After its construction, a backend with this method is only
       called by a thread of its own.
     * ``sample_time`` is the time at which the newest outputs were measured, in s of the clock of
       `Paced`. Without it, the time of the call counts.
+    * ``samples_outputs`` is True if its outputs are already what the ``samplings`` of the config
+      ask for, such as means over a step. A backend without it refuses a config that has some.
     """
 
     def reset(self, start_values: Mapping[str, Any]) -> Outputs:

@@ -222,9 +222,9 @@ class ProgramCoding:
         place = PlaceOfFMU.in_wine(
             setup.folder, setup.folder / setup.library, description.fmi_major_version
         )
-        writer.integers(description.fmi_major_version, manner_of(description))
+        writer.integers(description.fmi_major_version, manner_of(description, spec))
         _write_solving(writer, solving_settings(description, spec))
-        _write_library(writer, library_settings(description, place), setup.log_level)
+        _write_library(writer, library_settings(description, spec, place), setup.log_level)
         experiment = experiment_settings(spec)
         _write_experiment(writer, experiment)
         writer.access(spec.inputs, description.fmi_major_version)
@@ -345,18 +345,21 @@ def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) 
     _write_texts(writer, library["paths"])
     writer.flags(log_level <= logging.INFO, library["states"])
     _write_texts(writer, library["categories"])
+    for name in ("structural_references", "structural_values"):
+        writer.block(library[name])
 
 
 def _write_solving(writer: _Writer, solving: tuple[Any, ...] | None) -> None:
     writer.flags(solving is not None)
     if solving is not None:
-        name, tolerance, max_step, states, indicators, completes, *blocks = solving
+        name, tolerance, max_step, states, indicators, completes, *blocks, duration = solving
         writer.text(name)
         writer.numbers(tolerance, max_step)
         writer.integers(states, indicators)
         writer.flags(completes)
         for block in blocks:
             writer.block(block or b"")
+        writer.numbers(duration)
 
 
 def _write_texts(writer: _Writer, texts: Sequence[bytes]) -> None:

@@ -35,7 +35,7 @@ __all__ = [
 _NUMBERS: Final = "biuf"
 """The kinds of numpy's types that are numbers: Booleans, integers with and without sign, floats."""
 
-_BOOL, _FLOAT = np.dtype(np.bool_), np.dtype(np.float64)
+_BOOL = np.dtype(np.bool_)
 
 
 def flags(hook: str, value: Any, count: int) -> MaskArray:
@@ -51,8 +51,8 @@ def flags(hook: str, value: Any, count: int) -> MaskArray:
 
 def rewards(value: Any, count: int) -> FloatArray:
     """Turn the result of ``_reward_policy`` into new rewards of shape (N,), finite or not."""
-    if type(value) is np.ndarray and value.dtype == _FLOAT and value.shape == (count,):
-        return value.copy()
+    if type(value) is np.ndarray and value.shape == (count,) and value.dtype.kind in _NUMBERS:
+        return value.astype(np.float64)
     wanted = f"a number, or an array of {count} of them"
     return np.array(_numbers("_reward_policy", value, count, wanted), np.float64)
 

@@ -1,0 +1,153 @@
+"""Conversions between units."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+from fmugym.archive.description import Unit
+from fmugym.errors import ConfigError, shown
+
+__all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A value times ``factor``, plus ``offset``, is the value in the other unit."""
+
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def __call__(self, value: float) -> float:
+        """Convert a value to the other unit."""
+        return value * self.factor + self.offset
+
+    def inverse(self, value: float) -> float:
+        """Convert a value of the other unit back."""
+        return (value - self.offset) / self.factor
+
+
+IDENTITY: Final = Conversion()
+
+
+def conversion_between(
+    own: str | None, wanted: str | None, definitions: Mapping[str, Unit]
+) -> Conversion:
+    """Find the conversion from a variable's unit to the one that a task asks for.
+
+    The FMU's own definitions come first, since it says by them what it means by a name. Pint knows
+    the other units.
+
+    Args:
+        own: The unit of the variable in the FMU; None if the FMU gives none. The wanted unit is
+            then taken to be the variable's own.
+        wanted: The unit that the task asks for; None for the variable's own.
+        definitions: The units that the FMU defines.
+
+    Raises:
+        ConfigError: If one unit is unknown, or they measure different quantities.
+    """
+    if wanted is None or own is None or wanted == own:
+        return IDENTITY
+    own_unit = definitions.get(own, Unit())
+    if wanted in own_unit.display_units:
+        return Conversion(*own_unit.display_units[wanted])
+    for dimension, to_base in _defined(wanted, definitions):
+        if dimension is not None and dimension == own_unit.dimension:
+            factor, offset = to_base
+            return Conversion(own_unit.factor / factor, (own_unit.offset - offset) / factor)
+    return _conversion_by_pint(own, wanted)
+
+
+def _defined(
+    name: str, definitions: Mapping[str, Unit]
+) -> Iterator[tuple[tuple[int, ...] | None, tuple[float, float]]]:
+    """The definitions of a name: the dimension, and factor and offset to its SI unit."""
+    if name in definitions:
+        unit = definitions[name]
+        yield unit.dimension, (unit.factor, unit.offset)
+    for unit in definitions.values():
+        if name in unit.display_units:
+            factor, offset = unit.display_units[name]
+            yield (
+                unit.dimension,
+                (unit.factor / factor, unit.offset - unit.factor * offset / factor),
+            )
+
+
+def conversion_of_link(
+    source: str | None,
+    source_units: Mapping[str, Unit],
+    target: str | None,
+    target_units: Mapping[str, Unit],
+) -> Conversion:
+    """Find the conversion from a unit of one FMU to a unit of another.
+
+    What both FMUs define comes first: two FMUs may mean different units by one name. Pint knows
+    the other units. Without a unit on both sides there is nothing to convert.
+
+    Args:
+        source: The unit of the value.
+        source_units: The units that its FMU defines.
+        target: The unit to convert to.
+        target_units: The units that the other FMU defines.
+
+    Raises:
+        ConfigError: If one unit is unknown, or they measure different quantities.
+    """
+    if source is None or target is None:
+        return IDENTITY
+    for dimension, (factor, offset) in _defined(source, source_units):
+        for other, (to_base, base_offset) in _defined(target, target_units):
+            if dimension is not None and dimension == other:
+                return Conversion(factor / to_base, (offset - base_offset) / to_base)
+    return IDENTITY if source == target else _conversion_by_pint(source, target)
+
+
+def definition_of(name: str, units: Mapping[str, Unit]) -> Unit | None:
+    """Find what a name of a unit, or of a display unit, means in base units; None if it is open."""
+    for dimension, (factor, offset) in _defined(name, units):
+        if dimension is not None:
+            return Unit(dimension, factor, offset)
+    return None
+
+
+_LARGE: Final = 2.0**20
+"""The factor is taken from a large difference, so that an offset costs it no digits."""
+
+
+def _conversion_by_pint(own: str, wanted: str) -> Conversion:
+    pint, registry = _pint()
+    source, target = _parsed(own), _parsed(wanted)
+    try:
+        zero, large = (
+            float(registry.Quantity(value, source).to(target).magnitude) for value in (0.0, _LARGE)
+        )
+    except pint.DimensionalityError:
+        raise ConfigError(
+            f"the unit {shown(wanted)} does not measure what the unit {shown(own)} measures"
+        ) from None
+    return Conversion((large - zero) / _LARGE, zero)
+
+
+@cache
+def _pint() -> tuple[Any, Any]:
+    """Pint and its table of units, which takes a third of a second to read."""
+    import pint
+
+    return pint, pint.UnitRegistry(on_redefinition="ignore")
+
+
+def _parsed(name: str) -> Any:
+    """A unit in the way of writing of Modelica and FMI, where ``.`` multiplies: ``W/(m2.K)``."""
+    text = re.sub(r"(?<=[A-Za-z%])(-?\d+)", r"**(\1)", name.replace(".", "*"))
+    text = re.sub(r"(?<=[\w)])\^", "**", text).replace("%", "percent")
+    try:
+        return _pint()[1].Unit(text)
+    except Exception as error:  # pint passes on errors of the parsers that it uses
+        raise ConfigError(
+            f"{shown(name)} is no unit that is known ({type(error).__name__})"
+        ) from None

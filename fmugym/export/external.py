@@ -1,0 +1,102 @@
+"""Data of a task that somebody else gives the controller: measured weather, forecasts, prices."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fmugym.archive.description import Variable
+from fmugym.declared import TaskEnv
+from fmugym.declared.declarations import Declarations
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, unknown_name
+from fmugym.export.names import identifier
+from fmugym.vector.hooks.graph import Graph
+
+__all__ = ["External", "found_in"]
+
+
+@dataclass(frozen=True)
+class External:
+    """A value of data, now or at another time, that the agent observes.
+
+    Attributes:
+        node: Where the program would look it up.
+        variable: What takes its place.
+    """
+
+    node: int
+    variable: Variable
+
+
+def found_in(
+    env: FMUEnv, names: Collection[str], graph: Graph, observation: Sequence[int]
+) -> list[External]:
+    """Find the values of data in an observation.
+
+    Args:
+        env: The environment of a task file.
+        names: The names of the data.
+        graph: The operations.
+        observation: The nodes of the elements of the observation.
+
+    Raises:
+        ConfigError: If there are no such data, or the agent does not observe them.
+    """
+    if not names:
+        return []
+    seen = env.observation_names if isinstance(env, TaskEnv) else None
+    if not isinstance(env, TaskEnv) or seen is None:
+        raise ConfigError("only what a task file observes can be given to the agent from outside")
+    series = Declarations.read(env.task.root, env.fmu.description).series
+    found = []
+    for name in names:
+        if name not in series:
+            raise ConfigError(unknown_name("data", name, list(series)))
+        places = [i for i, text in enumerate(seen) if text.partition("[")[0] == name]
+        if not places:
+            raise ConfigError(f"the agent does not observe {name!r}, so that nobody need give it")
+        for place in places:
+            node = _lookup_in(graph, observation[place], _key_of(series[name]))
+            found.append(External(node, _variable(seen[place], series[name], env)))
+    return found
+
+
+def _key_of(series: Any) -> Any:
+    """How the graph calls the table of a series; see ``Graph.tables``."""
+    values = np.asarray(series.values, np.float64)
+    table = np.concatenate([np.asarray(series.times, np.float64), values, values[[0, -1]]])
+    return table.dtype.char, table.tobytes()
+
+
+def _lookup_in(graph: Graph, root: int, key: Any) -> int:
+    for number in _below(graph, root):
+        node = graph.nodes[number]
+        if node.kind == "interpolate" and node.what == key:
+            return number
+    raise ConfigError("data that do not change cannot be given from outside")
+
+
+def _below(graph: Graph, root: int) -> Iterator[int]:
+    waiting = [root]
+    while waiting:
+        number = waiting.pop()
+        yield number
+        waiting.extend(graph.nodes[number].operands)
+
+
+def _variable(name: str, series: Any, env: FMUEnv) -> Variable:
+    facts: Mapping[str, Any] = {
+        "value_reference": 0,
+        "causality": "input",
+        "variability": "continuous",
+        "initial": None,
+        "start": repr(float(series.values[0])),
+        "unit": series.unit,
+        "description": f"{name} of the task",
+    }
+    kind = "Float64" if env.fmu.description.fmi_version.startswith("3") else "Real"
+    return Variable(identifier(name), kind, **facts)

@@ -1,0 +1,282 @@
+"""Agents as ONNX: a function from measurements and memory to actions and the next memory."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.checks import check_path
+from fmugym.errors import ConfigError, shown
+from fmugym.export.agent import Agent
+from fmugym.export.c99 import field_names
+from fmugym.export.network import Activation
+from fmugym.export.onnx_nodes import Nodes, imported_onnx
+from fmugym.export.onnx_operations import computed, interpolated
+from fmugym.vector.hooks.graph import Node
+
+__all__ = ["onnx_model", "write_onnx"]
+
+_OPSET: Final = 18
+_IR_VERSION: Final = 9
+_COUNT: Final = "count"
+_ROWS: Final = "N"
+_WHOLE: Final = np.dtype(np.int64)
+_DOUBLE: Final = np.dtype(np.float64)
+
+
+def write_onnx(agent: Agent, path: str | os.PathLike[str]) -> Path:
+    """Write an agent as an ONNX model.
+
+    The model takes ``measurements`` of type float64, shape (N, m), and gives ``actions`` of shape
+    (N, a), for N plants at once. What the agent keeps from one sample to the next are inputs, too:
+    ``count``, the number of samples until now, and more arrays. The outputs ``next_count`` and so
+    on are their values for the next sample. The metadata of the model tell names, units, the time
+    between samples, and what the memory begins with.
+
+    Args:
+        agent: The agent.
+        path: The file, which must not exist.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: If the package onnx is missing (the extra ``onnx``), or the task computes what
+            cannot be written in ONNX.
+        FileExistsError: If the file exists.
+    """
+    file = check_path("path", path)
+    if not file.parent.is_dir():
+        raise ConfigError(f"{shown(str(file.parent))} is no folder")
+    content = onnx_model(agent).SerializeToString()
+    with file.open("xb") as stream:
+        stream.write(content)
+    return file
+
+
+def onnx_model(agent: Agent) -> Any:
+    """Make the model of ``write_onnx``, a ``ModelProto``."""
+    return _Model(agent).model()
+
+
+class _Model:
+    """Makes the model of one agent."""
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent, self._logic, self._graph = agent, agent.logic, agent.logic.graph
+        self._onnx, self._nodes = imported_onnx(), Nodes()
+        self._fields = field_names(agent)
+        self._names: dict[int, str] = {}
+        self._chosen: list[str] = []
+
+    def model(self) -> Any:
+        """The checked model."""
+        logic, updates = self._logic, [n for kept in self._logic.kept for n in kept.updates]
+        self._evaluate(logic.observation)
+        self._chosen = self._network(self._rows(logic.observation, self._agent.network.dtype))
+        self._evaluate([*logic.input_nodes, *updates])
+        self._store("actions", logic.input_nodes, _DOUBLE)
+        outputs = [self._value("actions", _DOUBLE, len(logic.inputs))]
+        outputs += self._next_memory()
+        make, helper = self._onnx.helper.make_graph, self._onnx.helper
+        nodes = self._nodes
+        graph = make(nodes.nodes, self._agent.name, self._inputs(), outputs, nodes.tensors)
+        model = helper.make_model(
+            graph,
+            producer_name="fmugym",
+            producer_version=self._agent.version,
+            opset_imports=[helper.make_opsetid("", _OPSET)],
+            ir_version=_IR_VERSION,
+            doc_string=" ".join(self._agent.notes),
+        )
+        helper.set_model_props(model, self._metadata())
+        self._onnx.checker.check_model(model)
+        return model
+
+    # The interface.
+
+    def _value(self, name: str, dtype: np.dtype[Any], width: int | None) -> Any:
+        shape: list[Any] = [_ROWS] if width is None else [_ROWS, width]
+        return self._onnx.helper.make_tensor_value_info(name, self._nodes.type_of(dtype), shape)
+
+    def _inputs(self) -> list[Any]:
+        inputs = [self._value("measurements", _DOUBLE, len(self._logic.measurements))]
+        inputs.append(self._value(_COUNT, _WHOLE, None))
+        for name, kept in zip(self._fields, self._logic.kept, strict=True):
+            inputs.append(self._value(name, kept.dtype, len(kept.starts)))
+        return inputs
+
+    def _next_memory(self) -> list[Any]:
+        one = self._nodes.constant(1, _WHOLE)
+        self._nodes.named("Add", (_COUNT, one), f"next_{_COUNT}")
+        outputs = [self._value(f"next_{_COUNT}", _WHOLE, None)]
+        for name, kept in zip(self._fields, self._logic.kept, strict=True):
+            if kept.updates:
+                self._store(f"next_{name}", kept.updates, kept.dtype)
+            else:
+                self._nodes.named("Identity", (name,), f"next_{name}")
+            outputs.append(self._value(f"next_{name}", kept.dtype, len(kept.starts)))
+        return outputs
+
+    def _metadata(self) -> dict[str, str]:
+        logic = self._logic
+        starts = {name: list(k.starts) for name, k in zip(self._fields, logic.kept, strict=True)}
+        facts: dict[str, Any] = {
+            "sample_time": logic.time_step,
+            "measurements": [{"name": v.name, "unit": v.unit} for v in logic.measurements],
+            "actions": [{"name": v.name, "unit": v.unit} for v in logic.inputs],
+            "memory": {_COUNT: 0, **starts},
+        }
+        return {name: json.dumps(value) for name, value in facts.items()}
+
+    # The program around the network. A value has the shape (N,), a constant none.
+
+    def _evaluate(self, numbers: Iterable[int]) -> None:
+        closure: set[int] = set()
+        waiting = list(numbers)
+        while waiting:
+            number = waiting.pop()
+            if number not in closure and number not in self._names:
+                closure.add(number)
+                if number not in self._logic.loads:
+                    waiting.extend(self._graph.nodes[number].operands)
+        for number in sorted(closure):
+            self._names[number] = self._expression(number, self._graph.nodes[number])
+
+    def _expression(self, number: int, node: Node) -> str:
+        if number in self._logic.loads:
+            return self._loaded(number, node)
+        operands, what, nodes = [self._names[one] for one in node.operands], node.what, self._nodes
+        match node.kind:
+            case "constant":
+                bits: Any = what
+                return nodes.constant(np.frombuffer(bits, node.dtype)[0], node.dtype)
+            case "ufunc":
+                return computed(nodes, what, operands, self._graph.nodes[node.operands[0]].dtype)
+            case "cast":
+                return nodes.cast(operands[0], node.dtype)
+            case "where":
+                return nodes.add("Where", *operands)
+            case "take":
+                return nodes.add("Gather", nodes.tensor(self._graph.tables[what]), *operands)
+            case "interpolate":
+                return interpolated(nodes, operands[0], self._graph.tables[what])
+        raise ConfigError(f"an operation of kind {node.kind!r} cannot be exported to ONNX")
+
+    def _loaded(self, number: int, node: Node) -> str:
+        load, nodes = self._logic.loads[number], self._nodes
+        match load[0]:
+            case "measurement":
+                return self._column("measurements", load[1])
+            case "kept":
+                return self._kept(load[1], load[2])
+            case "count":
+                return _COUNT
+            case "active":
+                return nodes.add("Greater", _COUNT, nodes.constant(0, _WHOLE))
+            case "chosen":
+                return self._chosen[load[1]]
+        return nodes.constant(load[1], node.dtype)
+
+    def _column(self, array: str, place: int) -> str:
+        return self._nodes.add("Gather", array, self._nodes.constant(place, _WHOLE), axis=1)
+
+    def _kept(self, field: int, element: int) -> str:
+        value = self._column(self._fields[field], element)
+        if self._logic.kept[field].name != "previous":
+            return value
+        is_first = self._nodes.add("Equal", _COUNT, self._nodes.constant(0, _WHOLE))
+        return self._nodes.add("Where", is_first, self._column("measurements", element), value)
+
+    def _rows(self, numbers: Iterable[int], dtype: np.dtype[Any]) -> str:
+        """Values side by side, shape (N, k)."""
+        nodes = self._nodes
+        shape, axis = nodes.add("Shape", _COUNT), nodes.tensor(np.array([1]))
+        columns = []
+        for number in numbers:
+            value = self._names[number]
+            if self._graph.nodes[number].dtype != dtype:
+                value = nodes.cast(value, dtype)
+            columns.append(nodes.add("Unsqueeze", nodes.add("Expand", value, shape), axis))
+        return nodes.add("Concat", *columns, axis=1)
+
+    def _store(self, name: str, numbers: Iterable[int], dtype: np.dtype[Any]) -> None:
+        self._nodes.named("Identity", (self._rows(numbers, dtype),), name)
+
+    # The network.
+
+    def _network(self, values: str) -> list[str]:
+        """The elements of the action, each of shape (N,)."""
+        nodes, network = self._nodes, self._agent.network
+        if network.scaling is not None:
+            values = self._scaled(values)
+        for layer in network.layers:
+            weights, bias = nodes.tensor(layer.weights), nodes.tensor(layer.bias)
+            values = nodes.add("Gemm", values, weights, bias, transB=1)
+            for activation in layer.activations:
+                values = _activated(nodes, values, activation, network.dtype)
+        if isinstance(network.space, spaces.Box):
+            return self._continuous(values)
+        return self._discrete(values)
+
+    def _scaled(self, values: str) -> str:
+        nodes, scaling = self._nodes, self._agent.network.scaling
+        parts = [getattr(scaling, name).astype(_DOUBLE) for name in ("mean", "divisor", "limit")]
+        mean, divisor, limit = map(nodes.tensor, parts)
+        shifted = nodes.add("Sub", nodes.cast(values, _DOUBLE), mean)
+        scaled = nodes.add("Min", nodes.add("Div", shifted, divisor), limit)
+        return nodes.cast(
+            nodes.add("Max", scaled, nodes.tensor(-parts[2])), self._agent.network.dtype
+        )
+
+    def _continuous(self, values: str) -> list[str]:
+        nodes, network = self._nodes, self._agent.network
+        space: Any = network.space
+        low, high = (np.ravel(one).astype(network.dtype) for one in (space.low, space.high))
+        if network.squashed:
+            one, half = (nodes.constant(number, network.dtype) for number in (1.0, 0.5))
+            share = nodes.add("Mul", half, nodes.add("Add", values, one))
+            values = nodes.add("Mul", share, nodes.tensor(high - low))
+            values = nodes.add("Add", nodes.tensor(low), values)
+        else:
+            values = nodes.add(
+                "Min", nodes.add("Max", values, nodes.tensor(low)), nodes.tensor(high)
+            )
+        typed = nodes.cast(values, np.dtype(space.dtype))
+        return [self._column(typed, index) for index in range(len(low))]
+
+    def _discrete(self, values: str) -> list[str]:
+        nodes, network, begin, chosen = self._nodes, self._agent.network, 0, []
+        dtype = np.dtype(network.space.dtype)
+        axis = nodes.tensor(np.array([1]))
+        for count, start in zip(network.parts, network.starts, strict=True):
+            ends = [nodes.tensor(np.array([place])) for place in (begin, begin + count)]
+            part = nodes.add("Slice", values, *ends, axis)
+            best = nodes.cast(nodes.add("ArgMax", part, axis=1, keepdims=0), dtype)
+            chosen.append(nodes.add("Add", best, nodes.constant(start, dtype)) if start else best)
+            begin += count
+        return chosen
+
+
+def _activated(nodes: Nodes, values: str, activation: Activation, dtype: np.dtype[Any]) -> str:
+    numbers = activation.arguments
+    match activation.name:
+        case "tanh" | "relu" | "sigmoid":
+            return nodes.add(activation.name.capitalize(), values)
+        case "leaky_relu":
+            return nodes.add("LeakyRelu", values, alpha=numbers[0])
+        case "elu":
+            return nodes.add("Elu", values, alpha=numbers[0])
+        case "silu":
+            return nodes.add("Mul", values, nodes.add("Sigmoid", values))
+        case "clamp":
+            return nodes.add("Clip", values, *(nodes.constant(one, dtype) for one in numbers))
+    beta = nodes.constant(numbers[0], dtype)
+    soft = nodes.add("Softplus", nodes.add("Mul", values, beta))
+    return nodes.add("Div", soft, beta)

@@ -1,0 +1,421 @@
+"""Logs of a plant, played through a task: rewards, observations and ends without the FMU's code.
+
+::
+
+    log = fmugym.logs.PlantLog.read("week.csv")
+    recordings = fmugym.logs.play_log(log, partial(fmugym.load, "house.toml"))
+
+A log is a table with a column of times. ``play_log`` puts it in the place of the FMU, and finds the
+actions that write the logged inputs.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.archive.description import Variable
+from fmugym.archive.units import conversion_between
+from fmugym.checks import check_number
+from fmugym.declared import Task
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray
+from fmugym.recording import Recorder, Recording
+from fmugym.task.actions import flat_inputs
+
+__all__ = ["PlantLog", "play_log"]
+
+_HEADING: Final = re.compile(r"\s*(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]+)\])?\s*$")
+_INDEXED: Final = re.compile(r"\d+(,\s*\d+)*$")
+_SAME_TIME: Final = 1e-9
+"""Times that differ by less, in seconds, are the same."""
+
+_MOST_ACTIONS: Final = 10_000
+"""The most actions of discrete spaces that are tried out for a row."""
+
+
+@dataclass(frozen=True)
+class PlantLog:
+    """What a plant has measured.
+
+    Attributes:
+        times: In seconds, rising within an episode, shape (n,).
+        columns: The values by name, each of shape (n,).
+        units: The units by name, of the columns that tell one.
+        episodes: Numbers of the episodes, shape (n,).
+        inputs_before: Whether inputs in a row are those that led to it, from the row before;
+            otherwise they hold until the next row.
+    """
+
+    times: FloatArray
+    columns: Mapping[str, FloatArray]
+    units: Mapping[str, str]
+    episodes: FloatArray
+    inputs_before: bool = False
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], *, inputs_before: bool | None = None) -> PlantLog:
+        """Read a CSV file.
+
+        The first row names the columns, with or without a unit: ``T [degC]``. There must be a
+        column ``time``, in seconds. A column ``episode`` tells episodes apart; without it, an
+        episode begins where the time goes back. Files of ``RecordSeries`` are such logs.
+
+        Args:
+            path: The file.
+            inputs_before: As the attribute. By default it is True for files with a column
+                ``step``, as ``RecordSeries`` writes them.
+
+        Raises:
+            ConfigError: If the file cannot be read, a cell that is needed is no number, or times do
+                not rise.
+        """
+        names, rows = _cells(Path(path))
+        found = [_heading(name) for name in names]
+        values = {
+            name: np.array([_number(path, row, place) for row in rows])
+            for place, (name, _) in enumerate(found)
+            if name and _is_numeric(rows, place)
+        }
+        if "time" not in values:
+            raise ConfigError(f"{shown(str(path))} has no column 'time' of numbers")
+        times = values.pop("time")
+        numbers = values.pop("episode", np.cumsum(np.diff(times, prepend=times[:1]) < 0.0))
+        _require_rising(path, times, numbers)
+        units = {name: unit for name, unit in found if unit}
+        before = "step" in values if inputs_before is None else inputs_before
+        return cls(times, values, units, numbers.astype(np.float64), before)
+
+    def parts(self) -> Iterator[PlantLog]:
+        """The episodes, one by one."""
+        ends = np.flatnonzero(np.diff(self.episodes)) + 1
+        for rows in np.split(np.arange(len(self.times)), ends):
+            columns = {name: values[rows] for name, values in self.columns.items()}
+            yield replace(
+                self, times=self.times[rows], columns=columns, episodes=self.episodes[rows]
+            )
+
+
+def _cells(path: Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names, *rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{shown(str(path))} cannot be read: {reason(error)}") from None
+    except ValueError:
+        raise ConfigError(f"{shown(str(path))} is empty") from None
+    if not rows:
+        raise ConfigError(f"{shown(str(path))} has no rows, only a heading")
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise ConfigError(
+                f"{shown(str(path))}, row {number}: expected {len(names)} cells, got {len(row)}"
+            )
+    return names, rows
+
+
+def _heading(text: str) -> tuple[str, str | None]:
+    """A column's name and its unit; ``v[2]`` is a name."""
+    match = _HEADING.match(text)
+    unit = match and match["unit"]
+    if not match or not unit or (_INDEXED.match(unit) and " [" not in text):
+        return text.strip(), None
+    return match["name"], unit
+
+
+def _is_numeric(rows: Sequence[Sequence[str]], place: int) -> bool:
+    """Whether a column has a number in its first row; others are remarks."""
+    try:
+        float(rows[0][place])
+    except ValueError:
+        return False
+    return True
+
+
+def _number(path: Any, row: Sequence[str], place: int) -> float:
+    try:
+        return float(row[place])
+    except ValueError:
+        text = f"{shown(str(path))}: expected a number in column {place + 1}, got {row[place]!r}"
+        raise ConfigError(text) from None
+
+
+def _require_rising(path: Any, times: FloatArray, episodes: FloatArray) -> None:
+    wrong = (np.diff(times) <= 0.0) & (np.diff(episodes) == 0)
+    if wrong.any() or not np.isfinite(times).all():
+        row = int(np.flatnonzero(wrong)[0]) + 3 if wrong.any() else 2
+        raise ConfigError(
+            f"{shown(str(path))}, row {row}: the time must rise within an episode, and be finite"
+        )
+
+
+def play_log(
+    log: PlantLog,
+    make_env: Callable[..., gymnasium.Env[Any, Any]],
+    *,
+    columns: Mapping[str, str] | None = None,
+    tolerance: float = 1e-3,
+    seed: int = 0,
+) -> list[Recording]:
+    """Play a log through a task.
+
+    The log is read at the communication points of the task. Reals are interpolated between its
+    rows; everything else, and inputs, hold their value until the next row. The actions are those
+    that make the task write the logged inputs. Rewards, observations and ends are the task's own.
+    Where an episode ends, the next one begins with the row that follows. The last episode is
+    truncated by the end of the log. An episode of the log shorter than one time step is left out.
+
+    Args:
+        log: The log. It needs a column for each input and output of the task.
+        make_env: Makes an ``FMUEnv``, or wrappers around one; it must pass the argument
+            ``backend`` on. The hook ``_get_inputs`` must be free of side effects.
+        columns: The names of the FMU by the names of columns that differ. Aliases of a task file
+            are known.
+        tolerance: How far an input may be from the logged one, as a part of the range of values
+            that the log has of it.
+        seed: The episodes have this seed and the following ones.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        ConfigError: If a column is missing, its unit does not fit, or no action makes the logged
+            inputs.
+    """
+    check_number("tolerance", tolerance, minimum=0.0)
+    plant = _Plant()
+    env = make_env(backend=plant)
+    try:
+        return _Player(env, plant, log, dict(columns or {}), tolerance).play(seed)
+    finally:
+        env.close()
+
+
+class _Plant:
+    """The log in the place of the FMU: a ``Backend``."""
+
+    samples_outputs = True  # whoever has written the log
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, float]] = []
+        self.row = 0
+
+    @property
+    def left(self) -> int:
+        """How many steps are left."""
+        return len(self.rows) - 1 - self.row
+
+    def reset(self, start_values: Mapping[str, Any]) -> dict[str, float]:
+        """Begin at the present row."""
+        return self.rows[self.row]
+
+    def step(self, inputs: Mapping[str, float]) -> tuple[dict[str, float], int]:
+        """Go on by a row."""
+        self.row += 1
+        return self.rows[self.row], Status.OK
+
+    def stop(self) -> None:
+        """Do nothing."""
+
+
+class _Player:
+    """Plays a log through an environment whose backend is the plant of the log."""
+
+    def __init__(
+        self, env: Any, plant: _Plant, log: PlantLog, columns: dict[str, str], tolerance: float
+    ) -> None:
+        self._recorder = Recorder(env)
+        inner: FMUEnv = env.unwrapped
+        if inner._warm_up_steps:
+            raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
+        self._plant, self._log, self._time_step = plant, log, inner._spec.time_step
+        self._columns = _Columns(inner, log, columns)
+        self._actions = _Actions(inner, self._columns, tolerance)
+
+    def play(self, seed: int) -> list[Recording]:
+        episodes: list[Recording] = []
+        for part in self._log.parts():
+            times, rows = self._columns.rows(part, self._time_step)
+            self._plant.rows, self._plant.row = rows, 0
+            while self._plant.left > 0:
+                self._recorder.reset(seed=seed + len(episodes))
+                episodes.append(self._episode(times, rows))
+        return episodes
+
+    def _episode(self, times: FloatArray, rows: Sequence[Mapping[str, float]]) -> Recording:
+        over = False
+        while self._plant.left > 0 and not over:
+            now, row = times[self._plant.row], rows[self._plant.row]
+            _, _, terminated, truncated, info = self._recorder.step(self._actions.of(row, now))
+            if "fault" in info:
+                raise ConfigError(f"the log at {now:g} s: {info['fault']}")
+            over = terminated or truncated
+        recording = self._recorder.recording
+        recording.truncated[-1] |= not over
+        return recording
+
+
+class _Columns:
+    """The columns of a log as variables of an FMU, in the units of the FMU."""
+
+    def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:
+        self._columns = log.columns
+        self._variables = env.fmu.description.variables
+        self._from: dict[str, tuple[str, float, float]] = {}
+        task = getattr(env, "task", None)
+        document = task.document if isinstance(task, Task) else {}
+        for column in log.columns:
+            alias, unit = columns.get(column, column), log.units.get(column)
+            declared = document.get("variables", {}).get(alias, {})
+            name = declared.get("name", alias)
+            if name in self._variables:
+                own = self._variables[name].unit
+                units = env.fmu.description.units
+                to_log = conversion_between(own, unit or declared.get("unit"), units)
+                self._from[name] = column, 1.0 / to_log.factor, -to_log.offset / to_log.factor
+        for variable in env._spec.outputs:
+            self.require(variable)
+
+    def require(self, variable: Variable) -> None:
+        """Refuse a log without a column for this variable."""
+        if variable.name not in self._from:
+            raise unknown_name("column of the log", variable.name, self._columns)
+
+    def range_of(self, variable: Variable) -> float:
+        """How far apart the values of a variable are; 1 if they are all the same."""
+        column, factor, _ = self._from[variable.name]
+        return float(np.ptp(self._columns[column]) * abs(factor)) or 1.0
+
+    def rows(self, part: PlantLog, time_step: float) -> tuple[FloatArray, list[dict[str, float]]]:
+        """The communication points of an episode, and the values of the variables there."""
+        count = int((part.times[-1] - part.times[0]) / time_step + 1e-6)
+        times = part.times[0] + np.arange(count + 1) * time_step
+        values = {
+            name: self._at(name, part, column, times) * factor + offset
+            for name, (column, factor, offset) in self._from.items()
+        }
+        return times, [{name: float(v[k]) for name, v in values.items()} for k in range(len(times))]
+
+    def _at(self, name: str, part: PlantLog, column: str, times: FloatArray) -> FloatArray:
+        """The values of a variable from communication points on."""
+        variable, values = self._variables[name], part.columns[column]
+        is_input = variable.causality == "input"
+        if variable.kind == "real" and not is_input:
+            interpolated: FloatArray = np.interp(times, part.times, values)
+            return interpolated
+        after = np.searchsorted(part.times, times + _SAME_TIME, side="right")
+        if is_input and part.inputs_before:
+            return values[np.minimum(after, len(values) - 1)]
+        return values[after - 1]
+
+
+class _Actions:
+    """Finds the action that makes an environment write given inputs."""
+
+    def __init__(self, env: FMUEnv, columns: _Columns, tolerance: float) -> None:
+        self._env, self._tolerance = env, tolerance
+        self._space: Any = env.action_space
+        self._candidates = _candidates(self._space)
+        self._columns = columns
+        self._written: list[int] = []
+        self._scales = np.empty(0)
+
+    def of(self, row: Mapping[str, float], time: float) -> Any:
+        """Find the action for the inputs in a row.
+
+        Raises:
+            ConfigError: If a column is missing, or no action makes these inputs.
+        """
+        tried = [self._inputs(action) for action in self._candidates]
+        self._find_written(np.array(tried))
+        wanted = np.array([row[self._env._spec.inputs[place].name] for place in self._written])
+        action = self._nearest(np.array(tried), wanted)
+        self._require_near(action, wanted, time)
+        return action
+
+    def _inputs(self, action: Any) -> FloatArray:
+        """What the environment would write for an action."""
+        env, before = self._env, self._env.action
+        env.action = action
+        try:
+            return flat_inputs(env._get_inputs(), env._spec.inputs, shown)
+        finally:
+            env.action = before
+
+    def _find_written(self, tried: FloatArray) -> None:
+        """Note which inputs actions change; data and schedules write the others."""
+        changes = np.flatnonzero(np.ptp(tried, axis=0) > 0.0).tolist()
+        new = [place for place in changes if place not in self._written]
+        for place in new:
+            self._columns.require(self._env._spec.inputs[place])
+        if new:
+            self._written = sorted(self._written + new)
+            inputs = self._env._spec.inputs
+            self._scales = np.array([self._columns.range_of(inputs[i]) for i in self._written])
+
+    def _nearest(self, tried: FloatArray, wanted: FloatArray) -> Any:
+        if not isinstance(self._space, spaces.Box):
+            distances = np.abs((tried[:, self._written] - wanted) / self._scales).sum(axis=1)
+            return self._candidates[int(distances.argmin())]
+        middle, *others = (np.ravel(action).astype(np.float64) for action in self._candidates)
+        moved = np.array([(other - middle).sum() for other in others])
+        slopes = (tried[1:, self._written] - tried[0, self._written]).T / moved
+        moves = np.linalg.lstsq(slopes, wanted - tried[0, self._written], rcond=None)[0]
+        flat = np.clip(middle + moves, self._space.low.ravel(), self._space.high.ravel())
+        return flat.reshape(self._space.shape).astype(self._space.dtype)
+
+    def _require_near(self, action: Any, wanted: FloatArray, time: float) -> None:
+        made = self._inputs(action)[self._written]
+        off = np.abs(made - wanted) > self._tolerance * self._scales
+        if off.any():
+            place = int(np.flatnonzero(off)[0])
+            name = self._env._spec.inputs[self._written[place]].name
+            raise ConfigError(
+                f"the log at {time:g} s: no action of {self._space} makes {name} = "
+                f"{wanted[place]:g}; the nearest makes {made[place]:g}. If that is near enough, "
+                "raise the tolerance"
+            )
+
+
+def _candidates(space: spaces.Space[Any]) -> list[Any]:
+    """All actions of a discrete space; of a box, its middle and one more along each axis.
+
+    Raises:
+        ConfigError: If the space is neither, or has too many actions.
+    """
+    if isinstance(space, spaces.Box):
+        return _corners(space)
+    if isinstance(space, spaces.Discrete):
+        ranges: list[range] = [range(int(space.start), int(space.start + space.n))]
+    elif isinstance(space, spaces.MultiDiscrete):
+        low, counts = np.ravel(space.start), np.ravel(space.nvec)
+        ranges = [range(int(a), int(a + n)) for a, n in zip(low, counts, strict=True)]
+    else:
+        raise ConfigError(f"a log can be played with actions of numbers, not of {space}")
+    if math.prod(map(len, ranges)) > _MOST_ACTIONS:
+        raise ConfigError(f"{space} has more than {_MOST_ACTIONS} actions, too many to try out")
+    if isinstance(space, spaces.Discrete):
+        return [np.int64(number) for number in ranges[0]]
+    shape, dtype = space.shape, space.dtype
+    return [np.array(one, dtype).reshape(shape) for one in itertools.product(*ranges)]
+
+
+def _corners(space: spaces.Box) -> list[Any]:
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    low, high = np.where(bounded, space.low, -2.0), np.where(bounded, space.high, 2.0)
+    middle, quarter = ((low + high) / 2).ravel(), ((high - low) / 4).ravel()
+    moves = [np.zeros_like(middle), *np.diag(quarter)]
+    return [(middle + move).reshape(space.shape).astype(space.dtype) for move in moves]

@@ -1,0 +1,179 @@
+"""The components of a system as a user gives them, checked against their FMUs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fmugym.archive.description import INTERFACES, Variable
+from fmugym.archive.fmu import FMU
+from fmugym.archive.structure import Feedthrough
+from fmugym.checks import (
+    check_count,
+    check_flag,
+    check_mapping,
+    check_number,
+    check_option,
+    check_path,
+)
+from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.systems import plan
+
+__all__ = ["Component", "OpenComponent", "start_number"]
+
+_NO_NAME = set('/\\:*?"<>|')
+
+
+@dataclass(frozen=True)
+class Component:
+    """One FMU of an ``FMUSystem``.
+
+    Attributes:
+        fmu: The path of the ``.fmu`` file, or an ``FMU``, whose limits and libraries are used.
+        start_values: Parameters and start values by the names of the FMU's variables, in their
+            units. Those of an environment, such as ``model_parameters``, win.
+        interface: ``"co_simulation"`` or ``"model_exchange"``; by default co-simulation where the
+            FMU offers it.
+        steps: Communication steps of this component in one of the system.
+        feedthrough: False says that no output depends on an input without a step in between, for
+            FMUs that tell nothing of it; None for what the FMU tells.
+
+    Raises:
+        ConfigError: If a value does not fit.
+    """
+
+    fmu: FMU | str | os.PathLike[str]
+    start_values: Mapping[str, Any] = field(default_factory=dict)
+    interface: str | None = None
+    steps: int = 1
+    feedthrough: bool | None = None
+
+    def __post_init__(self) -> None:
+        values = check_mapping("start_values of a component", self.start_values)
+        object.__setattr__(self, "start_values", values)
+        object.__setattr__(self, "steps", check_count("steps of a component", self.steps))
+        if self.interface is not None:
+            check_option("interface", self.interface, INTERFACES)
+        if self.feedthrough is not None and check_flag("feedthrough", self.feedthrough):
+            raise ConfigError("feedthrough of a component must be False or None, got True")
+        if not isinstance(self.fmu, FMU):
+            check_path("the path of an FMU", self.fmu)
+
+    @classmethod
+    def of(cls, value: Any) -> Component:
+        """Return a component as it is, or make one of an FMU."""
+        return value if isinstance(value, Component) else cls(value)
+
+
+class OpenComponent:
+    """A component whose FMU has been read.
+
+    Args:
+        name: Its name in the system.
+        given: What the user gave.
+
+    Attributes:
+        name, given: As given.
+        fmu: The FMU. Nothing of it is executed or extracted.
+        starts: The start values as numbers and texts.
+
+    Raises:
+        ConfigError: If the name or a start value does not fit.
+        FMULoadError: If the FMU cannot be read.
+    """
+
+    def __init__(self, name: str, given: Component) -> None:
+        if not name or not name.isprintable() or _NO_NAME & set(name) or name != name.strip():
+            raise ConfigError(f"a component cannot be named {shown(name)}")
+        self.name, self.given = name, given
+        self.fmu = _opened(given)
+        self.starts = tuple(map(self._start, given.start_values.items()))
+
+    def _start(self, item: tuple[str, Any]) -> tuple[str, float | str]:
+        name, value = item
+        variable = self.variable(name)
+        if not variable.settable_at_start:
+            raise ConfigError(
+                f"{self.name}.{name} cannot be set: it is a {variable.variability} "
+                f"{variable.causality} with initial={variable.initial!r}"
+            )
+        return name, start_number(f"{self.name}.{name}", variable, value)
+
+    def variable(self, name: str) -> Variable:
+        """Find a variable by its name in the component.
+
+        Raises:
+            ConfigError: If there is none; the text suggests the nearest name.
+        """
+        variables = self.fmu.description.variables
+        if name not in variables:
+            raise unknown_name(f"variable of the component {self.name!r}", name, variables)
+        return variables[name]
+
+    @property
+    def feedthrough(self) -> Feedthrough:
+        """Which inputs act on which outputs at once."""
+        told = self.fmu.feedthrough
+        if self.given.feedthrough is None:
+            return told
+        nothing: dict[str, frozenset[str]] = dict.fromkeys(told.in_step, frozenset())
+        return Feedthrough(nothing, nothing, known=True)
+
+    def planned(self) -> plan.Component:
+        """The component as the master executes it."""
+        limits, preload = self.fmu.limits, self.fmu.preload
+        return plan.Component(
+            self.name,
+            self.fmu.path,
+            self.fmu.interface,
+            self.given.steps,
+            self.starts,
+            limits,
+            preload,
+        )
+
+
+def start_number(name: str, variable: Variable, value: Any) -> float | str:
+    """Convert a start value for a variable, without loss.
+
+    Args:
+        name: The name of the variable, for errors.
+        variable: The variable.
+        value: A number, a Boolean, a text, or the name of an item of an enumeration.
+
+    Raises:
+        ConfigError: If the value is not of the variable's kind.
+    """
+    if variable.kind == "string" and isinstance(value, str):
+        return str.__str__(value)
+    if not variable.numeric:
+        raise ConfigError(f"{name} is of type {variable.type} and cannot be {shown(value)}")
+    items = dict(variable.items)
+    if isinstance(value, str) and value in items:
+        return float(items[value])
+    if isinstance(value, str) and items:
+        raise unknown_name(f"item of {name}", value, items)
+    number = check_number(name, value)
+    whole = variable.kind in {"integer", "enumeration"}
+    if (whole and not number.is_integer()) or (variable.kind == "boolean" and number not in {0, 1}):
+        raise ConfigError(f"{name} is of type {variable.type}, got {shown(value)}")
+    return number
+
+
+def _opened(given: Component) -> FMU:
+    if not isinstance(given.fmu, FMU):
+        path = check_path("the path of an FMU", given.fmu)
+        return FMU(path, interface=given.interface)
+    if given.interface in (None, given.fmu.description.interface):
+        return given.fmu
+    source = given.fmu
+    return FMU(
+        Path(source.path),
+        limits=source.limits,
+        preload=source.preload,
+        probe_timeout=source.probe_timeout,
+        interface=given.interface,
+    )

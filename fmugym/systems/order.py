@@ -1,0 +1,192 @@
+"""The order in which a system is evaluated, and its algebraic loops.
+
+A node of these graphs depends on its successors. Strongly connected nodes are found by Tarjan's
+algorithm (SIAM Journal on Computing 1 (1972), 146-160), which gives them in an order in which each
+comes after all it depends on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from fmugym.archive.structure import Feedthrough
+from fmugym.systems.plan import Evaluation, Group, Link, Loop
+
+__all__ = ["Order", "order_of", "strong_components"]
+
+Node = TypeVar("Node", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class Order:
+    """The order of a system.
+
+    Attributes:
+        groups: The components in the order of their steps.
+        initialization: The links in the order of the initialization.
+        loops: The links of each algebraic loop between steps.
+        late: Links whose value is one step late although no loop asks for it.
+    """
+
+    groups: tuple[Group, ...]
+    initialization: tuple[Evaluation, ...]
+    loops: tuple[tuple[Link, ...], ...]
+    late: tuple[Link, ...]
+
+
+def order_of(
+    names: Sequence[str], links: Sequence[Link], told: Mapping[str, Feedthrough], loop: Loop
+) -> Order:
+    """Order the components and links of a system.
+
+    A component steps after those whose new values act on its outputs at once. Where nothing asks
+    for an order, it is that of the names.
+
+    Args:
+        names: The components.
+        links: The connections.
+        told: The direct feed-through of each component.
+        loop: How algebraic loops are solved.
+    """
+    in_step = _chains(links, {name: one.in_step for name, one in told.items()})
+    found = _loops(in_step)
+    loops = tuple(tuple(links[place] for place in sorted(cycle)) for cycle in found)
+    teams = _teams(names, loops)
+    order, late = _order_of_teams(names, teams, links, told)
+    groups = tuple(_group(team, loops, loop) for team in order)
+    return Order(groups, _initialization(links, told, loop), loops, late)
+
+
+def _chains(
+    links: Sequence[Link], told: Mapping[str, Mapping[str, frozenset[str]]]
+) -> dict[int, list[int]]:
+    """For each link, the links whose values its own depends on at once."""
+    into: dict[tuple[str, str], int] = {(k.target, k.input): i for i, k in enumerate(links)}
+    return {
+        place: sorted(
+            into[link.source, name]
+            for name in told[link.source].get(link.output, ())
+            if (link.source, name) in into
+        )
+        for place, link in enumerate(links)
+    }
+
+
+def _loops(graph: Mapping[int, Sequence[int]]) -> list[list[int]]:
+    return [c for c in strong_components(graph) if len(c) > 1 or c[0] in graph[c[0]]]
+
+
+def _initialization(
+    links: Sequence[Link], told: Mapping[str, Feedthrough], loop: Loop
+) -> tuple[Evaluation, ...]:
+    graph = _chains(links, {name: one.at_start for name, one in told.items()})
+    return tuple(
+        Evaluation(tuple(sorted(c)), loop if len(c) > 1 or c[0] in graph[c[0]] else None)
+        for c in strong_components(graph)
+    )
+
+
+def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, tuple[str, ...]]:
+    """For each component, those that are in algebraic loops with it, and itself."""
+    team = {name: {name} for name in names}
+    for loop in loops:
+        union = set().union(*(team[end] for link in loop for end in (link.source, link.target)))
+        team.update(dict.fromkeys(union, union))
+    return {name: tuple(one for one in names if one in team[name]) for name in names}
+
+
+def _order_of_teams(
+    names: Sequence[str],
+    teams: Mapping[str, tuple[str, ...]],
+    links: Sequence[Link],
+    told: Mapping[str, Feedthrough],
+) -> tuple[list[tuple[str, ...]], tuple[Link, ...]]:
+    """Order the teams. Those that ask for each other's new values stay in the order of names."""
+    acting = [
+        link for link in links if _acts(link, told) and teams[link.source] != teams[link.target]
+    ]
+    graph: dict[tuple[str, ...], list[tuple[str, ...]]] = {teams[name]: [] for name in names}
+    for link in acting:
+        graph[teams[link.target]].append(teams[link.source])
+    places = list(graph)
+    order = [
+        team for together in strong_components(graph) for team in sorted(together, key=places.index)
+    ]
+    rank = {team: place for place, team in enumerate(order)}
+    late = (link for link in acting if rank[teams[link.source]] > rank[teams[link.target]])
+    return order, tuple(late)
+
+
+def _acts(link: Link, told: Mapping[str, Feedthrough]) -> bool:
+    """Whether the value of a link acts on an output of its target at once."""
+    return any(link.input in inputs for inputs in told[link.target].in_step.values())
+
+
+def _group(team: tuple[str, ...], loops: Iterable[Sequence[Link]], loop: Loop) -> Group:
+    own = set(team)
+    in_loop = any(link.source in own for one in loops for link in one)
+    return Group(team, loop if in_loop else None)
+
+
+@dataclass
+class _Search(Generic[Node]):
+    """The state of a depth-first search, which uses no recursion: systems may be long chains."""
+
+    graph: Mapping[Node, Sequence[Node]]
+    index: dict[Node, int] = field(default_factory=dict)
+    low: dict[Node, int] = field(default_factory=dict)
+    stack: list[Node] = field(default_factory=list)
+    on_stack: set[Node] = field(default_factory=set)
+    found: list[list[Node]] = field(default_factory=list)
+
+    def visit(self, root: Node) -> None:
+        path = [(root, iter(self.graph[root]))]
+        self._enter(root)
+        while path:
+            node, successors = path[-1]
+            after = next(successors, None)
+            if after is None:
+                path.pop()
+                self._leave(node)
+                if path:
+                    self._lower(path[-1][0], self.low[node])
+            elif after not in self.index:
+                self._enter(after)
+                path.append((after, iter(self.graph[after])))
+            elif after in self.on_stack:
+                self._lower(node, self.index[after])
+
+    def _enter(self, node: Node) -> None:
+        self.index[node] = self.low[node] = len(self.index)
+        self.stack.append(node)
+        self.on_stack.add(node)
+
+    def _lower(self, node: Node, value: int) -> None:
+        self.low[node] = min(self.low[node], value)
+
+    def _leave(self, node: Node) -> None:
+        if self.low[node] < self.index[node]:
+            return
+        place = self.stack.index(node)
+        component = self.stack[place:]
+        del self.stack[place:]
+        self.on_stack.difference_update(component)
+        self.found.append(component)
+
+
+def strong_components(graph: Mapping[Node, Sequence[Node]]) -> list[list[Node]]:
+    """Find the strongly connected components of a graph.
+
+    Args:
+        graph: For each node, those it depends on.
+
+    Returns:
+        The components, each after all it depends on.
+    """
+    search: _Search[Node] = _Search(graph)
+    for node in graph:
+        if node not in search.index:
+            search.visit(node)
+    return search.found

@@ -1,0 +1,269 @@
+"""Nested systems made flat: which component drives which, and what starts where.
+
+A node is a connector of a component or a system, named by the path of its element and its own name.
+Connections make a forest of nodes: every node has one source at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from fmugym.archive.description import ModelDescription, Unit, Variable
+from fmugym.archive.units import IDENTITY, conversion_of_link
+from fmugym.errors import ConfigError, FMULoadError, shown
+from fmugym.systems.connections import Connection
+from fmugym.systems.ssp.elements import Element, Scaling, SystemElement, Wire
+from fmugym.systems.ssp.parameters import Setting, read_settings
+
+__all__ = ["Flat", "Node"]
+
+Path = tuple[str, ...]
+Node = tuple[Path, str]
+"""The path of an element, () for the root system, and the name of a connector."""
+
+
+@dataclass(frozen=True)
+class _Value:
+    """A value on its way: ``gain * x + offset`` in a unit; None if it is not known."""
+
+    gain: float = 1.0
+    offset: float = 0.0
+    unit: str | None = None
+
+
+@dataclass
+class Flat:
+    """A tree of systems as one level.
+
+    Args:
+        root: The root system.
+        units: The units that the file defines.
+        description_of: Reads the model description of a component.
+        findings: What is ignored is added here.
+
+    Attributes:
+        components: The components by path.
+    """
+
+    root: SystemElement
+    units: Mapping[str, Unit]
+    description_of: Callable[[Element], ModelDescription]
+    findings: list[str]
+    components: dict[Path, Element] = field(default_factory=dict)
+    _systems: dict[Path, SystemElement] = field(default_factory=dict)
+    _into: dict[Node, tuple[Node, Wire]] = field(default_factory=dict)
+    _out_of: dict[Node, list[tuple[Node, Wire]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._enter((), self.root)
+        for path, system in self._systems.items():
+            for wire in system.wires:
+                self._add_wire(path, system, wire)
+
+    def _enter(self, path: Path, system: SystemElement) -> None:
+        self._systems[path] = system
+        for name, element in system.elements.items():
+            if isinstance(element, SystemElement):
+                self._enter((*path, name), element)
+            else:
+                self.components[*path, name] = element
+
+    def _variable(self, node: Node) -> Variable | None:
+        """The variable of an FMU behind a node, if there is one."""
+        element = self.components.get(node[0])
+        if element is None:
+            return None
+        return self.description_of(element).variables.get(node[1])
+
+    # Connections
+
+    def _add_wire(self, path: Path, system: SystemElement, wire: Wire) -> None:
+        nodes = [self._node(path, system, end, wire) for end in (wire.start, wire.end)]
+        gives = [self._gives(path, node) for node in nodes]
+        if gives[0] is False or gives[1] is True:
+            nodes.reverse()
+            gives.reverse()
+        if gives[0] is False or gives[1] is True:
+            raise FMULoadError(
+                f"the connection {wire} joins two connectors of which "
+                f"{'both give' if gives[0] else 'none gives'} a value"
+            )
+        source, target = nodes
+        other = self._into.setdefault(target, (source, wire))
+        if other[0] != source:
+            names = f"{_named(other[0])}, {_named(source)}"
+            raise ConfigError(f"{_named(target)} has two sources: {names}")
+        self._out_of.setdefault(source, []).append((target, wire))
+
+    def _node(
+        self, path: Path, system: SystemElement, end: tuple[str | None, str], wire: Wire
+    ) -> Node:
+        element, connector = end
+        if element is None:
+            if connector not in system.connectors:
+                raise FMULoadError(
+                    f"the connection {wire}: the system {system.name!r} has no connector "
+                    f"{shown(connector)}"
+                )
+            return path, connector
+        if element not in system.elements:
+            raise FMULoadError(
+                f"the connection {wire}: the system {system.name!r} has no element {shown(element)}"
+            )
+        return (*path, element), connector
+
+    def _gives(self, path: Path, node: Node) -> bool | None:
+        """Whether a connector gives a value to the inside of the system at ``path``."""
+        place, name = node
+        element = self.components.get(place) or self._systems[place]
+        connector = element.connectors.get(name)
+        if connector is not None and connector.kind not in {"inout", "unspecified"}:
+            return connector.gives != (place == path)
+        variable = self._variable(node)
+        return None if variable is None else variable.causality in {"output", "local"}
+
+    def connections(self) -> Iterator[Connection]:
+        """The connections between components, and with the inputs and outputs of the root."""
+        for target in self._into:
+            at_root = target[0] == ()
+            if at_root or target[0] in self.components:
+                chain = self._chain(target)
+                source = chain[0][0]
+                if source[0] == () and at_root:
+                    self.findings.append(
+                        f"the connection {_named(source)} -> {_named(target)} joins no component "
+                        "and is ignored"
+                    )
+                elif source[0] == () or source[0] in self.components:
+                    yield self._connection(target, chain)
+
+    def _chain(self, target: Node) -> list[tuple[Node, Wire]]:
+        """The ways from the first source to a node."""
+        chain: list[tuple[Node, Wire]] = []
+        node = target
+        while node in self._into:
+            chain.append(self._into[node])
+            node = chain[-1][0]
+            if len(chain) > len(self._into):
+                raise FMULoadError(f"the connections to {_named(target)} form a circle of systems")
+        return chain[::-1]
+
+    def _connection(self, target: Node, chain: list[tuple[Node, Wire]]) -> Connection:
+        ends = _named(chain[0][0]), _named(target)
+        if len(chain) == 1:  # kept as it is in the file, so that it can be written back
+            wire = chain[0][1]
+            return Connection(*ends, wire.scaling.gain, wire.scaling.offset, wire.convert)
+        value = _Value(unit=self._unit(chain[0][0]))
+        stops = [node for node, _ in chain[1:]] + [target]
+        for (_, wire), stop in zip(chain, stops, strict=True):
+            value = self._through(value, wire.convert, wire.scaling, stop)
+        return Connection(*ends, value.gain, value.offset, convert_units=False)
+
+    def _through(self, value: _Value, convert: bool, scaling: Scaling, node: Node) -> _Value:
+        """Convert a value to the unit of a node, then scale it."""
+        unit = self._unit(node)
+        conversion = IDENTITY
+        if convert and value.unit is not None and unit is not None:
+            conversion = conversion_of_link(value.unit, self.units, unit, self._units_at(node))
+        factor = scaling.gain * conversion.factor
+        offset = scaling.gain * (conversion.factor * value.offset + conversion.offset)
+        known = value.unit if unit is None else unit
+        return _Value(factor * value.gain, offset + scaling.offset, known)
+
+    def _unit(self, node: Node) -> str | None:
+        """The unit of a connector; an FMU knows best what its variable has."""
+        place, name = node
+        variable = self._variable(node)
+        if variable is not None and variable.unit is not None:
+            return variable.unit
+        element = self.components.get(place) or self._systems[place]
+        connector = element.connectors.get(name)
+        return None if connector is None else connector.unit
+
+    def _units_at(self, node: Node) -> Mapping[str, Unit]:
+        element = self.components.get(node[0])
+        return {**self.units, **({} if element is None else self.description_of(element).units)}
+
+    # Parameters
+
+    def start_values(self, read: Callable[[str], Any]) -> dict[Path, dict[str, Any]]:
+        """The start values of each component, by the names of its variables.
+
+        Bindings of a system win over those of its elements, later ones over earlier ones.
+
+        Args:
+            read: Returns the root of an XML file of the archive by its URI.
+        """
+        values: dict[Path, dict[str, Any]] = {path: {} for path in self.components}
+        owners: list[tuple[Path, Element | SystemElement]] = [
+            *self.components.items(),
+            *self._systems.items(),
+        ]
+        for path, owner in sorted(owners, key=lambda item: -len(item[0])):
+            for binding in owner.bindings:
+                for setting in read_settings(binding, read, self.findings):
+                    self._set(path, setting, values)
+        return values
+
+    def _set(self, path: Path, setting: Setting, values: dict[Path, dict[str, Any]]) -> None:
+        nodes = list(self._matching(path, setting.name))
+        ends = [end for node in nodes for end in self._ends(node, setting)]
+        for (place, name), value in ends:
+            values[place][name] = value
+        if not ends:
+            self.findings.append(
+                f"the parameter {shown(_named((path, setting.name)))} names nothing and is ignored"
+            )
+
+    def _matching(self, path: Path, name: str) -> Iterator[Node]:
+        """The nodes that a hierarchical name may mean, seen from an element."""
+        if path in self.components:
+            if self._variable((path, name)) is not None:
+                yield path, name
+            return
+        system = self._systems[path]
+        if name in system.connectors:
+            yield path, name
+        for element in system.elements:
+            if name.startswith(f"{element}."):
+                yield from self._matching((*path, element), name[len(element) + 1 :])
+
+    def _ends(self, node: Node, setting: Setting) -> Iterator[tuple[Node, Any]]:
+        """The variables of components that get a value by a node, and their values."""
+        value = setting.value
+        if isinstance(value, bool | str):
+            for end, _ in self._reached(node, _Value()):
+                yield end, value
+            return
+        first = _Value(0.0, float(value), setting.unit)
+        units = {**self.units, **setting.units}
+        first = self._converted(first, units, setting, node)
+        for end, reached in self._reached(node, first):
+            yield end, reached.offset
+
+    def _converted(
+        self, value: _Value, units: Mapping[str, Unit], setting: Setting, node: Node
+    ) -> _Value:
+        """Convert the value of a parameter set to the unit of the first node, then scale it."""
+        unit = self._unit(node)
+        number = value.offset
+        if setting.convert and value.unit is not None and unit is not None:
+            conversion = conversion_of_link(value.unit, units, unit, self._units_at(node))
+            number = conversion(number)
+        scaled = setting.scaling.gain * number + setting.scaling.offset
+        return _Value(0.0, scaled, unit)
+
+    def _reached(self, node: Node, value: _Value) -> Iterator[tuple[Node, _Value]]:
+        if node[0] in self.components:
+            yield node, value
+            return
+        for target, wire in self._out_of.get(node, ()):
+            if target != node and len(target[0]) > len(node[0]):
+                following = self._through(value, wire.convert, wire.scaling, target)
+                yield from self._reached(target, following)
+
+
+def _named(node: Node) -> str:
+    return ".".join((*node[0], node[1]))

@@ -1,0 +1,154 @@
+"""Systems as users make, read and write them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Self
+
+from fmugym.archive.safe_zip import ArchiveLimits
+from fmugym.checks import check_path
+from fmugym.errors import FMUGymError
+from fmugym.systems.components import Component
+from fmugym.systems.drawing import draw
+from fmugym.systems.ssp.reading import arguments_of
+from fmugym.systems.ssp.writing import write_ssp
+from fmugym.systems.wired import WiredSystem
+
+__all__ = ["FMUSystem"]
+
+
+class FMUSystem(WiredSystem):
+    """Several FMUs that run as one. It can stand wherever an FMU can.
+
+    The variables of the system are those of its components, named ``component.variable``. Inputs
+    that nothing drives are inputs of the system. A connection that begins or ends at a name without
+    a component gives the system an input, parameter or output of this name.
+
+    Args:
+        components: By name: the path of an FMU, an ``FMU`` or a ``Component``.
+        connections: ``"plant.y -> controller.u"``, pairs of names, or ``Connection`` objects.
+        name: The name of the system.
+        units: Units of the system's own inputs, outputs and parameters by name; without one, they
+            have the unit of the variable behind them.
+        master: ``"gauss_seidel"``, where each component gets the newest values, or ``"jacobi"``.
+        loops: How algebraic loops are solved: ``"newton"``, ``"fixed_point"``, or ``"refuse"``.
+        loop_tolerance: Relative, and absolute below 1, for the values in a loop.
+        loop_iterations: After so many, a step fails.
+        step_size: The default communication step size in seconds; without one, the smallest
+            default step size of the components.
+        start_time, stop_time: Of the default experiment, in seconds.
+        tolerance: For the solvers of the components; None for their own defaults.
+        description: For people.
+        own_names: Names of the system itself that contain a dot.
+        unit_definitions: Units that ``units`` use and that neither an FMU nor pint knows.
+        findings: What a file that described the system had of doubtful things.
+        file: The file that described the system.
+
+    Attributes:
+        name, description, units, unit_definitions, own_names, master, loops: As given.
+        components: The components by name, their FMUs read.
+        connections: As given, as ``Connection`` objects.
+        loop: How algebraic loops are solved.
+        times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
+
+    Raises:
+        ConfigError: If an argument does not fit, a name is unknown, two connections have one
+            target, or units or types do not fit.
+        FMULoadError: If an FMU cannot be read.
+    """
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> Self:
+        """Read an SSP archive. Nothing of its FMUs is executed.
+
+        Nested systems become one level: a component ``plant`` of the system ``car`` is named
+        ``car.plant``. Geometry, annotations of other tools and values for parameters that do not
+        exist are ignored and listed in ``findings``.
+
+        Args:
+            path: The ``.ssp`` file.
+            limits: What is too large to be opened.
+
+        Raises:
+            ConfigError: If the system has a mistake.
+            FMULoadError: If the archive or an FMU cannot be read, or it has something that changes
+                results and is not supported, such as signal dictionaries.
+        """
+        arguments = arguments_of(path, limits)
+        try:
+            return cls(**arguments)
+        except FMUGymError as error:
+            raise type(error)(f"{arguments['file'].name}: {error}") from None
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the system with its FMUs as an SSP archive.
+
+        What SSP has no words for (the master, steps of components) stands in annotations that
+        fmugym reads again.
+
+        Args:
+            path: The ``.ssp`` file, which is replaced if it exists.
+
+        Returns:
+            The path.
+
+        Raises:
+            ConfigError: If the path is none.
+            FMULoadError: If the file cannot be written.
+        """
+        file = check_path("the path of a system", path)
+        write_ssp(self, file)
+        return file
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the system: components, connections with their gains, inputs, outputs, loops.
+
+        Args:
+            path: A file to write, such as ``system.png`` or ``system.svg``; None for no file.
+
+        Returns:
+            The figure of Matplotlib.
+
+        Raises:
+            ConfigError: If Matplotlib is missing (extra ``plot``), the format of the file is
+                unknown, or the file cannot be written.
+        """
+        return draw(self, path)
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """A system pickles as the file that it came from, or as its arguments."""
+        if self.file is not None:
+            return type(self).read, (self.file,)
+        return _again, (type(self), self.arguments())
+
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that make this system once more, FMUs as their paths."""
+        components = {
+            name: Component(
+                one.fmu.path,
+                one.given.start_values,
+                one.fmu.interface,
+                one.given.steps,
+                one.given.feedthrough,
+            )
+            for name, one in self.components.items()
+        }
+        return {
+            "components": components,
+            "connections": self.connections,
+            "name": self.name,
+            "units": self.units,
+            "master": self.master,
+            "loops": self.loops,
+            "loop_tolerance": self.loop.tolerance,
+            "loop_iterations": self.loop.max_iterations,
+            **self.times,
+            "description": self.description,
+            "own_names": self.own_names,
+            "unit_definitions": self.unit_definitions,
+        }
+
+
+def _again(cls: type[FMUSystem], arguments: dict[str, Any]) -> FMUSystem:
+    return cls(**arguments)

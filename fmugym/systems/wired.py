@@ -1,0 +1,196 @@
+"""What follows from the components and connections of a system: its order and its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from fmugym.archive.description import Unit
+from fmugym.checks import check_count, check_mapping, check_number, check_option, check_text
+from fmugym.errors import ConfigError, shown
+from fmugym.systems.components import Component, OpenComponent
+from fmugym.systems.connections import Connection
+from fmugym.systems.order import Order, order_of
+from fmugym.systems.plan import LOOP_METHODS, MASTERS, Connector, Link, Loop, SystemPlan
+from fmugym.systems.wiring import Port, Wiring
+
+__all__ = ["LOOPS", "WiredSystem"]
+
+LOOPS: Final = (*LOOP_METHODS, "refuse")
+"""What is done about algebraic loops."""
+
+
+class WiredSystem:
+    """A system with all its names resolved.
+
+    See ``fmugym.FMUSystem`` for the arguments, the attributes and the errors.
+    """
+
+    def __init__(
+        self,
+        components: Mapping[str, Any],
+        connections: Sequence[Any] = (),
+        *,
+        name: str = "system",
+        units: Mapping[str, str] | None = None,
+        master: str = MASTERS[0],
+        loops: str = LOOPS[0],
+        loop_tolerance: float = Loop.tolerance,
+        loop_iterations: int = Loop.max_iterations,
+        step_size: float | None = None,
+        start_time: float = 0.0,
+        stop_time: float | None = None,
+        tolerance: float | None = None,
+        description: str = "",
+        own_names: Sequence[str] = (),
+        unit_definitions: Mapping[str, Unit] | None = None,
+        findings: Sequence[str] = (),
+        file: Path | None = None,
+    ) -> None:
+        given = check_mapping("components", components)
+        if not given:
+            raise ConfigError("a system needs at least one component")
+        self.name = check_text("the name of a system", name)
+        self.description = check_text("the description of a system", description)
+        self.units = {
+            n: check_text("a unit", u) for n, u in check_mapping("units", units or {}).items()
+        }
+        self.master = check_option("master", master, MASTERS)
+        self.loops = check_option("way of solving loops", loops, LOOPS)
+        self.loop = _loop(self.loops, loop_tolerance, loop_iterations)
+        self.times = _times(step_size, start_time, stop_time, tolerance)
+        self._given_findings, self.file = tuple(findings), file
+        self.connections = tuple(map(Connection.of, _listed(connections)))
+        self.components = {n: OpenComponent(n, Component.of(c)) for n, c in given.items()}
+        self.own_names = tuple(own_names)
+        self.unit_definitions = dict(unit_definitions or {})
+        self._wiring = Wiring(
+            self.components,
+            self.connections,
+            self.units,
+            frozenset(self.own_names) | self.units.keys(),
+            self.unit_definitions,
+        )
+        self.units = {one.name: one.unit for one in self.connectors if one.unit is not None}
+        if self.loops == "refuse" and self.order.loops:
+            raise ConfigError(
+                f"the system has an algebraic loop: {_told_loop(self.order.loops[0])}"
+            )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}: {', '.join(self.components)})"
+
+    @cached_property
+    def order(self) -> Order:
+        """The order of steps and of the initialization, and the algebraic loops."""
+        told = {name: one.feedthrough for name, one in self.components.items()}
+        return order_of(list(self.components), self._wiring.links, told, self.loop)
+
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """The connections between components, with gains and offsets between the FMUs' units."""
+        return tuple(self._wiring.links)
+
+    def port(self, name: str) -> Port | None:
+        """Find the variable that a name stands for; None for a name of the system itself.
+
+        Raises:
+            ConfigError: If there is no such component or variable.
+        """
+        return self._wiring.port(name)
+
+    @property
+    def connectors(self) -> tuple[Connector, ...]:
+        """The system's own inputs, outputs and parameters."""
+        return tuple(self._wiring.connectors)
+
+    @property
+    def open_inputs(self) -> tuple[Port, ...]:
+        """The inputs of components that nothing drives."""
+        return tuple(self._wiring.open_inputs())
+
+    @cached_property
+    def findings(self) -> tuple[str, ...]:
+        """What is doubtful in the system and in its FMUs, as texts."""
+        own = [f"algebraic loop: {_told_loop(loop)}" for loop in self.order.loops]
+        own += [
+            f"{link.target} steps before {link.source}, so that {link.target}.{link.input} gets "
+            "the value of the step before"
+            for link in self.order.late
+        ]
+        untold = [
+            f"{name} does not tell which outputs depend on which inputs at once: all, it is taken"
+            for name, one in self.components.items()
+            if not one.feedthrough.known
+        ]
+        of_fmus = [
+            f"{name}: {finding}"
+            for name, one in self.components.items()
+            for finding in one.fmu.findings
+        ]
+        return (*self._given_findings, *own, *untold, *of_fmus)
+
+    @cached_property
+    def plan(self) -> SystemPlan:
+        """What the master executes."""
+        times = dict(self.times)
+        if times["step_size"] is None:
+            times["step_size"] = self._smallest_step()
+        return SystemPlan(
+            self.name,
+            tuple(one.planned() for one in self.components.values()),
+            self.links,
+            self.order.groups,
+            self.order.initialization,
+            self.master,
+            self.connectors,
+            description=self.description,
+            findings=self.findings,
+            file=self.file,
+            **times,
+        )
+
+    def _smallest_step(self) -> float | None:
+        """The smallest default step size of the components, as a step of the system."""
+        steps = [
+            size * one.given.steps
+            for one in self.components.values()
+            if (size := one.fmu.description.step_size) is not None
+        ]
+        return min(steps, default=None)
+
+
+def _listed(connections: Any) -> Sequence[Any]:
+    if isinstance(connections, list | tuple):
+        return connections
+    raise ConfigError(f"connections must be a list, got {shown(connections)}")
+
+
+def _loop(method: str, tolerance: Any, iterations: Any) -> Loop:
+    return Loop(
+        LOOP_METHODS[0] if method == "refuse" else method,
+        check_number("loop_tolerance", tolerance, positive=True),
+        check_count("loop_iterations", iterations),
+    )
+
+
+def _times(step_size: Any, start_time: Any, stop_time: Any, tolerance: Any) -> dict[str, Any]:
+    given = {"step_size": step_size, "stop_time": stop_time, "tolerance": tolerance}
+    checked = {
+        name: None if value is None else check_number(name, value, positive=name != "stop_time")
+        for name, value in given.items()
+    }
+    return checked | {"start_time": check_number("start_time", start_time)}
+
+
+def _told_loop(loop: Sequence[Link]) -> str:
+    """The links of a loop one after the other, as far as each begins where another ends."""
+    rest = list(loop)
+    chain = [rest.pop(0)]
+    while rest:
+        following = next((k for k in rest if k.source == chain[-1].target), rest[0])
+        rest.remove(following)
+        chain.append(following)
+    return ", ".join(f"{k.source}.{k.output} -> {k.target}.{k.input}" for k in chain)

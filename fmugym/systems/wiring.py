@@ -1,0 +1,274 @@
+"""Connections resolved: which variables they join, by which gain and offset, and what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from fmugym.archive.description import Unit, Variable
+from fmugym.archive.units import IDENTITY, Conversion, conversion_of_link
+from fmugym.errors import ConfigError, unknown_name
+from fmugym.systems.components import OpenComponent
+from fmugym.systems.connections import Connection
+from fmugym.systems.plan import Connector, End, Link
+
+__all__ = ["Port", "Wiring"]
+
+_SOURCES = ("output", "local", "calculatedParameter")
+
+
+@dataclass(frozen=True)
+class Port:
+    """A variable of a component."""
+
+    component: OpenComponent
+    variable: Variable
+
+    @property
+    def name(self) -> str:
+        """Its name in the system."""
+        return f"{self.component.name}.{self.variable.name}"
+
+    @property
+    def units(self) -> Mapping[str, Unit]:
+        """The units that its FMU defines."""
+        return self.component.fmu.description.units
+
+    @property
+    def kind(self) -> str:
+        """Of the variable, where items of enumerations count as integers."""
+        kind = self.variable.kind
+        return "integer" if kind == "enumeration" else kind
+
+
+@dataclass
+class Wiring:
+    """The connections of a system.
+
+    Args:
+        components: The components by name.
+        connections: The connections as given.
+        units: Units of the system's own inputs, outputs and parameters; without one, they have
+            that of the variable behind them.
+        own_names: The names of the system itself that contain a dot, at least.
+        definitions: Units that ``units`` use and that the FMUs need not know.
+
+    Attributes:
+        links: Those between components.
+        connectors: The names of the system itself.
+
+    Raises:
+        ConfigError: If a connection does not fit.
+    """
+
+    components: Mapping[str, OpenComponent]
+    connections: Iterable[Connection]
+    units: Mapping[str, str]
+    own_names: frozenset[str] = frozenset()
+    definitions: Mapping[str, Unit] = field(default_factory=dict)
+    links: list[Link] = field(default_factory=list)
+    connectors: list[Connector] = field(default_factory=list)
+    _driven: dict[str, Connection] = field(default_factory=dict)
+    _ends: dict[str, list[End]] = field(default_factory=dict)
+    _causalities: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for connection in self.connections:
+            self._add(connection)
+        self._check_units()
+        self.connectors = [self._connector(name, ends) for name, ends in self._ends.items()]
+
+    def _connector(self, name: str, ends: list[End]) -> Connector:
+        """A name of the system, with a unit only where that is another than the variable's."""
+        unit, first = self.units.get(name), self._first(ends)
+        if first is not None and unit == first.variable.unit:
+            unit = None
+        return Connector(name, tuple(ends), self._causalities[name], unit)
+
+    def _add(self, connection: Connection) -> None:
+        source, target = self.port(connection.source), self.port(connection.target)
+        if source is None and target is None:
+            raise ConfigError(
+                f"{connection}: one of the two must be a variable of a component; components are: "
+                f"{', '.join(self.components)}"
+            )
+        if target is not None:
+            self._drive(target, connection)
+        if source is None and target is not None:
+            self._add_input(connection, target)
+        elif source is not None:
+            _require_source(source, connection)
+            if target is None:
+                self._add_output(connection, source)
+            else:
+                self.links.append(_link(connection, source, target))
+
+    def port(self, name: str) -> Port | None:
+        """Find the variable that a name stands for; None for a name of the system itself.
+
+        Raises:
+            ConfigError: If there is no such component or variable; the text suggests the nearest.
+        """
+        dots = [place for place, letter in enumerate(name) if letter == "."]
+        for dot in reversed(dots):
+            component = self.components.get(name[:dot])
+            if component is not None:
+                return Port(component, component.variable(name[dot + 1 :]))
+        if dots and name not in self.own_names:
+            raise unknown_name("component", name[: dots[0]], self.components)
+        return None
+
+    def _drive(self, target: Port, connection: Connection) -> None:
+        """Note what drives an input; there may be only one."""
+        other = self._driven.setdefault(target.name, connection)
+        if other is not connection:
+            raise ConfigError(f"{target.name} has two sources: {other.source}, {connection.source}")
+        variable = target.variable
+        if not variable.numeric:
+            raise ConfigError(f"{connection}: {_not_numeric(target)}")
+        is_parameter = variable.causality == "parameter" and variable.settable_at_start
+        from_system = self.port(connection.source) is None
+        if variable.causality != "input" and not (from_system and is_parameter):
+            raise ConfigError(
+                f"{connection}: {target.name} is a {variable.variability} {variable.causality}; "
+                "a connection must end at an input"
+            )
+
+    def _add_input(self, connection: Connection, target: Port) -> None:
+        name = connection.source
+        is_input = target.variable.causality == "input"
+        causality = "input" if is_input else "parameter"
+        self._claim(name, causality, connection)
+        ends = self._ends.setdefault(name, [])
+        first = self._first(ends)
+        conversion = self._own_conversion(name, connection, first or target, target)
+        if first is not None:
+            _check_kinds(connection, first, target)
+        ends.append(_end(connection, target, conversion))
+
+    def _first(self, ends: list[End]) -> Port | None:
+        if not ends:
+            return None
+        component = self.components[ends[0].component]
+        return Port(component, component.variable(ends[0].variable))
+
+    def _own_conversion(
+        self, name: str, connection: Connection, first: Port, target: Port
+    ) -> Conversion:
+        """From the unit of an input of the system to that of a variable behind it."""
+        own, definitions = self._own_unit(name, first)
+        return _conversion(connection, own, definitions, target.variable.unit, target.units)
+
+    def _own_unit(self, name: str, port: Port) -> tuple[str | None, Mapping[str, Unit]]:
+        """The unit of a name of the system, by default that of a variable behind it."""
+        unit = self.units.get(name, port.variable.unit)
+        return unit, self.definitions if unit in self.definitions else port.units
+
+    def _add_output(self, connection: Connection, source: Port) -> None:
+        name = connection.target
+        if name in self._ends:
+            known = self._driven.get(name)
+            others = f"{known.source}, {connection.source}" if known else connection.source
+            raise ConfigError(f"the output {name!r} of the system has two sources: {others}")
+        self._driven[name] = connection
+        self._claim(name, "output", connection)
+        if not source.variable.numeric:
+            raise ConfigError(f"{connection}: {_not_numeric(source)}")
+        own, definitions = self._own_unit(name, source)
+        unit = source.variable.unit
+        conversion = _conversion(connection, unit, source.units, own, definitions)
+        _check_gain(connection, source, source)
+        self._ends[name] = [_end(connection, source, conversion)]
+
+    def _claim(self, name: str, causality: str, connection: Connection) -> None:
+        """Let a name of the system mean one thing."""
+        if name in self.components:
+            raise ConfigError(f"{connection}: {name!r} is a component; which of its variables?")
+        known = self._causalities.setdefault(name, causality)
+        if known != causality:
+            raise ConfigError(
+                f"{connection}: {name!r} is both {known} and {causality} of the system"
+            )
+
+    def _check_units(self) -> None:
+        for name in self.units:
+            if name not in self._ends:
+                raise unknown_name(
+                    "input, output or parameter of the system in 'units'", name, self._ends
+                )
+
+    def open_inputs(self) -> Iterator[Port]:
+        """The inputs of components that nothing drives; they are inputs of the system."""
+        for component in self.components.values():
+            for variable in component.fmu.description.variables.values():
+                port = Port(component, variable)
+                if variable.causality == "input" and port.name not in self._driven:
+                    yield port
+
+
+def _require_source(source: Port, connection: Connection) -> None:
+    if source.variable.causality not in _SOURCES:
+        variable = source.variable
+        raise ConfigError(
+            f"{connection}: {source.name} is a {variable.variability} {variable.causality}; a "
+            "connection must begin at an output"
+        )
+
+
+def _link(connection: Connection, source: Port, target: Port) -> Link:
+    _check_kinds(connection, source, target)
+    own, other = source.variable, target.variable
+    conversion = _conversion(connection, own.unit, source.units, other.unit, target.units)
+    end = _end(connection, target, conversion)
+    return Link(source.component.name, own.name, end.component, end.variable, end.gain, end.offset)
+
+
+def _end(connection: Connection, port: Port, conversion: Conversion) -> End:
+    gain = connection.gain * conversion.factor
+    offset = connection.gain * conversion.offset + connection.offset
+    return End(port.component.name, port.variable.name, gain, offset)
+
+
+def _conversion(
+    connection: Connection,
+    own: str | None,
+    own_units: Mapping[str, Unit],
+    other: str | None,
+    other_units: Mapping[str, Unit],
+) -> Conversion:
+    if not connection.convert_units:
+        return IDENTITY
+    try:
+        return conversion_of_link(own, own_units, other, other_units)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{connection}: {error}; give it a gain and convert_units=False"
+        ) from None
+
+
+def _check_kinds(connection: Connection, source: Port, target: Port) -> None:
+    """Refuse what loses information: only integers may become reals."""
+    if not source.variable.numeric:
+        raise ConfigError(f"{connection}: {_not_numeric(source)}")
+    kinds = source.kind, target.kind
+    if kinds[0] != kinds[1] and kinds != ("integer", "real"):
+        raise ConfigError(
+            f"{connection}: {source.name} is of type {source.variable.type} and {target.name} of "
+            f"type {target.variable.type}; only equal kinds can be connected, and Integer with Real"
+        )
+    _check_gain(connection, source, target)
+
+
+def _check_gain(connection: Connection, source: Port, target: Port) -> None:
+    plain = connection.gain == 1 and connection.offset == 0
+    if target.kind != "real" and not plain:
+        raise ConfigError(
+            f"{connection}: gain and offset are for reals; {target.name} is of type "
+            f"{target.variable.type}"
+        )
+
+
+def _not_numeric(port: Port) -> str:
+    variable = port.variable
+    what = f"an array of shape {variable.shape}" if variable.shape else f"of type {variable.type}"
+    return f"{port.name} is {what}; only scalar numbers and Booleans can be connected"

@@ -1,0 +1,247 @@
+"""How exact an FMU is with other settings: an episode, repeated with the same inputs.
+
+The inputs of an episode are kept. The FMU alone repeats them, with other communication steps or
+solvers. What changes is an error of these settings.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.archive.bundled import is_bundled
+from fmugym.archive.description import Variable
+from fmugym.archive.fmu import FMU
+from fmugym.env import FMUEnv
+from fmugym.errors import FMUGymError
+from fmugym.fmi.status import Status
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.spec import PoolSpec
+from fmugym.task.opening import PoolOpening
+
+__all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
+
+TOLERANCE: Final = 0.01
+"""The error up to which settings are exact enough, as a fraction of how much outputs vary."""
+
+_CONVERGED: Final = 0.2 * TOLERANCE
+_STEPS: Final = 50
+_FEW: Final = 10
+"""Steps that are compared if 50 of them depend on the smallest errors, as chaos does."""
+
+_MOST_SUBSTEPS: Final = 512
+_SECONDS: Final = 2.0
+"""Real time after which a repetition is cut short."""
+
+_NOTHING: Final = 1e-9
+"""Outputs that vary by a smaller fraction of their size do not vary."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What an FMU gave.
+
+    Attributes:
+        outputs: Its real outputs at the start and after each step, shape (T + 1, k); NaN after a
+            failure.
+        seconds: The real time of a step, the median.
+        is_whole: Whether there was time for all steps.
+    """
+
+    outputs: FloatArray
+    seconds: float
+    is_whole: bool = True
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The inputs of an episode, to be repeated.
+
+    Attributes:
+        opening: Makes the pool.
+        variables: Those that are set at the start.
+        starts: Their values, shape (P, 1).
+        inputs: The values of the inputs in each step, shape (T, m).
+    """
+
+    opening: PoolOpening
+    variables: tuple[Variable, ...]
+    starts: FloatArray
+    inputs: FloatArray
+
+    @classmethod
+    def of(cls, env: FMUEnv) -> Replay:
+        """Play the beginning of an episode with random actions, and keep what the FMU got."""
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        plan, pool = env._plan, env._open_pool("a repetition")
+        starts = [float(env.parameters[name]) for name in plan.parameter_names]
+        inputs: list[Any] = []
+        fails = False
+        while len(inputs) < _STEPS:
+            _, _, terminated, truncated, info = env.step(env.action_space.sample())
+            inputs.append(pool.inputs[:, 0].copy())
+            fails = fails or "fault" in info
+            if terminated or truncated:
+                break
+        rows = np.array(inputs, np.float64).reshape(len(inputs), len(pool.inputs))
+        if fails:  # with other settings it may go on
+            rows = np.resize(rows, (_STEPS, len(pool.inputs)))
+        return cls(env._opening, plan.model_variables, np.array([starts]).T, rows)
+
+    @property
+    def spec(self) -> PoolSpec:
+        """The settings of the task."""
+        return self.opening.spec
+
+    def run(self, **changes: Any) -> Course | None:
+        """Repeat the episode with other settings.
+
+        Args:
+            changes: Attributes of ``PoolSpec``.
+
+        Returns:
+            What the FMU gave; None if it does not begin with these settings.
+        """
+        spec = replace(self.spec, warm_up_steps=0, **changes)
+        opening = replace(self.opening, fmu=_untried(self.opening.fmu), spec=spec)
+        isolation = None if is_bundled(opening.fmu.path) else "process"
+        try:
+            pool = opening.open(1, rehearse=False, isolation=isolation)
+        except FMUGymError:
+            opening.fmu.close()
+            return None
+        with closing(pool):
+            pool.reset(self.variables, self.starts)
+            return None if pool.statuses[0] > Status.WARNING else self._played(pool)
+
+    def _played(self, pool: Pool) -> Course:
+        real = [i for i, one in enumerate(self.spec.outputs) if one.kind == "real"]
+        rows = np.full((1 + len(self.inputs), len(real)), np.nan)
+        rows[0] = pool.outputs[real, 0]
+        times: list[float] = []
+        for row, inputs in zip(rows[1:], self.inputs, strict=True):
+            begin = time.perf_counter()
+            pool.step(inputs[:, np.newaxis])
+            times.append(time.perf_counter() - begin)
+            if pool.statuses[0] > Status.WARNING:
+                break
+            row[:] = pool.outputs[real, 0]
+            if sum(times) > _SECONDS:
+                return Course(rows[: 1 + len(times)], statistics.median(times), is_whole=False)
+        return Course(rows, statistics.median(times))
+
+
+def _untried(fmu: FMU) -> FMU:
+    """The FMU without trials: each setting would have one of its own.
+
+    So an FMU that is not bundled runs in a worker process, whose end is a failure of the setting.
+    """
+    arguments: Any = {"limits": fmu.limits, "preload": fmu.preload, "interface": fmu.interface}
+    return FMU(fmu.path, **arguments, probe_timeout=None)
+
+
+def error_of(course: Course | None, reference: Course, steps: int | None = None) -> float:
+    """The difference of two courses, as a fraction of how much the outputs vary.
+
+    It is the root of the mean square over the steps, of the worst output. It is infinite for a
+    course with a failure.
+    """
+    if course is None:
+        return np.inf
+    count = min(len(course.outputs), len(reference.outputs), 1 + (steps or _STEPS))
+    one, other = course.outputs[:count], reference.outputs[:count]
+    if not count or not one.shape[1]:
+        return 0.0
+    if not (np.isfinite(one).all() and np.isfinite(other).all()):
+        return np.inf
+    scale, differences = _variation(other), _root_mean_square(one - other)
+    with np.errstate(all="ignore"):
+        errors = np.where(scale > 0, differences / scale, np.where(_variation(one) > 0, np.inf, 0))
+    return float(errors.max())
+
+
+def _variation(rows: FloatArray) -> FloatArray:
+    """How much each output varies, beyond its rounding."""
+    varies: FloatArray = _root_mean_square(rows - rows[0])
+    return np.where(varies > _NOTHING * np.abs(rows).max(axis=0), varies, 0.0)
+
+
+def _root_mean_square(rows: FloatArray) -> FloatArray:
+    with np.errstate(over="ignore"):
+        root: FloatArray = np.sqrt(np.mean(rows**2, axis=0))
+    return root
+
+
+@dataclass(frozen=True)
+class Substeps:
+    """What other numbers of substeps give.
+
+    Attributes:
+        needed: The least number that is exact enough; None if the results do not settle.
+        error: That of the task's own number of substeps.
+        least: The difference of the two finest repetitions.
+        finest: The largest number that was tried.
+        seconds: The real time of a step by the number of substeps.
+    """
+
+    needed: int | None
+    error: float
+    least: float
+    finest: int
+    seconds: dict[int, float]
+
+
+def substeps_of(replay: Replay) -> Substeps | None:
+    """Find out how many substeps are needed.
+
+    The number is doubled until the results settle.
+
+    Returns:
+        What was found; None if the FMU allows no other number.
+    """
+    own = replay.spec.substeps
+    courses = {own: replay.run(), **dict(_ladder(replay))}
+    *others, finest = sorted(count for count in courses if courses[count] is not None) or [own]
+    reference = courses[finest]
+    if reference is None or not others or finest < own:
+        return None
+    if not np.isfinite(reference.outputs).all():  # no number of substeps helps
+        return None
+    steps = next((n for n in (_STEPS, _FEW) if _difference(courses, finest, n) <= TOLERANCE), _FEW)
+    errors = {count: error_of(course, reference, steps) for count, course in courses.items()}
+    least = _difference(courses, finest, steps)
+    fine = [count for count in sorted(courses) if errors[count] <= TOLERANCE]
+    seconds = {n: one.seconds for n, one in courses.items() if one is not None}
+    needed = fine[0] if least <= TOLERANCE else None
+    return Substeps(needed, errors[own], least, finest, seconds)
+
+
+def _difference(courses: dict[int, Course | None], finest: int, steps: int) -> float:
+    """That of the finest repetition and the one before."""
+    reference = courses[finest]
+    before = max((n for n in courses if n < finest), default=finest)
+    return np.inf if reference is None else error_of(courses[before], reference, steps)
+
+
+def _ladder(replay: Replay) -> Iterator[tuple[int, Course | None]]:
+    """Courses with 1, 2, 4 ... substeps, until they settle."""
+    internal = replay.opening.fmu.description.fixed_internal_step_size or 0.0
+    before, count = None, 1
+    while count <= max(_MOST_SUBSTEPS, 2 * replay.spec.substeps):
+        if replay.spec.time_step / count < 0.999999 * internal:
+            return
+        course = replay.run(substeps=count)
+        yield count, course
+        if course is not None and not course.is_whole:
+            return
+        settled = course is not None and error_of(before, course) <= _CONVERGED
+        if settled and count >= replay.spec.substeps:
+            return
+        before, count = course, 2 * count

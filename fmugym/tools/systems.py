@@ -1,0 +1,163 @@
+"""The facts about a system that a user asks for first, as plain data and as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from fmugym.archive.fmu import FMU
+from fmugym.declared import Task
+from fmugym.declared.systems import fmu_of
+from fmugym.systems import FMUSystem
+from fmugym.systems.fmu import SystemFMU
+from fmugym.tools.overview import overview, plain, tables
+
+__all__ = ["as_text_of_system", "open_model", "open_system", "overview_of_system"]
+
+
+def open_system(path: Path) -> FMUSystem | None:
+    """Read the system of an SSP archive or a task file; None if the path names an FMU.
+
+    Raises:
+        ConfigError: If the task file or the system has a mistake.
+        FMULoadError: If the archive or an FMU cannot be read.
+    """
+    if path.suffix.lower() == ".ssp":
+        return FMUSystem.read(path)
+    if path.suffix.lower() != ".toml":
+        return None
+    source = fmu_of(Task.read(path))
+    return source if isinstance(source, FMUSystem) else open_system(source)
+
+
+def open_model(path: Path) -> FMU:
+    """Open an FMU, or the system of an SSP archive in its place.
+
+    Raises:
+        ConfigError: If the system has a mistake.
+        FMULoadError: If it cannot be read.
+    """
+    if path.suffix.lower() == ".ssp":
+        return SystemFMU(FMUSystem.read(path).plan)
+    return FMU(path)
+
+
+def overview_of_system(
+    system: FMUSystem, *, everything: bool = False, pattern: str | None = None
+) -> dict[str, Any]:
+    """Gather the facts about a system.
+
+    Args:
+        system: The system.
+        everything: As for ``overview``.
+        pattern: As for ``overview``.
+
+    Returns:
+        As ``overview``, with ``system``, a dict; ``docs/command-line.md`` describes the keys.
+    """
+    facts = overview(SystemFMU(system.plan), everything=everything, pattern=pattern)
+    groups = [
+        {"components": list(group.components), "is_loop": group.loop is not None}
+        for group in system.order.groups
+    ]
+    facts["system"] = {
+        "components": [_component(system, name) for name in system.components],
+        "connections": [asdict(link) for link in system.links],
+        "connectors": [asdict(connector) for connector in system.connectors],
+        "master": system.master,
+        "order": groups,
+        "loops": [[asdict(link) for link in loop] for loop in system.order.loops],
+    }
+    return facts
+
+
+def _component(system: FMUSystem, name: str) -> dict[str, Any]:
+    component = system.components[name]
+    description = component.fmu.description
+    return {
+        "name": name,
+        "fmu": str(component.fmu.path),
+        "fmi_version": description.fmi_version,
+        "interface": description.interface,
+        "generation_tool": description.generation_tool,
+        "steps": component.given.steps,
+        "start_values": dict(component.starts),
+    }
+
+
+def as_text_of_system(facts: Mapping[str, Any]) -> str:
+    """Format an overview of a system for a terminal.
+
+    Args:
+        facts: What ``overview_of_system`` returned.
+
+    Returns:
+        Lines of printable ASCII.
+    """
+    return "\n".join([*_heading(facts), *_parts(facts["system"]), *tables(facts)])
+
+
+def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
+    yield plain(f"{facts['model_name']} (a system of {len(facts['system']['components'])} FMUs)")
+    if facts["description"]:
+        yield plain(facts["description"])
+    times = facts["default_experiment"]
+    step = times["step_size"]
+    obstacles = "; ".join(facts["obstacles"])
+    rows = {
+        "file": facts["path"],
+        "this machine": f"does NOT run here: {obstacles}" if obstacles else "runs here",
+        "step": "not given" if step is None else f"{step:g} s",
+        "master": facts["system"]["master"],
+        "order": " -> ".join(map(_group, facts["system"]["order"])),
+    }
+    for name, value in rows.items():
+        yield f"  {name:<20}{plain(value)}"
+
+
+def _group(group: Mapping[str, Any]) -> str:
+    names = ", ".join(group["components"])
+    return f"({names})" if group["is_loop"] else names
+
+
+def _parts(system: Mapping[str, Any]) -> Iterator[str]:
+    yield f"\nComponents ({len(system['components'])})"
+    for one in system["components"]:
+        kind = "model exchange" if one["interface"] == "model_exchange" else "co-simulation"
+        text = f"{one['name']}: {Path(one['fmu']).name}, FMI {one['fmi_version']} {kind}"
+        tool = f", by {one['generation_tool']}" if one["generation_tool"] else ""
+        steps = f", {one['steps']} steps in one of the system" if one["steps"] > 1 else ""
+        yield f"  {plain(text + tool + steps)}"
+    yield f"\nConnections ({len(system['connections'])})"
+    for link in system["connections"]:
+        yield f"  {plain(_link(link))}"
+    if system["connectors"]:
+        yield f"\nNames of the system ({len(system['connectors'])})"
+    for connector in system["connectors"]:
+        yield f"  {plain(_connector(connector))}"
+    for loop in system["loops"]:
+        yield "\nAlgebraic loop: " + plain("; ".join(map(_link, loop)))
+
+
+def _link(link: Mapping[str, Any]) -> str:
+    change = _change(link["gain"], link["offset"])
+    return f"{link['source']}.{link['output']} -> {link['target']}.{link['input']}{change}"
+
+
+def _change(gain: float, offset: float) -> str:
+    """What happens to a value on its way."""
+    parts = [f"* {gain:.6g}"] if gain != 1 else []
+    if offset:
+        parts.append(f"{'+' if offset > 0 else '-'} {abs(offset):.6g}")
+    return f" ({' '.join(parts)})" if parts else ""
+
+
+def _connector(connector: Mapping[str, Any]) -> str:
+    ends = [
+        f"{end['component']}.{end['variable']}{_change(end['gain'], end['offset'])}"
+        for end in connector["ends"]
+    ]
+    arrow = "<-" if connector["causality"] == "output" else "->"
+    return f"{connector['causality']} {connector['name']} {arrow} {', '.join(ends)}"

@@ -1,0 +1,176 @@
+"""The settings that ``fmugym validate`` recommends, for models whose needs are known."""
+
+import math
+import tomllib
+from functools import partial
+
+import exchange_tools
+import foreign_lag
+import numpy as np
+import pytest
+from gymnasium import spaces
+from pythonfmu.builder import FmuBuilder
+
+import fmugym
+from fmugym.declared import Task, load
+from fmugym.tools.advice import lines_of
+from fmugym.tools.cli import main
+from fmugym.tools.validation import validate
+
+LAG = {
+    "time_step": 0.05,
+    "episode_length": 5.0,
+    "variables": {"u": {"min": -1, "max": 1}},
+    "agent": {"actions": ["u"], "observations": ["x", "fast"]},
+    "reward": "-abs(x)",
+}
+
+
+@pytest.fixture(scope="module")
+def lag(tmp_path_factory):
+    """The FMU of ``foreign_lag.py``: explicit Euler in communication steps."""
+    return FmuBuilder.build_FMU(foreign_lag.__file__, tmp_path_factory.mktemp("lag"))
+
+
+def advised(task):
+    report = validate(partial(load, task))
+    return {one.key: one.value for one in report.advices}, report
+
+
+def lag_task(lag, rate, **more):
+    return Task.from_dict(LAG | {"fmu": str(lag), "parameters": {"rate": rate}} | more)
+
+
+def error_of_lag(task):
+    """That of x in 50 steps, against the exponential, as a fraction of its variation."""
+    env = load(task)
+    env.action_space.seed(1)
+    env.reset(seed=0)
+    decay, x, found, exact = math.exp(-0.05), 0.0, [], []
+    for _ in range(50):
+        action = env.action_space.sample()
+        found.append(float(env.step(action)[0][0]))
+        x = decay * x + (1 - decay) * float(action[0])
+        exact.append(x)
+    env.close()
+    return np.sqrt(np.mean(np.subtract(found, exact) ** 2)) / np.std(exact)
+
+
+def test_substeps_of_a_lag_make_it_exact(lag):
+    advice, report = advised(lag_task(lag, 1.0))
+    assert 2 <= advice["substeps"] <= 16
+    better = lag_task(lag, 1.0, substeps=advice["substeps"])
+    assert error_of_lag(better) < 0.02 < error_of_lag(lag_task(lag, 1.0))
+    again, _ = advised(better)
+    assert "substeps" not in again
+    assert report.recommended["substeps"] == advice["substeps"]
+
+
+def test_a_stiff_one_gets_smaller_steps(lag):
+    """Euler's method is stable from 0.05 s * 1000 / 2 substeps on."""
+    advice, report = advised(lag_task(lag, 1000.0))
+    assert 25 < advice["substeps"] <= 128
+    assert not any(finding.check == "accuracy" for finding in report.findings)
+
+
+def test_needless_substeps_are_told(lag):
+    advice, _ = advised(lag_task(lag, 1.0, substeps=512))
+    assert 2 <= advice["substeps"] <= 16
+
+
+def test_lines_can_be_written_into_the_file(lag, tmp_path, capsys):
+    path = tmp_path / "a.toml"
+    lag_task(lag, 1000.0).write(path)
+    assert main(["validate", str(path)]) in (0, 1)
+    _, _, lines = capsys.readouterr().out.partition("for the task file:\n")
+    document = tomllib.loads(path.read_text())
+    pasted = tomllib.loads(lines)
+    assert pasted["substeps"] > 25
+    Task.from_dict(document | pasted)
+    (tmp_path / "b.toml").write_text(lines + path.read_text(), encoding="utf-8")
+    load(tmp_path / "b.toml").close()
+
+
+class Exchanged(fmugym.FMI2MEEnv):
+    """A model of ``exchange`` without inputs."""
+
+    def __init__(self, path, config):
+        super().__init__(path, {"model_input_names": [], **config})
+
+    def _get_action_space(self):
+        return spaces.Discrete(2)
+
+    def _get_inputs(self):
+        return []
+
+    def _is_done(self):
+        return False
+
+
+def of_model(folder, model, outputs, time_step, **config):
+    path = folder / f"{model}.fmu"
+    exchange_tools.exchange_fmu(path, model, 2)
+    config = {"model_output_names": outputs, "time_step": time_step, **config}
+    report = validate(lambda: Exchanged(path, config))
+    return {one.key: one.value for one in report.advices}, report
+
+
+class TestSolvers:
+    @pytest.mark.parametrize(
+        ("model", "outputs", "time_step", "parameters"),
+        [
+            ("prothero", ["x"], 0.1, {"k": 1e5}),
+            ("van_der_pol", ["x1", "x2"], 10.0, {"mu": 1000.0}),
+            ("robertson", ["y1", "y3"], 10.0, {}),
+        ],
+    )
+    def test_stiff_models_get_one_for_stiff_models(
+        self, model, outputs, time_step, parameters, tmp_path
+    ):
+        advice, report = of_model(tmp_path, model, outputs, time_step, model_parameters=parameters)
+        assert advice["solver"] == "rosenbrock"
+        tables = tomllib.loads("\n".join(lines_of(report.advices)))
+        assert tables["config"]["solver"] == "rosenbrock"
+
+    def test_a_method_whose_steps_are_too_long_is_replaced(self, tmp_path):
+        config = {"solver": "euler", "max_step": 0.05}
+        advice, report = of_model(tmp_path, "van_der_pol", ["x1", "x2"], 0.1, **config)
+        assert advice["solver"] in ("dormand_prince", "rosenbrock")
+        assert advice["tolerance"] <= 1e-3
+        assert "%" in next(one.why for one in report.advices if one.key == "solver")
+
+    def test_one_that_fails_is_replaced(self, tmp_path):
+        config = {"solver": "rk4", "max_step": 0.1}
+        advice, _ = of_model(tmp_path, "robertson", ["y1", "y3"], 10.0, **config)
+        assert advice["solver"] == "rosenbrock"
+
+    def test_one_that_is_fine_stays(self, tmp_path):
+        advice, _ = of_model(tmp_path, "van_der_pol", ["x1", "x2"], 0.1, tolerance=1e-3)
+        assert "solver" not in advice
+
+
+HANGING = {"q_0": 0.0}
+
+
+def pendulum(**more):
+    variables = {"tau": {"min": -0.01, "max": 0.01}}
+    agent = {"actions": ["tau"], "observations": ["q", "q_dot"]}
+    fmu, reward = {"bundled": "Pendulum"}, "-abs(q)"
+    given = {"fmu": fmu, "variables": variables, "agent": agent, "reward": reward}
+    return Task.from_dict({"episode_length": 20.0, **given, **more})
+
+
+class TestTimeStep:
+    def test_an_oscillation_gets_ten_steps(self):
+        """A pendulum of 0.1 m swings with 2 pi sqrt(l / g) = 0.634 s."""
+        advice, report = advised(pendulum(time_step=0.5, parameters=HANGING))
+        assert advice["time_step"] == 0.05
+        why = next(one.why for one in report.advices if one.key == "time_step")
+        assert "0.63" in why
+        assert "time_step" not in advised(pendulum(time_step=0.05, parameters=HANGING))[0]
+
+    def test_what_falls_needs_shorter_ones(self):
+        """Upright, it leaves with the time constant sqrt(l / g) = 0.1 s, of which friction adds."""
+        upright = {"q_0": math.pi}
+        advice, _ = advised(pendulum(time_step=0.2, parameters=upright))
+        assert advice["time_step"] == 0.02

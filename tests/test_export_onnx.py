@@ -1,0 +1,231 @@
+"""Exported agents as ONNX, run by ONNX Runtime."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from export_tools import FUNCTIONS, arguments_of, network_for
+from test_export import TASKS, Filtered, heating
+
+from fmugym import ConfigError
+from fmugym.export import Activation, Layer, Network, agent_of, write_onnx
+from fmugym.export.onnx_nodes import Nodes
+from fmugym.export.onnx_operations import computed, interpolated
+
+onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
+runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
+
+
+def made(env_id):
+    return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
+
+
+class Runner:
+    """Takes samples with ONNX Runtime, as a user would."""
+
+    def __init__(self, path, count=1):
+        self.session = runtime.InferenceSession(str(path))
+        facts = self.session.get_modelmeta().custom_metadata_map
+        self.facts = {name: json.loads(value) for name, value in facts.items()}
+        types = {"tensor(double)": np.float64, "tensor(float)": np.float32}
+        types["tensor(int64)"] = np.int64
+        kinds = {one.name: types[one.type] for one in self.session.get_inputs()}
+        self.memory = {
+            name: np.repeat(np.array(start, kinds[name])[None], count, axis=0)
+            for name, start in self.facts["memory"].items()
+        }
+
+    def step(self, measurements):
+        """The actions for measurements of shape (N, m)."""
+        names = ["actions", *(f"next_{name}" for name in self.memory)]
+        inputs = {"measurements": np.asarray(measurements, np.float64), **self.memory}
+        actions, *memory = self.session.run(names, inputs)
+        self.memory = dict(zip(self.memory, memory, strict=True))
+        return actions
+
+
+def difference(env, network, path, steps, **parameters):
+    """The largest difference of inputs while the environment's own agent acts."""
+    runner, worst = Runner(path), 0.0
+    for name, value in parameters.items():
+        runner.memory[name][:] = value
+    names = [one["name"] for one in runner.facts["measurements"]]
+    written = [one["name"] for one in runner.facts["actions"]]
+    observation = env._get_observation()
+    for _ in range(steps):
+        (actions,) = runner.step([[env.out[name] for name in names]])
+        action = network.action(np.ravel(observation))
+        is_discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
+        observation, _, terminated, *_ = env.step(int(action[0]) if is_discrete else action)
+        inputs = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+        worst = max(worst, np.abs(actions - [inputs[name] for name in written]).max())
+        if terminated:
+            break
+    return worst
+
+
+class TestEpisodes:
+    @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House", "CloudPendulum"])
+    def test_of_registered_tasks(self, env_id, tmp_path):
+        env = made(env_id)
+        network = network_for(env)
+        path = write_onnx(agent_of(env, network, all_inputs=True), tmp_path / "agent.onnx")
+        env.reset(seed=4)
+        known = {name: env.variables[name] for name in env.variables if name == "clock"}
+        assert difference(env, network, path, 200, **known) <= 1e-5
+        env.close()
+
+    @pytest.mark.parametrize("task", TASKS)
+    def test_of_what_a_task_file_declares(self, task, tmp_path):
+        env = heating(task)
+        network = network_for(env, scaled=False)
+        path = write_onnx(agent_of(env, network), tmp_path / "agent.onnx")
+        env.reset(seed=1)
+        known = {"T_set": env.variables["T_set"]} if task == "set point" else {}
+        assert difference(env, network, path, 192, **known) <= 1e-5
+        env.close()
+
+    def test_of_data_that_are_given(self, tmp_path):
+        env = made("House")
+        network = network_for(env)
+        agent = agent_of(env, network, external=["T_set"])
+        runner = Runner(write_onnx(agent, tmp_path / "agent.onnx"))
+        places = [i for i, one in enumerate(env.observation_names) if one.startswith("T_set")]
+        observation, _ = env.reset(seed=2)
+        runner.memory["clock"][:] = env.variables["clock"]
+        for _ in range(50):
+            actions = runner.step([[env.out["T_op"], env.out["T_w"], *observation[places]]])
+            observation, *_ = env.step(network.action(observation))
+            assert actions[0, 0] == pytest.approx(env.inputs[0], abs=1e-5)
+        env.close()
+
+    def test_of_hooks_by_hand(self, tmp_path):
+        env = Filtered()
+        network = network_for(env)
+        runner = Runner(write_onnx(agent_of(env, network), tmp_path / "agent.onnx"))
+        observation, _ = env.reset(seed=5)
+        runner.memory["goal"][:] = env.variables["goal"]
+        for _ in range(50):
+            action = network.action(np.concatenate([observation["angle"], observation["speed"]]))
+            gain = [0.5, 1.0, 2.0][action[0]]
+            assert runner.step([env.state]).item() == pytest.approx(gain * (action[1] - 1.0))
+            observation, *_ = env.step(action)
+        env.close()
+
+
+class TestFunctions:
+    @pytest.mark.parametrize("dtype", [np.float64, np.float32])
+    def test_of_numpy(self, dtype):
+        nodes, wanted = Nodes(), []
+        for ufunc in FUNCTIONS:
+            if ufunc is np.float_power and dtype is np.float32:
+                continue  # it computes with float64
+            values = arguments_of(ufunc, dtype)
+            result = computed(nodes, ufunc, list("xy"[: ufunc.nin]), np.dtype(dtype))
+            with np.errstate(all="ignore"):
+                wanted.append(ufunc(*values))
+            kind = np.dtype(wanted[-1].dtype)
+            graph = onnx.helper.make_graph(
+                list(nodes.nodes),
+                "function",
+                [value_info(name, np.dtype(dtype)) for name in "xy"[: ufunc.nin]],
+                [value_info(result, kind)],
+                list(nodes.tensors),
+            )
+            own = run_graph(graph, dict(zip("xy", values, strict=False)), result)
+            single = ufunc in {np.arcsin, np.arccos, np.arctan, np.arctan2}
+            tolerance = 1e-12 if dtype is np.float64 and not single else 3e-6
+            np.testing.assert_allclose(
+                own, wanted[-1], rtol=tolerance, atol=tolerance, err_msg=ufunc.__name__
+            )
+            nodes = Nodes()
+
+    def test_others_are_refused(self):
+        with pytest.raises(ConfigError, match="cbrt"):
+            computed(Nodes(), np.cbrt, ["x"], np.dtype(np.float64))
+
+    @pytest.mark.parametrize("count", [1, 2, 7])
+    def test_tables(self, count):
+        rng = np.random.default_rng(0)
+        xs, ys = np.sort(rng.normal(size=count)), rng.normal(size=count)
+        nodes = Nodes()
+        result = interpolated(nodes, "x", np.concatenate([xs, ys, [-9.0, 9.0]]))
+        double = np.dtype(np.float64)
+        graph = onnx.helper.make_graph(
+            nodes.nodes,
+            "table",
+            [value_info("x", double)],
+            [value_info(result, double)],
+            nodes.tensors,
+        )
+        seen = np.concatenate([xs, rng.normal(size=50) * 2])
+        own = run_graph(graph, {"x": seen}, result)
+        assert own == pytest.approx(np.interp(seen, xs, ys, -9.0, 9.0), abs=1e-12)
+
+
+def value_info(name, dtype):
+    kind = onnx.helper.np_dtype_to_tensor_dtype(dtype)
+    return onnx.helper.make_tensor_value_info(name, kind, [None])
+
+
+def run_graph(graph, values, result):
+    opset = onnx.helper.make_opsetid("", 18)
+    model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=9)
+    return runtime.InferenceSession(model.SerializeToString()).run([result], values)[0]
+
+
+class TestModel:
+    def test_many_plants_at_once(self, tmp_path):
+        env = heating("history")
+        path = write_onnx(agent_of(env, network_for(env)), tmp_path / "agent.onnx")
+        env.close()
+        seen = 290 + 5 * np.random.default_rng(0).normal(size=(20, 7, 1))
+        many, one = Runner(path, 7), Runner(path)
+        together = np.array([many.step(row) for row in seen])
+        alone = np.array([one.step(row[3:4]) for row in seen])
+        assert together[:, 3:4] == pytest.approx(alone, abs=1e-6)
+        assert np.ptp(together) > 0.01
+
+    def test_says_what_it_is(self, tmp_path):
+        env = made("House")
+        path = write_onnx(agent_of(env, network_for(env)), tmp_path / "agent.onnx")
+        env.close()
+        facts = Runner(path).facts
+        assert facts["measurements"][0] == {"name": "T_op", "unit": "K"}
+        assert [one["name"] for one in facts["actions"]] == ["u"]
+        assert facts["sample_time"] == 900.0
+        assert facts["memory"].keys() == {"count", "clock"}
+        onnx.checker.check_model(str(path), full_check=True)
+
+    @pytest.mark.parametrize(
+        "activation",
+        [
+            *map(Activation, ["tanh", "relu", "sigmoid", "silu"]),
+            Activation("leaky_relu", (0.02,)),
+            Activation("elu", (0.7,)),
+            Activation("softplus", (1.5, 20.0)),
+            Activation("clamp", (-0.5, 0.25)),
+        ],
+        ids=lambda one: one.name,
+    )
+    @pytest.mark.parametrize("squashed", [False, True])
+    def test_activations(self, activation, squashed, tmp_path):
+        env = made("Pendulum")
+        first, *rest = network_for(env, squashed=squashed).layers
+        layers = Layer(first.weights, first.bias, (activation,)), *rest
+        network = Network(layers, env.action_space, squashed=squashed)
+        path = write_onnx(agent_of(env, network), tmp_path / "agent.onnx")
+        env.reset(seed=0)
+        assert difference(env, network, path, 50) <= 1e-5
+        env.close()
+
+    def test_nothing_is_overwritten(self, tmp_path):
+        env = made("CartPole")
+        agent = agent_of(env, network_for(env))
+        env.close()
+        write_onnx(agent, tmp_path / "agent.onnx")
+        with pytest.raises(FileExistsError, match=r"agent\.onnx"):
+            write_onnx(agent, tmp_path / "agent.onnx")
+        with pytest.raises(ConfigError, match="nowhere"):
+            write_onnx(agent, tmp_path / "nowhere" / "agent.onnx")

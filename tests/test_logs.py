@@ -1,0 +1,188 @@
+"""Logs of plants: played through a task, they give what the task itself would have given."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import fmugym
+from fmugym import ConfigError, Recorder, bundled_fmu
+from fmugym.logs import PlantLog, play_log
+from fmugym.series import RecordSeries
+
+IDS = ["fmugym/CartPole-v0", "fmugym/Pendulum-v0", "fmugym/House-v0"]
+
+
+class Cart(fmugym.FMI2CSEnv):
+    """A cart that is pushed by one of several actions."""
+
+    space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, backend=None, **config):
+        defaults = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot"],
+            "model_parameters": {"x_0": fmugym.Uniform(-0.5, 0.5)},
+            "time_step": 0.02,
+        }
+        super().__init__(bundled_fmu("CartPole"), defaults | config, backend=backend)
+
+    def _get_action_space(self):
+        return self.space
+
+    def _get_inputs(self):
+        return 10.0 * np.ravel(self.action)[0]
+
+    def _is_done(self):
+        return False
+
+    def _reward_policy(self):
+        return -(self.out["x"] ** 2) - 0.001 * self.inputs[0] ** 2
+
+
+class Pushed(Cart):
+    space = spaces.MultiDiscrete([3, 2])
+
+    def _get_inputs(self):
+        return 10.0 * (self.action[0] - 1.0) + 1.0 * self.action[1]
+
+
+def written(make_env, path, episodes=2, steps=40):
+    """Episodes of random actions, and the file that a recorder has made of them."""
+    truth = []
+    with RecordSeries(make_env(), path=path) as plant:
+        recorder = Recorder(plant)
+        recorder.action_space.seed(0)
+        for seed in range(episodes):
+            recorder.reset(seed=seed)
+            over = False
+            while not over and len(recorder.recording) < steps:
+                _, _, terminated, truncated, _ = recorder.step(recorder.action_space.sample())
+                over = terminated or truncated
+            truth.append(recorder.recording)
+    return truth
+
+
+@pytest.mark.parametrize("make_env", [*(partial(gym.make, one) for one in IDS), Cart, Pushed])
+def test_what_was_recorded_comes_out_again(make_env, tmp_path):
+    truth = written(make_env, tmp_path / "run.csv")
+    found = play_log(PlantLog.read(tmp_path / "run.csv"), make_env)
+    assert len(found) == len(truth)
+    for one, expected in zip(found, truth, strict=True):
+        np.testing.assert_allclose(one.actions, expected.actions, atol=1e-6)
+        np.testing.assert_allclose(one.observations, expected.observations, atol=1e-12)
+        np.testing.assert_allclose(one.rewards, expected.rewards, atol=1e-7)
+        np.testing.assert_array_equal(one.terminated, expected.terminated)
+        assert one.truncated[-1] or one.terminated[-1]
+
+
+def log_of(tmp_path, text, **options):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    return PlantLog.read(path, **options)
+
+
+def test_units_times_and_names_are_those_of_the_plant(tmp_path):
+    rows = ["time,Stellung [cm],speed [m/min],force [kN]"]
+    rows += [f"{100 + 0.05 * k},{k},{60 * k},{0.001 * (k % 5)}" for k in range(11)]
+    columns = {"Stellung": "x", "speed": "x_dot", "force": "f"}
+    (one,) = play_log(log_of(tmp_path, "\n".join(rows)), Cart, columns=columns)
+    assert len(one) == 25  # 0.5 s in steps of 0.02 s
+    times = 0.02 * np.arange(26)
+    np.testing.assert_allclose(one.observations[:, 0], times / 0.05 / 100, rtol=1e-6)
+    np.testing.assert_allclose(one.observations[:, 1], times / 0.05, rtol=1e-6)
+    held = np.floor(times[:-1] / 0.05 + 1e-9) % 5  # newtons, until the next row
+    np.testing.assert_allclose(one.actions[:, 0], held / 10, atol=1e-6)
+
+
+def test_the_fmu_is_not_loaded(tmp_path, monkeypatch):
+    rows = ["time,x,x_dot,f", "0,1,2,3", "0.02,1,2,3"]
+    log = log_of(tmp_path, "\n".join(rows))
+    monkeypatch.setattr(fmugym.FMU, "extract", lambda self: pytest.fail("extracted"))
+    assert len(play_log(log, Cart)[0]) == 1
+
+
+def test_episodes_end_where_the_task_ends_them(tmp_path):
+    class Bounded(Cart):
+        def _is_done(self):
+            return self.out["x"] > 2.5
+
+    rows = ["time,x,x_dot,f", *(f"{0.02 * k},{k},0,1" for k in range(8))]
+    found = play_log(log_of(tmp_path, "\n".join(rows)), Bounded)
+    assert [len(one) for one in found] == [3, 1, 1, 1, 1]
+    assert [bool(one.terminated[-1]) for one in found] == [True] * 5
+    starts = [one.observations[0][0] for one in found]
+    assert starts == [0, 3, 4, 5, 6]  # in the row where the episode before has ended
+
+
+def test_time_that_goes_back_begins_an_episode(tmp_path):
+    rows = ["time,x,x_dot,f", "0,1,2,3", "0.02,1,2,3", "0,5,2,3", "0.02,5,2,3", "0.04,5,2,3"]
+    found = play_log(log_of(tmp_path, "\n".join(rows)), Cart)
+    assert [len(one) for one in found] == [1, 2]
+
+
+def test_inputs_of_the_row_before(tmp_path):
+    rows = ["time,x,x_dot,f", "0,0,0,99", "0.02,0,0,3", "0.04,0,0,4"]
+    log = log_of(tmp_path, "\n".join(rows), inputs_before=True)
+    (one,) = play_log(log, Cart)
+    np.testing.assert_allclose(one.actions.ravel(), [0.3, 0.4], rtol=1e-6)
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("text", "facts"),
+        [
+            ("", ["empty"]),
+            ("time,x", ["no rows"]),
+            ("x,f\n1,2", ["'time'"]),
+            ("time,x\n0,1,2", ["row 2", "2", "3"]),
+            ("time,x\n0,1\n0,2", ["row 3", "rise"]),
+            ("time,x\n0,1\n1,much", ["column 2", "'much'"]),
+        ],
+    )
+    def test_files(self, tmp_path, text, facts):
+        with pytest.raises(ConfigError) as caught:
+            log_of(tmp_path, text)
+        assert all(fact in str(caught.value) for fact in facts)
+
+    def test_no_file(self, tmp_path):
+        with pytest.raises(ConfigError, match=r"none\.csv"):
+            PlantLog.read(tmp_path / "none.csv")
+
+    @pytest.mark.parametrize(
+        ("text", "facts"),
+        [
+            ("time,x,f\n0,1,2\n1,1,2", ["'x_dot'"]),
+            ("time,x,x_dot\n0,1,2\n1,1,2", ["'f'"]),
+            ("time,x,x_dot,f\n0,0,0,11\n1,0,0,0", ["f = 11", "10", "tolerance"]),
+            ("time,x [degC],x_dot,f\n0,1,2,3\n1,1,2,3", ["degC"]),
+            ("time,x,x_dot,f\n0,0,0,1\n0.02,nan,0,1", ["0 s", "x"]),
+        ],
+    )
+    def test_columns(self, tmp_path, text, facts):
+        with pytest.raises(ConfigError) as caught:
+            play_log(log_of(tmp_path, text), Cart)
+        assert all(fact in str(caught.value) for fact in facts)
+
+    def test_a_warm_up(self, tmp_path):
+        log = log_of(tmp_path, "time,x,x_dot,f\n0,1,2,3\n1,1,2,3")
+        with pytest.raises(ConfigError, match="warm-up"):
+            play_log(log, partial(Cart, warm_up=1.0))
+
+    def test_actions_that_are_no_numbers(self, tmp_path):
+        class Odd(Cart):
+            space = spaces.Text(3)
+
+        log = log_of(tmp_path, "time,x,x_dot,f\n0,1,2,3\n1,1,2,3")
+        with pytest.raises(ConfigError, match="Text"):
+            play_log(log, Odd)
+
+    def test_too_many_actions(self, tmp_path):
+        class Many(Cart):
+            space = spaces.MultiDiscrete([101, 100])
+
+        log = log_of(tmp_path, "time,x,x_dot,f\n0,1,2,3\n1,1,2,3")
+        with pytest.raises(ConfigError, match="10000"):
+            play_log(log, Many)

@@ -1,0 +1,215 @@
+"""Datasets of Minari hold what recordings hold, and give it back."""
+
+import json
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import ConfigError, Recorder, Recording
+from fmugym.series import RecordSeries
+from fmugym.tools.cli import main
+
+WITHOUT_MINARI = """
+import sys
+sys.modules["minari"] = None
+import fmugym.minari
+"""
+
+
+def test_without_minari_the_import_names_the_extra():
+    command = [sys.executable, "-c", WITHOUT_MINARI]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "pip install 'fmugym-toolbox[minari]'" in done.stderr
+
+
+minari = pytest.importorskip("minari", reason="needs Minari: the extra minari")
+
+from fmugym.minari import read_dataset, write_dataset  # noqa: E402
+
+IDS = ["fmugym/CartPole-v0", "fmugym/Pendulum-v0", "fmugym/House-v0"]
+GOALS = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.02,
+    "episode_length": "0.2s",
+    "variables": {"tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["q", "q_dot"]},
+    "reward": "-abs(q)",
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return tmp_path
+
+
+def played(env, episodes=3, steps=30):
+    recorder, found = Recorder(env), []
+    for number in range(episodes):
+        recorder.reset(seed=None if number == 1 else number)
+        over = False
+        while not over and len(recorder.recording) < steps:
+            _, _, terminated, truncated, _ = recorder.step(env.action_space.sample())
+            over = terminated or truncated
+        found.append(recorder.recording)
+    return found
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "parquet"])
+@pytest.mark.parametrize("env_id", IDS)
+def test_recordings_come_back_to_the_last_bit(env_id, data_format):
+    if data_format == "parquet":
+        pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
+    env = gym.make(env_id)
+    recordings = played(env)
+    made = write_dataset("test/all-v0", recordings, env.unwrapped, data_format=data_format)
+    assert made.total_episodes == 3
+    assert made.total_steps == sum(map(len, recordings))
+    for one, expected in zip(read_dataset("test/all-v0"), recordings, strict=True):
+        for name, value in vars(expected).items():
+            np.testing.assert_array_equal(getattr(one, name), value, err_msg=name)
+        assert fmugym.replay(one, env).is_equal
+    env.close()
+
+
+def test_minari_itself_sees_the_same_steps():
+    env = gym.make("fmugym/Pendulum-v0")
+    recordings = played(env)
+    write_dataset("test/seen-v0", recordings, env.unwrapped, author="Ada")
+    dataset = minari.load_dataset("test/seen-v0")
+    assert dataset.storage.metadata["author"] in ("Ada", {"Ada"}, ["Ada"])
+    for episode, expected in zip(dataset.iterate_episodes(), recordings, strict=True):
+        np.testing.assert_array_equal(episode.observations, expected.observations)
+        np.testing.assert_array_equal(episode.actions, expected.actions)
+        np.testing.assert_array_equal(episode.rewards, expected.rewards)
+    again = dataset.recover_environment()
+    assert isinstance(again.unwrapped, type(env.unwrapped))
+    again.close()
+    env.close()
+
+
+class Goal(fmugym.FMI2CSEnv):
+    """An observation of several parts, and one of several actions."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "time_step": 0.02,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum"), config)
+
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        return gym.spaces.Dict({"now": box, "side": gym.spaces.Discrete(2)})
+
+    def _get_action_space(self):
+        return gym.spaces.Discrete(3, start=-1)
+
+    def _get_observation(self):
+        return {"now": np.array(self.state), "side": np.int64(self.out["q"] > 0)}
+
+    def _get_inputs(self):
+        return 0.01 * self.action
+
+    def _is_done(self):
+        return False
+
+
+def test_observations_of_several_parts():
+    env = Goal()
+    recordings = played(env, 2, 10)
+    write_dataset("test/parts-v0", recordings, env)
+    for one, expected in zip(read_dataset("test/parts-v0"), recordings, strict=True):
+        np.testing.assert_array_equal(one.observations, expected.observations)
+        np.testing.assert_array_equal(one.actions, expected.actions)
+    env.close()
+
+
+class TestMistakes:
+    def test_no_recordings(self):
+        env = fmugym.load(GOALS)
+        with pytest.raises(ConfigError, match="at least one"):
+            write_dataset("test/none-v0", [], env)
+        env.close()
+
+    def test_another_task(self):
+        env, other = gym.make("fmugym/CartPole-v0"), fmugym.load(GOALS)
+        with pytest.raises(ConfigError, match="recording"):
+            write_dataset("test/other-v0", played(env, 1, 5), other)
+        env.close()
+        other.close()
+
+    def test_a_name_that_exists(self):
+        env = fmugym.load(GOALS)
+        recordings = played(env, 1)
+        write_dataset("test/twice-v0", recordings, env)
+        with pytest.raises(ConfigError, match="test/twice-v0"):
+            write_dataset("test/twice-v0", recordings, env)
+        env.close()
+
+    def test_a_dataset_that_is_missing(self):
+        with pytest.raises(ConfigError, match=r"nothing-v0.*there are: none"):
+            read_dataset("test/nothing-v0")
+
+    @pytest.mark.filterwarnings("ignore")
+    def test_a_dataset_of_another_program(self):
+        episode = minari.data_collector.EpisodeBuffer(
+            observations=[np.zeros(4, np.float32)] * 2,
+            actions=[0],
+            rewards=[1.0],
+            terminations=[True],
+            truncations=[False],
+        )
+        dataset = minari.create_dataset_from_buffers(
+            "test/foreign-v0", [episode], env="CartPole-v1"
+        )
+        with pytest.raises(ConfigError, match="not made by fmugym"):
+            read_dataset(dataset)
+
+
+class TestCommand:
+    def test_episodes_of_a_controller(self, capsys):
+        command = ["dataset", "test/random-v0", "--task", "fmugym/Pendulum-v0", "--episodes", "2"]
+        assert main([*command, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert (told["episodes"], told["steps"]) == (2, 400)
+        recordings = read_dataset("test/random-v0")
+        assert [bool(one.truncated[-1]) for one in recordings] == [True, True]
+
+    def test_back_to_recordings(self, folder, capsys):
+        command = ["dataset", "test/two-v0", "--task", "fmugym/CartPole-v0", "--episodes", "2"]
+        assert main(command) == 0
+        assert main(["dataset", "test/two-v0", "--output", str(folder / "out")]) == 0
+        files = sorted((folder / "out").iterdir())
+        assert len(files) == 2
+        texts = [argument for file in files for argument in ("--recording", str(file))]
+        again = ["dataset", "test/again-v0", "--task", "fmugym/CartPole-v0", *texts]
+        assert main(again) == 0
+        assert len(Recording.load(files[0])) == len(read_dataset("test/again-v0")[0])
+
+    def test_logs(self, folder, capsys):
+        with RecordSeries(gym.make("fmugym/House-v0"), path=folder / "week.csv") as env:
+            env.reset(seed=0)
+            for _ in range(20):
+                env.step(env.action_space.sample())
+        command = ["dataset", "test/log-v0", "--task", "fmugym/House-v0", "--log"]
+        assert main([*command, str(folder / "week.csv")]) == 0
+        assert "1 episodes, 20 steps" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ("arguments", "fact"),
+        [
+            ([], "--task"),
+            (["--task", "fmugym/CartPole-v0", "--log", "none.csv"], "none.csv"),
+            (["--task", "fmugym/CartPole-v0", "--log", "none.csv", "--column", "x"], "COLUMN="),
+        ],
+    )
+    def test_mistakes(self, arguments, fact, capsys):
+        assert main(["dataset", "test/wrong-v0", *arguments]) == 1
+        assert fact in capsys.readouterr().err

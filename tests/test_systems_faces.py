@@ -1,0 +1,359 @@
+"""Systems where an FMU can stand: environments, task files, the command line, pictures."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
+from fmugym.systems.placing import layout_of
+from fmugym.tools.cli import main
+
+HOUSE = bundled_fmu("House")
+
+TASK = """
+version = 1
+time_step = "15min"
+episode_length = "6h"
+{head}
+
+[system]
+name = "two houses"
+connections = [
+  "outside -> east.T_out",
+  "outside -> west.T_out",
+  {{ source = "east.Q_em", target = "west.Q_int", gain = 0.1 }},
+]
+units = {{ outside = "degC" }}
+step_size = "60s"
+
+[system.components]
+east = {{ bundled = "House" }}
+west = {{ fmu = {{ bundled = "House" }}, start_values = {{ T_m_0 = 290.0 }} }}
+
+[variables]
+T = {{ name = "east.T_air", unit = "degC", min = 0, max = 50 }}
+T2 = {{ name = "west.T_air", unit = "degC", min = 0, max = 50 }}
+u = {{ name = "east.u" }}
+u2 = {{ name = "west.u" }}
+
+[agent]
+actions = ["u", "u2"]
+observations = ["T", "T2"]
+
+{tail}
+"""
+ONE_REWARD = {"head": 'reward = "-abs(T - 21)"', "tail": ""}
+TWO_REWARDS = {
+    "head": "",
+    "tail": '[reward.warm]\nexpr = "-abs(T - 21)"\n[reward.cool]\nexpr = "-abs(T2 - 18)"\n',
+}
+
+
+def two_houses(**options):
+    return FMUSystem(
+        {"east": HOUSE, "west": Component(HOUSE, {"T_m_0": 290.0})},
+        [
+            "outside -> east.T_out",
+            "outside -> west.T_out",
+            fmugym.Connection("east.Q_em", "west.Q_int", 0.1),
+            "east.T_air -> warmth",
+        ],
+        units={"outside": "degC", "warmth": "degC"},
+        **{"step_size": 60.0, "name": "two houses"} | options,
+    )
+
+
+class TwoHouses(FMUEnv):
+    def __init__(self, path, **options):
+        config = {
+            "model_input_names": ["east.u", "outside"],
+            "model_output_names": ["east.T_air", "west.T_air", "warmth", "west.E"],
+            "model_parameters": {"east.A_f": fmugym.Uniform(100, 200)},
+            "time_step": 900.0,
+            "max_episode_steps": 20,
+        }
+        super().__init__(path, config, **options)
+
+    def _is_done(self):
+        return False
+
+
+class Open(FMUEnv):
+    """With any config."""
+
+    def _is_done(self):
+        return False
+
+
+def played(env, steps=12, seed=3):
+    env.action_space.seed(seed)
+    rows = [env.reset(seed=seed)[0]]
+    rows += [env.step(env.action_space.sample())[0] for _ in range(steps)]
+    env.close()
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    return two_houses().write(tmp_path_factory.mktemp("ssp") / "houses.ssp")
+
+
+@pytest.fixture
+def task(tmp_path):
+    def write(**parts):
+        path = tmp_path / "houses.toml"
+        path.write_text(TASK.format(**ONE_REWARD | parts))
+        return path
+
+    return write
+
+
+class TestEnvironments:
+    def test_an_object_and_an_archive_give_the_same(self, archive):
+        assert np.array_equal(played(TwoHouses(two_houses())), played(TwoHouses(archive)))
+
+    def test_a_relative_archive_is_found_beside_the_class(self):
+        with pytest.raises(fmugym.FMULoadError, match=r"tests.*none\.ssp"):
+            TwoHouses("none.ssp")
+
+    def test_houses_that_are_not_connected_are_as_if_alone(self):
+        """One FMU alone, stepped by the same pool, is the reference."""
+
+        class Alone(FMUEnv):
+            def __init__(self, path, prefixes=("",)):
+                names = [[f"{p}{n}" for p in prefixes] for n in ("u", "T_air")]
+                config = {"model_input_names": names[0], "model_output_names": names[1]}
+                super().__init__(path, config | {"time_step": 900.0})
+
+            def _is_done(self):
+                return False
+
+        both = Alone(FMUSystem({"a": HOUSE, "b": HOUSE}), ("a.", "b."))
+        one, other = Alone(HOUSE), Alone(HOUSE)
+        assert both.reset()[0].tolist() == [*one.reset()[0], *other.reset()[0]]
+        for step in range(20):
+            actions = np.array([step % 2, (step % 3) / 2], np.float32)
+            seen = both.step(actions)[0]
+            alone = [env.step(actions[[i]])[0][0] for i, env in enumerate((one, other))]
+            assert seen.tolist() == alone
+
+    def test_units_of_the_system_hold_in_the_environment(self):
+        env = TwoHouses(two_houses())
+        (_, outside) = env.action_space.low
+        assert outside == pytest.approx(200 - 273.15, abs=1e-4)  # the FMU gives 200 K
+        state = env.reset(seed=0)[0]
+        assert state[2] == pytest.approx(state[0] - 273.15, abs=1e-4)
+
+    def test_start_values_of_components_are_in_the_episode(self):
+        """A house that begins colder is colder, and the environment's own values win."""
+        first = TwoHouses(two_houses()).reset(seed=0)[0]
+        env = TwoHouses(two_houses())
+        options = {"model_parameters": {"west.T_m_0": 295.0}}
+        assert env.reset(seed=0, options=options)[0][1] > first[1] + 2
+
+    def test_a_vector_environment_gives_what_single_ones_give(self, archive):
+        envs = FMUVectorEnv(lambda: TwoHouses(archive), 3)
+        single = [TwoHouses(archive) for _ in range(3)]
+        seen = envs.reset(seed=5)[0]
+        assert np.array_equal(seen, [env.reset(seed=5 + i)[0] for i, env in enumerate(single)])
+        for _ in range(5):
+            actions = np.stack([env.action_space.sample() for env in single])
+            seen = envs.step(actions)[0]
+            alone = [env.step(a)[0] for env, a in zip(single, actions, strict=True)]
+            assert np.array_equal(seen, alone)
+        envs.close()
+
+    def test_a_copy_of_an_environment_has_the_same_system(self):
+        import pickle
+
+        env = pickle.loads(pickle.dumps(TwoHouses(two_houses())))
+        assert np.array_equal(played(env), played(TwoHouses(two_houses())))
+
+    def test_what_drives_a_name_is_the_only_one(self):
+        """An input behind a name of the system is set by that name alone."""
+        with pytest.raises(ConfigError, match=r"east\.T_out.*local"):
+            Open(
+                two_houses(),
+                {"model_input_names": ["east.T_out"], "model_output_names": ["warmth"]},
+            )
+
+    def test_keys_for_a_single_fmu(self):
+        for key, value in (("interface", "co_simulation"), ("preload", ["/x.so"])):
+            config = {"model_input_names": [], "model_output_names": ["warmth"], key: value}
+            with pytest.raises(ConfigError, match=key):
+                Open(two_houses(), config)
+
+
+class TestTaskFiles:
+    def test_the_section_makes_the_same_system(self, task):
+        env = fmugym.load(task())
+        assert env.fmu.plan.links == two_houses().plan.links
+        assert env.fmu.plan.components[1].starts == (("T_m_0", 290.0),)
+        assert env.fmu.plan.step_size == 60.0
+        rows = played(env, steps=10)
+        assert rows.shape == (11, 2)
+
+    def test_it_can_be_written_and_read_again(self, task, tmp_path):
+        env = fmugym.load(task())
+        env.task.write(tmp_path / "again.toml")
+        assert fmugym.Task.read(tmp_path / "again.toml") == env.task
+
+    def test_paths_of_components_are_relative_to_the_file(self, task, tmp_path):
+        (tmp_path / "parts").mkdir()
+        (tmp_path / "parts" / "own.fmu").write_bytes(HOUSE.read_bytes())
+        path = task()
+        path.write_text(
+            path.read_text().replace('east = { bundled = "House" }', 'east = "parts/own.fmu"')
+        )
+        loaded = fmugym.load(path)
+        assert loaded.fmu.plan.components[0].path == tmp_path / "parts" / "own.fmu"
+        copy = tmp_path / "parts" / "copy.toml"
+        loaded.task.write(copy)
+        assert 'east = "own.fmu"' in copy.read_text()
+
+    def test_an_archive_is_an_fmu(self, archive):
+        task = {
+            "fmu": str(archive),
+            "time_step": 900,
+            "episode_length": 3600,
+            "reward": "east_T",
+            "variables": {"east_T": {"name": "east.T_air"}, "u": {"name": "east.u"}},
+            "agent": {"actions": ["u"], "observations": ["east_T"]},
+        }
+        assert played(fmugym.load(task), steps=4).shape == (5, 1)
+
+    @pytest.mark.parametrize(
+        ("old", "new", "facts"),
+        [
+            (
+                '"outside -> east.T_out"',
+                '"outside -> eest.T_out"',
+                ["system", "eest", "did you mean"],
+            ),
+            ("T_m_0 = 290.0", "T_m_1 = 290.0", ["system", "T_m_1", "T_m_0"]),
+            ("gain = 0.1", "gian = 0.1", ["connections", "gian", "gain"]),
+            ("gain = 0.1", 'gain = "much"', ["gain", "much"]),
+            ('source = "east.Q_em", ', "", ["source"]),
+            ('step_size = "60s"', 'step = "60s"', ["step", "step_size"]),
+            ('step_size = "60s"', 'step_size = "soon"', ["step_size", "soon"]),
+            ('step_size = "60s"', 'master = "jacob"', ["jacobi"]),
+            ('{ bundled = "House" }\nwest', '"none.fmu"\nwest', ["east", "none.fmu"]),
+            ("version = 1", 'version = 1\nfmu = "a.fmu"', ["'fmu'", "'system'"]),
+        ],
+    )
+    def test_mistakes_say_where_they_are(self, task, old, new, facts):
+        path = task()
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        with pytest.raises(TaskError) as error:
+            fmugym.load(path)
+        assert str(error.value).startswith("houses.toml, line "), error.value
+        assert all(fact in str(error.value) for fact in facts), error.value
+
+
+class TestCommandLine:
+    def test_info_of_an_archive_and_of_a_task(self, archive, task, tmp_path, capsys):
+        for path in (archive, task()):
+            assert main(["info", str(path), "--plot", str(tmp_path / "system.svg")]) == 0
+            text = capsys.readouterr().out
+            for fact in (
+                "two houses (a system of 2 FMUs)",
+                "east.Q_em -> west.Q_int (* 0.1)",
+                "input outside -> east.T_out (+ 273.15), west.T_out (+ 273.15)",
+                "east -> west",
+            ):
+                assert fact in text
+            picture = (tmp_path / "system.svg").read_text()
+            assert all(f">{name}<" in picture for name in ("east", "west", "outside", "Q_int"))
+
+    def test_info_as_json(self, archive, capsys):
+        assert main(["info", str(archive), "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        system = facts["system"]
+        assert [one["name"] for one in system["components"]] == ["east", "west"]
+        assert system["connections"][0]["gain"] == 0.1
+        assert system["order"] == [
+            {"components": ["east"], "is_loop": False},
+            {"components": ["west"], "is_loop": False},
+        ]
+
+    def test_the_plot_is_for_systems(self, tmp_path, capsys):
+        assert main(["info", str(HOUSE), "--plot", str(tmp_path / "x.svg")]) == 1
+        assert "--plot" in capsys.readouterr().err
+        assert not list(tmp_path.iterdir())
+
+    def test_from_an_archive_to_a_task_and_an_episode(self, archive, tmp_path, capsys):
+        path = tmp_path / "new.toml"
+        assert main(["new", str(archive), "--output", str(path)]) == 0
+        assert main(["validate", str(path)]) == 0
+        run = ["simulate", str(path), "--steps", "3", "--output", str(tmp_path / "run.csv")]
+        assert main(run) == 0
+        header = (tmp_path / "run.csv").read_text().splitlines()[0]
+        assert "west_E" in header
+        assert main(["bench", str(archive), "--envs", "2", "--seconds", "0.1"]) == 0
+        capsys.readouterr()
+
+    def test_an_archive_that_is_none(self, tmp_path, capsys):
+        (tmp_path / "x.ssp").write_text("x")
+        assert main(["info", str(tmp_path / "x.ssp")]) == 1
+        assert "x.ssp" in capsys.readouterr().err
+
+    def test_make(self, task):
+        env = gymnasium.make("fmugym/FMU-v0", config=str(task()))
+        assert env.reset(seed=0)[0].shape == (2,)
+        env.close()
+
+
+class TestPictures:
+    LOOP = ("b.Q_em -> a.Q_int", "a.Q_em -> b.Q_int", "b.P -> c.Q_int", "c.T_m -> a.T_out")
+
+    def make(self):
+        links = [*self.LOOP, "T -> b.T_out", "T -> c.T_out", "c.T_air -> y", "u -> a.u"]
+        return FMUSystem({"a": HOUSE, "b": HOUSE, "c": HOUSE}, links)
+
+    def test_boxes_do_not_overlap(self):
+        boxes = list(layout_of(self.make()).boxes.values())
+        assert len(boxes) == 6
+        for number, one in enumerate(boxes):
+            for other in boxes[:number]:
+                beside = one.x >= other.x + other.width or other.x >= one.x + one.width
+                above = one.y - one.height >= other.y or other.y - other.height >= one.y
+                assert beside or above, (one.title, other.title)
+
+    def test_wires_lead_from_port_to_port(self):
+        layout = layout_of(self.make())
+        assert len(layout.wires) == 8
+        for wire in layout.wires:
+            (source, name), (target, other) = wire.source, wire.target
+            assert wire.points[0] == layout.boxes[source].port(name, left=False)
+            assert wire.points[-1] == layout.boxes[target].port(other, left=True)
+
+    def test_loops_are_marked_and_wires_back_run_below(self):
+        layout = layout_of(self.make())
+        marked = {(w.source[0], w.target[0]) for w in layout.wires if w.in_loop}
+        assert marked == {("a", "b"), ("b", "a")}
+        bottom = min(box.y - box.height for box in layout.boxes.values())
+        back = [wire for wire in layout.wires if wire.leads_back]
+        assert back
+        assert all(min(y for _, y in wire.points) < bottom for wire in back)
+
+    def test_files(self, tmp_path):
+        system = self.make()
+        system.plot(tmp_path / "a.png")
+        assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+        for name in ("a.svg", "b.svg"):
+            system.plot(tmp_path / name)
+        text = (tmp_path / "a.svg").read_text()
+        assert text == (tmp_path / "b.svg").read_text()
+        assert "algebraic loop" in text
+        with pytest.raises(ConfigError, match="picture"):
+            system.plot(tmp_path / "a.docx")
+        with pytest.raises(ConfigError, match="picture"):
+            system.plot(tmp_path / "none" / "a.png")
+
+    def test_names_that_look_like_mathematics_are_texts(self, tmp_path):
+        FMUSystem({"$x$": HOUSE}, name="$\\alpha").plot(tmp_path / "a.png")

@@ -1,0 +1,577 @@
+"""SSP archives: what is read of them, compared with FMPy's reader, and what is written."""
+
+import copy
+import random
+import zipfile
+
+import pytest
+from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
+from lxml import etree
+
+from fmugym import (
+    Component,
+    ConfigError,
+    Connection,
+    FMUGymError,
+    FMULoadError,
+    FMUSystem,
+    bundled_fmu,
+)
+
+HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
+
+HEAD = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n<ssd:SystemStructureDescription version="1.0" '
+    'name="test" xmlns:ssd="http://ssp-standard.org/SSP1/SystemStructureDescription" '
+    'xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" '
+    'xmlns:ssv="http://ssp-standard.org/SSP1/SystemStructureParameterValues" '
+    'xmlns:ssm="http://ssp-standard.org/SSP1/SystemStructureParameterMapping">\n'
+)
+TAIL = "</ssd:SystemStructureDescription>"
+
+
+def connectors(**kinds):
+    """Connectors by name: the kind, and after a blank the unit."""
+    parts = []
+    for name, text in kinds.items():
+        kind, _, unit = text.partition(" ")
+        unit = f' unit="{unit}"' if unit else ""
+        own = f'<ssd:Connector name="{name}" kind="{kind}"><ssc:Real{unit}/></ssd:Connector>'
+        parts.append(own)
+    return f"<ssd:Connectors>{''.join(parts)}</ssd:Connectors>"
+
+
+def values(parameters, more="", **attributes):
+    """A binding with values in place, by name: a number, and after a blank its unit."""
+    own = "".join(f' {name}="{value}"' for name, value in attributes.items())
+    return (
+        f"<ssd:ParameterBinding{own}><ssd:ParameterValues>{parameter_set(parameters)}"
+        f"</ssd:ParameterValues>{more}</ssd:ParameterBinding>"
+    )
+
+
+def parameter_set(parameters):
+    own = "".join(
+        f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>'
+        for name, value in parameters.items()
+    )
+    return (
+        '<ssv:ParameterSet version="1.0" name="set" '
+        'xmlns:ssv="http://ssp-standard.org/SSP1/SystemStructureParameterValues">'
+        f"<ssv:Parameters>{own}</ssv:Parameters></ssv:ParameterSet>"
+    )
+
+
+def mapping(entries):
+    return (
+        '<ssm:ParameterMapping version="1.0" '
+        'xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" '
+        'xmlns:ssm="http://ssp-standard.org/SSP1/SystemStructureParameterMapping">'
+        f"{entries}</ssm:ParameterMapping>"
+    )
+
+
+def bindings(*texts):
+    return f"<ssd:ParameterBindings>{''.join(texts)}</ssd:ParameterBindings>"
+
+
+def real(value, unit=""):
+    unit = f' unit="{unit}"' if unit else ""
+    return f'<ssv:Real value="{value}"{unit}/>'
+
+
+def component(name, ports, source="resources/House.fmu", more="", **attributes):
+    own = "".join(f' {key}="{value}"' for key, value in attributes.items())
+    return (
+        f'<ssd:Component name="{name}" source="{source}"{own}>{connectors(**ports)}{more}'
+        "</ssd:Component>"
+    )
+
+
+def connection(start, end, inner="", **attributes):
+    ends = []
+    for kind, text in (("start", start), ("end", end)):
+        element, _, connector = text.rpartition(".")
+        ends.append(f' {kind}Element="{element}"' if element else "")
+        ends.append(f' {kind}Connector="{connector}"')
+    own = "".join(f' {key}="{value}"' for key, value in attributes.items())
+    return f"<ssd:Connection{''.join(ends)}{own}>{inner}</ssd:Connection>"
+
+
+def system(name, ports, elements, connections=(), more=""):
+    wires = f"<ssd:Connections>{''.join(connections)}</ssd:Connections>" if connections else ""
+    return (
+        f'<ssd:System name="{name}">{connectors(**ports) if ports else ""}{more}'
+        f"<ssd:Elements>{''.join(elements)}</ssd:Elements>{wires}</ssd:System>"
+    )
+
+
+def linear(factor, offset=0.0):
+    return f'<ssc:LinearTransformation factor="{factor}" offset="{offset}"/>'
+
+
+@pytest.fixture
+def pack(tmp_path):
+    """Write an archive with one system, the bundled FMUs and more files."""
+
+    def write(root, after="", **files):
+        path = tmp_path / "system.ssp"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("SystemStructure.ssd", HEAD + root + after + TAIL)
+            archive.write(HOUSE, "resources/House.fmu")
+            archive.write(PENDULUM, "resources/Pendulum.fmu")
+            for name, text in files.items():
+                archive.writestr(f"resources/{name.replace('_', '.')}", text)
+        return path
+
+    return write
+
+
+HOUSE_PORTS = {"T_out": "input K", "Q_int": "input W", "Q_em": "output W", "T_air": "output K"}
+LINKED = system(
+    "root",
+    {"T": "input degC", "warmth": "output"},
+    [component("a", HOUSE_PORTS), component("b", HOUSE_PORTS)],
+    [
+        connection("T", "a.T_out"),
+        connection("a.Q_em", "b.Q_int", linear(0.5, 10)),
+        connection("warmth", "b.T_air"),  # from its end to its start
+    ],
+)
+EAST = {"Q_int": "input W", "Q_em": "output W", "T_air": "output K"}
+NESTED = system(
+    "root",
+    {"power": "input kW", "T": "output degC"},
+    [
+        system(
+            "east",
+            {"heat": "input kW", "out": "output W", "T": "output K"},
+            [component("house", EAST)],
+            [
+                connection("heat", "house.Q_int"),
+                connection("house.Q_em", "out"),
+                connection("house.T_air", "T"),
+            ],
+        ),
+        system(
+            "west",
+            {"heat": "input W"},
+            [
+                system(
+                    "room",
+                    {"heat": "input W"},
+                    [component("house", {"Q_int": "input W"})],
+                    [connection("heat", "house.Q_int", linear(2.0, 1.0))],
+                )
+            ],
+            [connection("heat", "room.heat")],
+        ),
+    ],
+    [
+        connection("power", "east.heat"),
+        connection("east.out", "west.heat", linear(3.0, 5.0)),
+        connection("east.T", "T"),
+    ],
+)
+
+
+def links_of(system):
+    return [(k.source, k.output, k.target, k.input, k.gain, k.offset) for k in system.links]
+
+
+def starts_of(system):
+    return {one.name: dict(one.starts) for one in system.plan.components}
+
+
+class TestReading:
+    def test_of_one_level(self, pack):
+        system = FMUSystem.read(pack(LINKED))
+        assert system.name == "test"
+        assert links_of(system) == [("a", "Q_em", "b", "Q_int", 0.5, 10.0)]
+        found = {c.name: (c.causality, c.ends[0].component) for c in system.plan.connectors}
+        assert found == {"T": ("input", "a"), "warmth": ("output", "b")}
+        (end,) = system.plan.connectors[0].ends
+        assert end.offset == pytest.approx(273.15)  # pint knows degC, the file does not define it
+
+    def test_nested_systems_become_flat(self, pack):
+        system = FMUSystem.read(pack(NESTED))
+        assert list(system.components) == ["east.house", "west.room.house"]
+        ((*ends, gain, offset),) = links_of(system)
+        assert ends == ["east.house", "Q_em", "west.room.house", "Q_int"]
+        assert (gain, offset) == (6.0, 11.0)  # 2 (3 x + 5) + 1
+        inputs = {c.name: c.ends[0] for c in system.plan.connectors}
+        assert inputs["power"].gain == pytest.approx(1000.0)  # from kW to W
+        assert inputs["T"].offset == pytest.approx(-273.15)
+
+    def test_the_same_components_and_connections_as_fmpy_finds(self, pack):
+        path = pack(NESTED)
+        theirs = read_ssd(str(path))
+        names = {f"{c.parent.name}.{c.name}" for c in find_components(theirs.system)}
+        ours = FMUSystem.read(path)
+        assert names == {".".join(name.split(".")[-2:]) for name in ours.components}
+        assert traced_by_fmpy(theirs) == {
+            (f"{k.source}.{k.output}", f"{k.target}.{k.input}") for k in ours.links
+        }
+
+    def test_parameters_by_their_hierarchical_names(self, pack):
+        """A binding of a system wins over those of its parts, a later one over an earlier one."""
+        inner = bindings(values({"A_f": real(50), "H_w": real(1)}), values({"H_w": real(2)}))
+        east = system(
+            "east",
+            {"area": "parameter m2"},
+            [component("house", {"A_f": "parameter m2"}, more=inner)],
+            [connection("area", "house.A_f")],
+            more=bindings(values({"house.H_ve": real(3)})),
+        )
+        top = bindings(
+            values({"east.area": real(70), "east.house.UA": real(4)}),
+            values({"house.C_w": real(5), "nothing": real(1)}, prefix="east."),
+            values({"T_m_0": real(20, "degC")}, prefix="east.house."),
+        )
+        found = FMUSystem.read(pack(system("root", {}, [east], more=top)))
+        (starts,) = starts_of(found).values()
+        assert starts.pop("T_m_0") == pytest.approx(293.15)
+        assert starts == {"A_f": 70.0, "H_w": 2.0, "H_ve": 3.0, "UA": 4.0, "C_w": 5.0}
+        assert any("east.nothing" in finding for finding in found.findings)
+
+    def test_external_sets_and_mappings_as_fmpy_reads_them(self, pack):
+        entries = (
+            f'<ssm:MappingEntry source="area" target="A_f">{linear(2.0, 1.0)}</ssm:MappingEntry>'
+            '<ssm:MappingEntry source="method" target="solver"><ssc:IntegerMappingTransformation>'
+            '<ssc:MapEntry source="0" target="1"/><ssc:MapEntry source="7" target="2"/>'
+            "</ssc:IntegerMappingTransformation></ssm:MappingEntry>"
+        )
+        own = {"area": real(60), "method": '<ssv:Integer value="7"/>', "UA": real(9)}
+        binding = (
+            '<ssd:ParameterBinding source="resources/p.ssv">'
+            '<ssd:ParameterMapping source="resources/p.ssm"/></ssd:ParameterBinding>'
+        )
+        root = system("root", {}, [component("h", HOUSE_PORTS, more=bindings(binding))])
+        path = pack(root, p_ssv=parameter_set(own), p_ssm=mapping(entries))
+        assert starts_of(FMUSystem.read(path)) == {"h": {"A_f": 121.0, "solver": 2.0}}
+        theirs = read_ssv(str(path), "resources/p.ssv")
+        assert {one.name: one.value for one in theirs.parameters} == {
+            "area": "60",
+            "method": "7",
+            "UA": "9",
+        }
+        (first, _) = read_ssm(str(path), "resources/p.ssm").mappingEntries
+        assert (first.source, first.target) == ("area", "A_f")
+
+    def test_items_of_enumerations_and_booleans(self, pack):
+        item = {"solver": '<ssv:Enumeration value="rk4"/>'}
+        root = system("r", {}, [component("h", HOUSE_PORTS, more=bindings(values(item)))])
+        assert starts_of(FMUSystem.read(pack(root))) == {"h": {"solver": 2.0}}
+
+    def test_what_is_ignored_is_told(self, pack):
+        note = (
+            '<ssd:Annotations><ssc:Annotation type="org.example"><x/></ssc:Annotation>'
+            "</ssd:Annotations>"
+        )
+        shape = '<ssd:ElementGeometry x1="0" y1="0" x2="1" y2="1"/>'
+        root = system(
+            "root",
+            {"idle": "input"},
+            [component("h", HOUSE_PORTS, more=shape + note)],
+        )
+        findings = " ".join(FMUSystem.read(pack(root)).findings)
+        for fact in ("org.example", "ElementGeometry", "idle"):
+            assert fact in findings
+
+    def test_the_default_experiment_and_the_interface(self, pack):
+        root = system("r", {}, [component("h", HOUSE_PORTS, implementation="CoSimulation")])
+        experiment = '<ssd:DefaultExperiment startTime="3" stopTime="9.5"/>'
+        plan = FMUSystem.read(pack(root, experiment)).plan
+        assert (plan.start_time, plan.stop_time) == (3.0, 9.5)
+        assert plan.components[0].interface == "co_simulation"
+
+    def test_units_of_the_file_are_known(self, pack):
+        unit = (
+            '<ssd:Units><ssc:Unit name="odd"><ssc:BaseUnit kg="1" m="2" s="-3" factor="7"/>'
+            "</ssc:Unit></ssd:Units>"
+        )
+        root = system(
+            "r", {"q": "input odd"}, [component("h", HOUSE_PORTS)], [connection("q", "h.Q_int")]
+        )
+        (connector,) = FMUSystem.read(pack(root, unit)).plan.connectors
+        assert connector.ends[0].gain == 7.0
+
+
+def traced_by_fmpy(ssd):
+    """The connections of components that FMPy finds, followed through the connectors of systems."""
+    from fmpy.ssp.ssd import Component as Part
+    from fmpy.ssp.ssd import build_path
+
+    pairs = get_connections(ssd.system)
+    source = {id(end): start for start, end in pairs}
+    found = set()
+    for start, end in pairs:
+        while id(start) in source and not isinstance(start.parent, Part):
+            start = source[id(start)]
+        if isinstance(start.parent, Part) and isinstance(end.parent, Part):
+            names = [build_path(one).partition(".")[2] for one in (start, end)]
+            found.add(tuple(names))
+    return found
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("root", "error", "facts"),
+        [
+            (
+                system("r", {}, [component("h", HOUSE_PORTS, source="resources/Hause.fmu")]),
+                FMULoadError,
+                ["'h'", "resources/Hause.fmu"],
+            ),
+            (
+                system("r", {}, [component("h", HOUSE_PORTS, source="../House.fmu")]),
+                FMULoadError,
+                ["../House.fmu"],
+            ),
+            (
+                system("r", {}, [component("h", HOUSE_PORTS, type="application/x-ssp-package")]),
+                FMULoadError,
+                ["application/x-ssp-package"],
+            ),
+            (
+                system(
+                    "r",
+                    {},
+                    [component("h", HOUSE_PORTS)],
+                    [connection("h.Q_em", "h.Q_in")],
+                ),
+                ConfigError,
+                ["Q_in", "Q_int"],
+            ),
+            (
+                system("r", {}, [component("h", HOUSE_PORTS)], [connection("h.Q_em", "i.Q_int")]),
+                FMULoadError,
+                ["'i'"],
+            ),
+            (
+                system("r", {}, [component("h", HOUSE_PORTS)], [connection("q", "h.Q_int")]),
+                FMULoadError,
+                ["'q'"],
+            ),
+            (
+                system("r", {}, [component("h", HOUSE_PORTS)], [connection("h.Q_em", "h.T_air")]),
+                FMULoadError,
+                ["h.Q_em", "h.T_air", "both give"],
+            ),
+            (
+                system(
+                    "r",
+                    {"q": "input", "p": "input"},
+                    [component("h", HOUSE_PORTS)],
+                    [connection("q", "h.Q_int"), connection("p", "h.Q_int")],
+                ),
+                ConfigError,
+                ["h.Q_int", "q, p"],
+            ),
+            (
+                system("r", {}, [component("h", HOUSE_PORTS), component("h", HOUSE_PORTS)]),
+                FMULoadError,
+                ["'h'"],
+            ),
+            (
+                system(
+                    "r",
+                    {},
+                    [
+                        component("h", HOUSE_PORTS),
+                        '<ssd:SignalDictionaryReference name="bus" dictionary="d"/>',
+                    ],
+                ),
+                FMULoadError,
+                ["signal dictionaries"],
+            ),
+            (
+                system(
+                    "r",
+                    {},
+                    [component("h", HOUSE_PORTS)],
+                    [connection("h.Q_em", "h.Q_int", linear("much"))],
+                ),
+                FMULoadError,
+                ["factor", "much"],
+            ),
+            (
+                system(
+                    "r",
+                    {},
+                    [
+                        component(
+                            "h",
+                            HOUSE_PORTS,
+                            more=bindings(values({"T_air": real(1)})),
+                        )
+                    ],
+                ),
+                ConfigError,
+                ["h.T_air"],
+            ),
+        ],
+    )
+    def test_are_named(self, pack, root, error, facts):
+        with pytest.raises(error) as found:
+            FMUSystem.read(pack(root))
+        text = str(found.value)
+        assert text.startswith("system.ssp: ")
+        assert all(fact in text for fact in facts), text
+
+    def test_a_circle_of_system_connectors(self, pack):
+        inner = system("s", {"u": "input", "y": "output"}, [], [connection("u", "y")])
+        root = system(
+            "r",
+            {},
+            [inner.replace("<ssd:Elements></ssd:Elements>", ""), component("h", HOUSE_PORTS)],
+            [connection("s.y", "s.u"), connection("s.y", "h.Q_int")],
+        )
+        with pytest.raises(FMULoadError, match="circle"):
+            FMUSystem.read(pack(root))
+
+    def test_files_that_are_no_systems(self, tmp_path):
+        no_zip = tmp_path / "text.ssp"
+        no_zip.write_text("hello")
+        bomb = tmp_path / "bomb.ssp"
+        with zipfile.ZipFile(bomb, "w") as archive:
+            archive.writestr("SystemStructure.ssd", '<!DOCTYPE x [<!ENTITY a "b">]><x>&a;</x>')
+        cases = {tmp_path / "none.ssp": "no system", no_zip: "zip", HOUSE: "SystemStructure"}
+        for path, fact in (cases | {bomb: "DOCTYPE"}).items():
+            with pytest.raises(FMULoadError, match=fact):
+                FMUSystem.read(path)
+
+
+class TestDamaged:
+    """Whatever is in a file, an error of this package says so, or the system can be written."""
+
+    WORDS = (
+        "",
+        "nan",
+        "-1",
+        "1e999",
+        "x",
+        "../../x",
+        "input",
+        "output",
+        "a",
+        "Q_em",
+        "K",
+        "\u202e",
+    )
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_by_chance(self, pack, seed, tmp_path):
+        draw = random.Random(seed)
+        texts = [NESTED, LINKED, self.with_parameters()]
+        read = 0
+        for _ in range(40):
+            root = draw.choice(texts)
+            text = etree.tostring(
+                self.damaged(draw, etree.fromstring((HEAD + root + TAIL).encode()))
+            )
+            path = pack(text.decode().partition(">")[2].rpartition("<")[0] or root)
+            try:
+                system = FMUSystem.read(path)
+                again = FMUSystem.read(system.write(tmp_path / "again.ssp"))
+            except FMUGymError:
+                continue
+            read += 1
+            assert (again.links, again.connectors) == (system.links, system.connectors)
+        assert read
+
+    def with_parameters(self):
+        own = bindings(values({"T_m_0": real(20, "degC"), "A_f": real(3)}, prefix=""))
+        steps = (
+            '<ssd:Annotations><ssc:Annotation type="fmugym"><x steps="2"/></ssc:Annotation>'
+            "</ssd:Annotations>"
+        )
+        return system("r", {}, [component("h", HOUSE_PORTS, more=own + steps)])
+
+    def damaged(self, draw, root):
+        for _ in range(draw.randint(1, 4)):
+            elements = [one for one in root.iter() if one.getparent() is not None]
+            if not elements:
+                return root
+            one, other = draw.choice(elements), draw.choice(elements)
+            change = draw.randrange(5)
+            if change <= 1 and one.attrib:
+                one.set(draw.choice(list(one.attrib)), draw.choice(self.WORDS))
+            elif change == 2 and one.attrib:
+                del one.attrib[draw.choice(list(one.attrib))]
+            elif change == 3:
+                one.getparent().remove(one)
+            elif other not in list(one.iter()):
+                other.append(copy.deepcopy(one))
+        return root
+
+
+class TestWriting:
+    def make(self):
+        return FMUSystem(
+            {
+                "house": Component(HOUSE, {"T_m_0": 290.0, "solver": "rk4"}, steps=2),
+                "other": Component(HOUSE, interface="co_simulation", feedthrough=False),
+                "rod": PENDULUM,
+            },
+            [
+                "u -> house.u",
+                "T -> house.T_out",
+                "T -> other.T_out",
+                "house.T_air -> T_room",
+                Connection("house.T_air", "rod.tau", 0.1, -1.0, convert_units=False),
+                Connection("house.Q_em", "other.Q_int", 2.0),
+                "A -> house.A_f",
+            ],
+            units={"T": "degC", "T_room": "degC"},
+            name="demo",
+            description="Two houses & a rod",
+            master="jacobi",
+            loops="fixed_point",
+            loop_tolerance=1e-7,
+            step_size=0.1,
+            stop_time=5.5,
+            tolerance=1e-5,
+        )
+
+    def test_what_is_read_again_is_the_same(self, tmp_path):
+        system = self.make()
+        found = FMUSystem.read(system.write(tmp_path / "demo.ssp"))
+        for name in ("links", "connectors", "times", "units", "loop", "loops", "master", "order"):
+            assert getattr(found, name) == getattr(system, name), name
+        assert (found.name, found.description) == (system.name, system.description)
+        assert found.findings == system.findings
+        for theirs, ours in zip(found.plan.components, system.plan.components, strict=True):
+            assert (theirs.name, theirs.steps, theirs.starts) == (
+                ours.name,
+                ours.steps,
+                ours.starts,
+            )
+            assert theirs.path.read_bytes() == ours.path.read_bytes()
+        again = found.write(tmp_path / "again.ssp")
+        assert again.read_bytes() == (tmp_path / "demo.ssp").read_bytes()
+
+    def test_the_schemas_of_the_standard_accept_it(self, tmp_path):
+        """FMPy validates against the schemas of SSP 1.0 when it reads."""
+        theirs = read_ssd(str(self.make().write(tmp_path / "demo.ssp")))
+        assert [one.name for one in theirs.system.elements] == ["house", "other", "rod"]
+        ends = {
+            (one.startElement, one.startConnector, one.endElement, one.endConnector)
+            for one in theirs.system.connections
+        }
+        assert ("house", "Q_em", "other", "Q_int") in ends
+        assert (None, "T", "other", "T_out") in ends
+        units = {one.name: (one.K, one.factor, one.offset) for one in theirs.units}
+        assert units["degC"] == (1, 1.0, 273.15)
+        (binding,) = theirs.system.elements[0].parameterBindings
+        assert [one.value for one in binding.parameterValues[0].parameters] == ["290.0", "2"]
+
+    def test_a_nested_system_is_written_flat(self, pack, tmp_path):
+        system = FMUSystem.read(pack(NESTED))
+        found = FMUSystem.read(system.write(tmp_path / "flat.ssp"))
+        assert links_of(found) == links_of(system)
+        assert list(found.components) == list(system.components)
+
+    def test_a_folder_that_does_not_exist(self, tmp_path):
+        with pytest.raises(FMULoadError, match="none"):
+            self.make().write(tmp_path / "none" / "demo.ssp")
