@@ -276,7 +276,7 @@ class TestLoops:
 @by_each_master
 def test_the_pendulum_in_two_parts_comes_near_the_whole(make, fmus, master):
     """A damper of its own turns the pendulum without friction into the one with friction."""
-    path, damping, errors = bundled_fmu("Pendulum"), 0.05, []
+    path, damping, errors = bundled_fmu("Pendulum"), 0.004, []
     starts = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0))
     for count in (100, 200, 400):
         whole = Component("pendulum", path, starts=(*starts, ("b", damping)))
