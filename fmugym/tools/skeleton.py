@@ -18,6 +18,7 @@ import numpy as np
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError
+from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain, start_value
 
 __all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
@@ -175,6 +176,8 @@ class Skeleton:
     @property
     def _base(self) -> str:
         """The name of the base class."""
+        if isinstance(self._description, SystemDescription):
+            return "FMUEnv"
         kind = "CS" if self._description.interface == "co_simulation" else "ME"
         return f"FMI{self._description.fmi_major_version}{kind}Env"
 
