@@ -228,7 +228,7 @@ class TestHooks:
                 super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config)
 
             def _get_observation_space(self):
-                return gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+                return gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
 
             def _update(self):
                 past = self.variables["past"]
@@ -236,7 +236,8 @@ class TestHooks:
                 self.variables["count"] = self.variables["past"][2] - self.variables["count"]
 
             def _get_observation(self):
-                return np.array([self.variables["past"][2], self.variables["count"]])
+                kept = self.variables["past"][2], self.variables["count"]
+                return np.array([*kept, self.previous_action[0]])
 
             def _is_done(self):
                 return False
