@@ -1,6 +1,7 @@
 """Values of every type, and arrays, in all pools: against closed forms and FMPy."""
 
 import fmpy
+import makers
 import model_tools
 import numpy as np
 import pytest
@@ -615,6 +616,39 @@ def test_sizes_cannot_change_from_episode_to_episode(sized):
 def test_a_parameter_that_gives_no_size(sized):
     with pytest.raises(ConfigError, match=r"'x_0'.*parameter"):
         fmugym.FMU(sized, sizes={"x_0": 3})
+
+
+# Other makers
+
+
+@pools
+def test_arrays_of_pythonfmu3(mixer, options):
+    gain = np.array([[1, 2, 3], [4, 5, 6]])
+    u = np.array([1, 0.5, -0.5], np.float32)
+
+    def make():
+        return Env(
+            mixer,
+            model_input_names="u",
+            model_output_names="y",
+            model_parameters={"gain": gain},
+            bounds={"u": (-1, 1)},
+            **options,
+        )
+
+    env = make()
+    for _ in range(2):
+        env.reset()
+        for steps in (1, 2, 3):
+            env.step(u)
+            assert env.out["y"] == pytest.approx(gain @ u * STEP * steps, abs=1e-12)
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def mixer(tmp_path_factory):
+    build = makers.by_python("pythonfmu3", "foreign_mixer3.py")
+    return build(tmp_path_factory.mktemp("mixer"))
 
 
 # Mistakes

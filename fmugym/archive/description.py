@@ -120,8 +120,11 @@ class Variable:
 
     @property
     def numeric(self) -> bool:
-        """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration."""
-        return self.is_number and not self.shape
+        """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration.
+
+        A clock has no value between its ticks.
+        """
+        return self.is_number and not self.shape and not self.ticking
 
     @property
     def is_number(self) -> bool:

@@ -237,7 +237,6 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     bounded = inputs + outputs
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
     _check_rest_is_known(inputs)
-    _check_no_arrays_beside_clocks(description, inputs)
     return Interface(
         inputs=inputs,
         outputs=outputs,
@@ -248,19 +247,6 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         description=description,
         limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
     )
-
-
-def _check_no_arrays_beside_clocks(
-    description: ModelDescription, inputs: Sequence[Variable]
-) -> None:
-    """Inputs are set one by one where some of them wait for clocks."""
-    arrays = [variable for variable in inputs if variable.array is not None]
-    if arrays and description.clocked_inputs:
-        raise ConfigError(
-            f"{arrays[0].name!r} cannot be an input: it belongs to an array, and "
-            f"{description.model_name} has inputs with clocks, such as "
-            f"{description.clocked_inputs[0].name!r}"
-        )
 
 
 def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
@@ -469,7 +455,7 @@ def _require_known_clock(description: ModelDescription, variable: Variable, role
 
 
 def _require_numeric(variable: Variable, role: str) -> None:
-    if variable.numeric:
+    if variable.numeric or variable.ticking:
         return
     if variable.is_number:
         raise ConfigError(

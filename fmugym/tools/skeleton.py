@@ -151,7 +151,14 @@ class Skeleton:
         return [v for v in usable if not _SOLVER.search(v.name)]
 
     def _of(self, causality: str) -> list[Variable]:
-        return [v for v in self._description.variables.values() if v.causality == causality]
+        """The variables that an environment may use in this role; not all clocks are."""
+        clocks, everything = self._description.clocks, self._description.variables.values()
+        return [
+            v
+            for v in everything
+            if v.causality == causality
+            and (not v.ticking or (v in clocks and (causality != "input" or v.settable_in_step)))
+        ]
 
     @property
     def class_name(self) -> str:
