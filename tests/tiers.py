@@ -36,6 +36,7 @@ SLOW_MODULES = {
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
+    "test_reference_models",
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
@@ -45,6 +46,7 @@ SLOW_MODULES = {
     "test_systems",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_parts",
     "test_systems_ssp",
     "test_without_native",
 }
@@ -68,15 +70,20 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_compile": 3,
+    "test_copies": 2,
     "test_declared_sensors": 5,
     "test_declared_warm_up": 5,
-    "test_copies": 2,
+    "test_events": 5,
     "test_examples_planners": 4,
+    "test_input_interpolation": 5,
+    "test_nested_fmus": 5,
     "test_quirks": 4,
+    "test_reference_models": 17,
     "test_snapshot_machine": 4,
     "test_start_times": 5,
-    "test_value_types": 3,
     "test_systems": 5,
+    "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,
 }
@@ -198,6 +205,7 @@ EXHAUSTIVE_TESTS = (
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
     "test_examples_system.py",
+    "test_systems_faces.py::TestCommandLine::test_validation",
     "test_systems_ssp.py::TestDamaged",
     "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",

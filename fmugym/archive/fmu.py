@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import fmpy
 
@@ -33,7 +33,7 @@ from fmugym.checks import check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
-__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
+__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU", "StandsForFMU"]
 
 logger = logging.getLogger(__name__)
 
@@ -134,6 +134,14 @@ class LoadableFMU(ABC):
         for stray in stray_libraries(library):
             load_globally(str(stray))
         return library
+
+
+@runtime_checkable
+class StandsForFMU(Protocol):
+    """What can be opened like an FMU, such as a system of FMUs."""
+
+    def as_fmu(self) -> FMU:
+        """Open it, with a temporary folder of its own."""
 
 
 class ExtractedFMU(LoadableFMU):
@@ -241,8 +249,10 @@ class FMU(LoadableFMU):
             )
 
     @classmethod
-    def of(cls, source: FMU | str | os.PathLike[str]) -> FMU:
+    def of(cls, source: FMU | StandsForFMU | str | os.PathLike[str]) -> FMU:
         """Open an FMU by its path, or open a second one with the arguments of the first."""
+        if isinstance(source, StandsForFMU):
+            return source.as_fmu()
         return source.again() if isinstance(source, FMU) else cls(source)
 
     def again(self) -> FMU:
