@@ -14,7 +14,7 @@ import system_tools
 from system_tools import linear, linear_fmu, masses, system, tank
 
 import fmugym
-from fmugym import FMULoadError, SimulationError, bundled_fmu
+from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.bundle import SaveMethod
@@ -237,6 +237,17 @@ class TestLoops:
         expected = np.array([0.0, 1.0, -2.0, 5.0]) / (1 + 0.3)
         assert np.allclose(rows[:, 0], expected, rtol=1e-9, atol=1e-12)
         assert np.allclose(rows[:, 1], -0.6 * expected, rtol=1e-9, atol=1e-12)
+
+    def test_of_components_that_cannot_repeat_a_step_are_refused(self, fmus):
+        for version, what in ((1, "saved"), (3, None)):
+            plan = loop_of_gains(fmus | {2: fmus[version]}, Loop())
+            if what is None:
+                SystemFMU(plan)
+                continue
+            with pytest.raises(ConfigError, match=rf"'a'.*'b'.*{what}.*component 'a'"):
+                SystemFMU(plan)
+            with pytest.raises(ConfigError, match=r"component 'a'.*FMI 1\.0"):
+                SystemFMU(replace(plan, master="jacobi"))
 
     @in_each_engine
     def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus, native):

@@ -613,6 +613,13 @@ def test_sizes_cannot_change_from_episode_to_episode(sized):
     env.close()
 
 
+def test_systems_have_no_arrays(sized):
+    with pytest.raises(ConfigError, match=r"'n': 3.*arrays"):
+        fmugym.FMUSystem({"part": fmugym.FMU(sized, sizes={"n": 3})}, [])
+    with pytest.raises(ConfigError, match=r"x\[1\]"):
+        fmugym.FMUSystem({"part": sized}, [("part.x[1]", "part.u[1]")])
+
+
 def test_a_parameter_that_gives_no_size(sized):
     with pytest.raises(ConfigError, match=r"'x_0'.*parameter"):
         fmugym.FMU(sized, sizes={"x_0": 3})
