@@ -97,18 +97,25 @@ Status solver_fail(const Solver *me, const char *format, ...) {
     return STATUS_ERROR;
 }
 
-/* Calls of the FMU. Each restores the floating-point environment. */
+/* Calls of the FMU. The environment is restored before anything is computed here. */
 
 void solver_restore_floats(const Solver *me) {
     floats_restore_if_seen(me->floats);
 }
 
-static Status place(Solver *me, double time, const double *x) {
-    Status status = sane(me->equations->set_time(me->component, time));
+/* The caller restores the environment: mostly another call of the FMU follows. */
+static inline Status move(Solver *me, double time, const double *x) {
+    const Status status = sane(me->equations->set_time(me->component, time));
 
-    if (good(status) && me->n > 0) {
-        status = sane(me->equations->set_states(me->component, x, me->n));
-    }
+    me->is_there = false;
+    return good(status) && me->n > 0
+               ? sane(me->equations->set_states(me->component, x, me->n))
+               : status;
+}
+
+static Status place(Solver *me, double time, const double *x) {
+    const Status status = move(me, time, x);
+
     solver_restore_floats(me);
     return status;
 }
@@ -121,14 +128,22 @@ static Status get_indicators(Solver *me, double *z) {
     return status;
 }
 
-Status solver_rates(Solver *me, double time, const double *x, double *rates) {
-    Status status = place(me, time, x);
+static inline Status rates_here(Solver *me, double *rates) {
+    const Status status =
+        me->n == 0 ? STATUS_OK : sane(me->equations->get_rates(me->component, rates, me->n));
 
-    if (good(status) && me->n > 0) {
-        status = sane(me->equations->get_rates(me->component, rates, me->n));
-        solver_restore_floats(me);
-    }
+    solver_restore_floats(me);
     return status;
+}
+
+Status solver_rates(Solver *me, double time, const double *x, double *rates) {
+    const Status status = move(me, time, x);
+
+    if (!good(status)) {
+        solver_restore_floats(me);
+        return status;
+    }
+    return rates_here(me, rates);
 }
 
 /* Reads the states and their nominal values, which an event may have changed. */
@@ -146,7 +161,8 @@ static Status read_states(Solver *me) {
         const double nominal = fabs(me->nominals[i]);
         me->nominals[i] = nominal > 0.0 && nominal <= DBL_MAX ? nominal : 1.0;
     }
-    me->stale = me->knows_rates = me->knows_indicators = me->has_jacobian = false;
+    me->stale = me->is_there = false;
+    me->knows_rates = me->knows_indicators = me->has_jacobian = false;
     return status;
 }
 
@@ -154,7 +170,9 @@ static Status read_states(Solver *me) {
 static Status know(Solver *me) {
     Status status = STATUS_OK;
 
-    if (!me->knows_rates) {
+    if (!me->knows_rates && me->is_there) {
+        status = rates_here(me, me->rates);
+    } else if (!me->knows_rates) {
         status = solver_rates(me, me->memory.time, me->x, me->rates);
     }
     if (good(status) && !me->knows_indicators) {
@@ -367,7 +385,8 @@ static Status differentiate_by_time(Solver *me, double step) {
 
 Status solver_differentiate(Solver *me, double step) {
     double *column = me->found;
-    Status status = me->has_jacobian ? STATUS_OK : place(me, me->memory.time, me->x);
+    const bool asks = me->solving->state_references != NULL && !me->has_jacobian;
+    Status status = asks ? place(me, me->memory.time, me->x) : STATUS_OK;
 
     for (size_t j = 0; j < me->n && good(status) && !me->has_jacobian; j++) {
         status = differentiate_by(me, j, column);
@@ -463,7 +482,7 @@ static void move_on(Solver *me, double end, bool interrupted) {
     exchange_arrays(&me->x, &me->next);
     exchange_arrays(&me->z, &me->next_z);
     me->knows_rates = method->last > 0 && !interrupted;
-    me->knows_indicators = !interrupted;
+    me->is_there = me->knows_indicators = !interrupted;
     me->has_jacobian = false;
     if (me->knows_rates) {
         memcpy(me->rates, me->stages + method->last * me->n, me->n * sizeof(double));

@@ -36,6 +36,7 @@ SLOW_MODULES = {
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
+    "test_reference_models",
     "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
@@ -68,15 +69,20 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_compile": 3,
+    "test_copies": 2,
     "test_declared_sensors": 5,
     "test_declared_warm_up": 5,
-    "test_copies": 2,
+    "test_events": 5,
     "test_examples_planners": 4,
+    "test_input_interpolation": 5,
+    "test_nested_fmus": 5,
     "test_quirks": 4,
+    "test_reference_models": 17,
     "test_snapshot_machine": 4,
     "test_start_times": 5,
-    "test_value_types": 3,
     "test_systems": 5,
+    "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,
 }
