@@ -32,6 +32,7 @@ import overlap
 import reset
 import rollouts
 import single
+import systems
 import tasks
 import vector
 import windows
@@ -47,6 +48,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "rollouts": rollouts.tables,
     "heavy": heavy.tables,
     "exchange": exchange.tables,
+    "systems": systems.tables,
     "isolation": isolation.tables,
     "windows": windows.tables,
     "overlap": overlap.tables,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.archive.fmu import FMU
+from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.errors import ConfigError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
@@ -58,7 +58,7 @@ class LinearModel:
 
 
 def linearize(
-    fmu: FMU | str | os.PathLike[str],
+    fmu: FMU | StandsForFMU | str | os.PathLike[str],
     *,
     states: str | Sequence[str] | None = None,
     inputs: str | Sequence[str] | None = None,

@@ -35,15 +35,14 @@ static Status advance(Composite *me, size_t index, Span span) {
     Status status = STATUS_OK;
 
     for (int64_t i = 0; i < part->steps && goes_on(status); i++) {
-        status = part_judge(me, index, part->fmi->do_step(&me->libraries[index],
-                                                          me->parts.components[index],
-                                                          span.time + (double)i * size, size,
-                                                          span.no_return));
+        status = part->fmi->do_step(&me->libraries[index], me->components[index],
+                                    span.time + (double)i * size, size, span.no_return);
     }
     return status;
 }
 
-/* If the FMU asks to stop, the others do their step all the same. */
+/* If the FMU asks to stop, the others do their step all the same. The floating-point environment is
+ * restored before another FMU runs. */
 static Status step_part(Composite *me, size_t index, Span span) {
     Status status = part_set_inputs(me, index);
 
@@ -54,7 +53,10 @@ static Status step_part(Composite *me, size_t index, Span span) {
         me->terminated = true;
         status = STATUS_OK;
     }
-    return goes_on(status) ? part_read(me, index) : status;
+    if (goes_on(status)) {
+        status = part_read(me, index);
+    }
+    return part_judge(me, index, status);
 }
 
 /* Algebraic loops: their parts repeat the step from its beginning. */
@@ -75,7 +77,7 @@ static Status save_all(const Repetition *r) {
         const Fmi *fmi = me->system->parts[part].fmi;
         status = fmi->get_state == NULL
                      ? STATUS_ERROR
-                     : fmi->get_state(&me->libraries[part], me->parts.components[part],
+                     : fmi->get_state(&me->libraries[part], me->components[part],
                                       &me->parts.before[part]);
         status = part_judge(me, part, status);
     }
@@ -89,7 +91,7 @@ static Status restore_all(const Repetition *r) {
     for (size_t i = 0; i < r->group->count && goes_on(status); i++) {
         const size_t part = r->group->parts[i];
         status = part_judge(me, part, me->system->parts[part].fmi->set_state(
-                                          &me->libraries[part], me->parts.components[part],
+                                          &me->libraries[part], me->components[part],
                                           me->parts.before[part]));
     }
     return status;

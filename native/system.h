@@ -113,22 +113,22 @@ typedef struct {
     bool *dead;    /* the parts for which no call is legal */
     bool *started; /* the parts that have left instantiation */
     void **before; /* states at the begin of a step */
-    void **components;
     char *names; /* of LOG_NAME bytes each */
 } PartPlaces;
 
-/* One instance. */
+/* One instance. A step uses only one block of memory: this, the components and the slots. */
 typedef struct {
     const System *system;
     const Library *libraries; /* of the parts */
     const Floats *floats;
-    PartPlaces parts;
+    const char *blamed; /* who failed last, or NULL */
+    void **components;
     double *inputs, *outputs; /* the slots */
-    double *loop, *typed;     /* scratch memory */
     bool is_fresh;            /* whether the output slots are what the parts would tell */
     bool is_collecting;       /* whether values to be set are pending */
     bool terminated;          /* whether a part has asked to stop in this step */
-    const char *blamed;       /* who failed last, or NULL */
+    PartPlaces parts;
+    double *loop, *typed; /* scratch memory */
     Pending *pending;
     size_t number_pending, room;
 } Composite;
@@ -167,14 +167,14 @@ Status system_serialize(const Library *library, void *component, void *state, ch
 Status system_deserialize(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
 
-/* Notes a status of a part and returns it. */
+/* Notes a status of a part, and restores the floating-point environment. Returns the status. */
 Status part_judge(Composite *me, size_t index, Status status);
-/* Sets the inputs of a part to its slots. */
+/* Sets the inputs of a part to its slots; and fills the slots of its outputs. The caller judges the
+ * status. */
 Status part_set_inputs(Composite *me, size_t index);
 /* One variable of a part. The place of its reference must stay the same: solvers compare it. */
 Status part_get(Composite *me, size_t index, Type type, const uint32_t *reference, double *value);
 Status part_set(Composite *me, size_t index, Type type, const uint32_t *reference, double value);
-/* Fills the output slots of a part. */
 Status part_read(Composite *me, size_t index);
 /* Computes what a route carries. Values that are not finite must not reach other FMUs. */
 Status route_carry(Composite *me, const Route *route, double value, double *carried);

@@ -60,10 +60,7 @@ static void free_arrays(Composite *me) {
     free(me->parts.dead);
     free(me->parts.started);
     free((void *)me->parts.before);
-    free((void *)me->parts.components);
     free(me->parts.names);
-    free(me->inputs);
-    free(me->outputs);
     free(me->loop);
     free(me->typed);
     free(me->pending);
@@ -74,15 +71,25 @@ static bool allocate(Composite *me, const System *s) {
     me->parts.dead = calloc(s->count, sizeof(bool));
     me->parts.started = calloc(s->count, sizeof(bool));
     me->parts.before = calloc(s->count, sizeof(void *));
-    me->parts.components = calloc(s->count, sizeof(void *));
     me->parts.names = calloc(s->count, LOG_NAME);
-    me->inputs = calloc(s->inputs + 1, sizeof(double));
-    me->outputs = calloc(s->outputs + 1, sizeof(double));
     me->loop = calloc(s->memory + 1, sizeof(double));
     me->typed = calloc(s->scratch + 1, sizeof(double));
     return me->parts.dead != NULL && me->parts.started != NULL && me->parts.before != NULL &&
-           me->parts.components != NULL && me->parts.names != NULL && me->inputs != NULL && me->outputs != NULL &&
-           me->loop != NULL && me->typed != NULL;
+           me->parts.names != NULL && me->loop != NULL && me->typed != NULL;
+}
+
+/* The slots follow the instance, so that a step finds all of it in a few cache lines. */
+static Composite *in_one_block(const System *s) {
+    const size_t words = s->count + s->inputs + s->outputs;
+    Composite *me = calloc(1, sizeof *me + words * sizeof(double));
+
+    if (me != NULL) {
+        me->system = s;
+        me->inputs = (double *)(void *)(me + 1);
+        me->outputs = me->inputs + s->inputs;
+        me->components = (void **)(void *)(me->outputs + s->outputs);
+    }
+    return me;
 }
 
 static bool instantiate_part(Composite *me, size_t index, const Identity *whole) {
@@ -99,19 +106,18 @@ static bool instantiate_part(Composite *me, size_t index, const Identity *whole)
         .solving = &part->solving,
         .floats = whole->floats,
     };
-    me->parts.components[index] = part->fmi->instantiate(&me->libraries[index], &identity);
+    me->components[index] = part->fmi->instantiate(&me->libraries[index], &identity);
     floats_restore_if_seen(me->floats);
-    return me->parts.components[index] != NULL;
+    return me->components[index] != NULL;
 }
 
 void *system_instantiate(const Library *library, const Identity *identity) {
     const System *system = loaded(library)->system;
-    Composite *me = calloc(1, sizeof *me);
+    Composite *me = in_one_block(system);
 
     if (me == NULL) {
         return NULL;
     }
-    me->system = system;
     me->libraries = loaded(library)->parts;
     me->floats = identity->floats;
     bool good = allocate(me, system);
@@ -126,7 +132,7 @@ void *system_instantiate(const Library *library, const Identity *identity) {
 
 static void free_part(Composite *me, size_t index) {
     const Fmi *fmi = me->system->parts[index].fmi;
-    void *component = me->parts.components[index];
+    void *component = me->components[index];
 
     if (me->parts.before[index] != NULL) {
         fmi->free_state(&me->libraries[index], component, &me->parts.before[index]);
@@ -138,12 +144,11 @@ static void free_part(Composite *me, size_t index) {
 /* FMI forbids every call after a fatal error, so the memory of such a part is lost. */
 void system_free(const Library *library, void *component) {
     Composite *me = component;
-    const bool complete = me->parts.components != NULL && me->parts.dead != NULL &&
-                          me->parts.before != NULL;
+    const bool complete = me->parts.dead != NULL && me->parts.before != NULL;
 
     (void)library;
     for (size_t i = 0; complete && i < me->system->count; i++) {
-        if (me->parts.components[i] != NULL && !me->parts.dead[i]) {
+        if (me->components[i] != NULL && !me->parts.dead[i]) {
             free_part(me, i);
         }
     }
@@ -165,7 +170,7 @@ Status system_choose_messages(const Library *library, void *component,
         const Component *part = &me->system->parts[i];
         if (part->fmi->choose_messages != NULL && part->number_of_categories > 0) {
             const Status status = part_judge(
-                me, i, part->fmi->choose_messages(&me->libraries[i], me->parts.components[i],
+                me, i, part->fmi->choose_messages(&me->libraries[i], me->components[i],
                                                   part->categories,
                                                   count > 0 ? part->number_of_categories : 0));
             worst = status > worst ? status : worst;
@@ -183,7 +188,7 @@ static Status reset_part(Composite *me, size_t index) {
     }
     const Status status = part_judge(
         me, index, me->system->parts[index].fmi->reset(&me->libraries[index],
-                                                       me->parts.components[index]));
+                                                       me->components[index]));
     me->parts.started[index] = status > STATUS_WARNING;
     return status;
 }
@@ -210,7 +215,7 @@ Status system_terminate(const Library *library, void *component) {
         if (me->parts.started[i] && !me->parts.dead[i]) {
             const Status status = part_judge(
                 me, i, me->system->parts[i].fmi->terminate(&me->libraries[i],
-                                                           me->parts.components[i]));
+                                                           me->components[i]));
             worst = status > worst ? status : worst;
         }
     }

@@ -26,7 +26,7 @@ static Status set_pending(Composite *me, size_t index, const Pending *pending) {
         return part_set(me, index, end->type, &end->reference, pending->value);
     }
     return part_judge(me, index, part->fmi->set_string(&me->libraries[index],
-                                                       me->parts.components[index],
+                                                       me->components[index],
                                                        end->reference, pending->text));
 }
 
@@ -37,7 +37,7 @@ static Status set_starts(void *context) {
     const size_t index = place->index;
     const Component *part = &me->system->parts[index];
     const Library *library = &me->libraries[index];
-    void *component = me->parts.components[index];
+    void *component = me->components[index];
 
     Status status = part_judge(me, index, access_set(&part->starts, library, component,
                                                      part->start_values, me->typed, me->floats));
@@ -52,7 +52,9 @@ static Status set_starts(void *context) {
         }
     }
     /* an FMU of FMI 1.0 takes no values between these and the end of its initialization */
-    return status <= STATUS_WARNING && !part->has_mode ? part_set_inputs(me, index) : status;
+    return status <= STATUS_WARNING && !part->has_mode
+               ? part_judge(me, index, part_set_inputs(me, index))
+               : status;
 }
 
 static Status begin_from(const Beginning *b, size_t index);
@@ -70,7 +72,7 @@ static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
 
     me->parts.started[index] = true;
     return part_judge(me, index, me->system->parts[index].fmi->initialize(
-                                     &me->libraries[index], me->parts.components[index],
+                                     &me->libraries[index], me->components[index],
                                      b->experiment, values, b->doing));
 }
 

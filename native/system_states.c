@@ -39,7 +39,7 @@ static Status free_states(Composite *me, Saved *saved) {
         if (saved->states[i] != NULL && !me->parts.dead[i]) {
             const Status status = part_judge(
                 me, i, me->system->parts[i].fmi->free_state(
-                           &me->libraries[i], me->parts.components[i], &saved->states[i]));
+                           &me->libraries[i], me->components[i], &saved->states[i]));
             worst = status > worst ? status : worst;
         }
     }
@@ -63,7 +63,7 @@ static Status get_all(Composite *me, Saved *saved, bool *is_other) {
         void *before = saved->states[i];
         status = fmi->get_state == NULL
                      ? STATUS_ERROR
-                     : fmi->get_state(&me->libraries[i], me->parts.components[i],
+                     : fmi->get_state(&me->libraries[i], me->components[i],
                                       &saved->states[i]);
         status = part_judge(me, i, status);
         *is_other |= before != saved->states[i];
@@ -114,7 +114,7 @@ Status system_set_state(const Library *library, void *component, void *state) {
     for (size_t i = 0; i < s->count && status <= STATUS_WARNING; i++) {
         me->parts.started[i] = true;
         status = part_judge(me, i, s->parts[i].fmi->set_state(&me->libraries[i],
-                                                              me->parts.components[i],
+                                                              me->components[i],
                                                               saved->states[i]));
     }
     memcpy(me->inputs, saved->slots, s->inputs * sizeof(double));
@@ -137,7 +137,7 @@ static size_t size_of_part(Composite *me, const Saved *saved, size_t index) {
     const size_t size = fmi->state_size == NULL
                             ? 0
                             : fmi->state_size(&me->libraries[index],
-                                              me->parts.components[index], saved->states[index]);
+                                              me->components[index], saved->states[index]);
 
     floats_restore_if_seen(me->floats);
     return size;
@@ -177,7 +177,7 @@ Status system_serialize(const Library *library, void *component, void *state, ch
         memcpy(place, &own, sizeof own);
         place += sizeof own;
         status = part_judge(me, i, me->system->parts[i].fmi->serialize(
-                                       &me->libraries[i], me->parts.components[i],
+                                       &me->libraries[i], me->components[i],
                                        saved->states[i], place, own));
         place += own;
     }
@@ -208,7 +208,7 @@ static Status read_parts(Composite *me, Saved *saved, const char *place, const c
         if (bytes == NULL || fmi->deserialize == NULL) {
             return STATUS_ERROR;
         }
-        status = part_judge(me, i, fmi->deserialize(&me->libraries[i], me->parts.components[i],
+        status = part_judge(me, i, fmi->deserialize(&me->libraries[i], me->components[i],
                                                     bytes, size, &saved->states[i]));
     }
     return place == end ? status : STATUS_ERROR;

@@ -38,7 +38,7 @@ Status part_get(Composite *me, size_t index, Type type, const uint32_t *referenc
     const Access one = access_of_one(&me->system->parts[index], type, reference, &position);
 
     return part_judge(me, index, access_get(&one, &me->libraries[index],
-                                            me->parts.components[index], value, me->typed,
+                                            me->components[index], value, me->typed,
                                             me->floats));
 }
 
@@ -47,26 +47,34 @@ Status part_set(Composite *me, size_t index, Type type, const uint32_t *referenc
     const Access one = access_of_one(&me->system->parts[index], type, reference, &position);
 
     return part_judge(me, index, access_set(&one, &me->libraries[index],
-                                            me->parts.components[index], &value, me->typed,
+                                            me->components[index], &value, me->typed,
                                             me->floats));
 }
 
 Status part_set_inputs(Composite *me, size_t index) {
     const Component *part = &me->system->parts[index];
 
-    return part_judge(me, index,
-                      access_set(&part->inputs, &me->libraries[index],
-                                 me->parts.components[index], me->inputs + part->first_input,
-                                 me->typed, me->floats));
+    if (part->inputs.direct) {
+        const Group *group = part->inputs.groups;
+        return part->fmi->set(&me->libraries[index], me->components[index], TYPE_FLOAT64,
+                              group->references, group->count, me->inputs + part->first_input,
+                              group->size);
+    }
+    return access_set(&part->inputs, &me->libraries[index], me->components[index],
+                      me->inputs + part->first_input, me->typed, me->floats);
 }
 
 Status part_read(Composite *me, size_t index) {
     const Component *part = &me->system->parts[index];
 
-    return part_judge(me, index,
-                      access_get(&part->outputs, &me->libraries[index],
-                                 me->parts.components[index], me->outputs + part->first_output,
-                                 me->typed, me->floats));
+    if (part->outputs.direct) {
+        const Group *group = part->outputs.groups;
+        return part->fmi->get(&me->libraries[index], me->components[index], TYPE_FLOAT64,
+                              group->references, group->count, me->outputs + part->first_output,
+                              group->size);
+    }
+    return access_get(&part->outputs, &me->libraries[index], me->components[index],
+                      me->outputs + part->first_output, me->typed, me->floats);
 }
 
 Status route_carry(Composite *me, const Route *route, double value, double *carried) {
@@ -82,7 +90,7 @@ Status system_refresh(Composite *me) {
     Status status = STATUS_OK;
 
     for (size_t i = 0; i < me->system->count && status <= STATUS_WARNING; i++) {
-        status = part_read(me, i);
+        status = part_judge(me, i, part_read(me, i));
     }
     me->is_fresh = status <= STATUS_WARNING;
     return status;

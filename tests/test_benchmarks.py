@@ -69,6 +69,15 @@ def test_model_exchange_is_compared_with_fmpy():
     assert all(rows["model exchange, Rosenbrock"])
 
 
+def test_systems_are_compared_with_their_fmus_and_with_fmpy():
+    result = run("--only", "systems")
+    assert (result.returncode, result.stderr) == (0, "")
+    rows = tables_in(result.stdout)
+    assert rows["the three FMUs, each in a pool of its own"][1] == "1.00x"
+    assert rows["FMPy's container in a Python loop (Jacobi)"][3] == "1.00x"
+    assert all(rows['a system, `"jacobi"`'])
+
+
 def test_the_base_is_compared_with_itself(ended):
     assert tables_in(ended[0].stdout)["Gymnasium CartPole-v1, gym.make"][3] == "1.00x"
 

@@ -30,6 +30,7 @@ CLASS_ATTRIBUTES = {"metadata", "render_size", "reset_options", "steps_after_end
 EXTRAS = {
     "deploy.md": "torch",
     "stable-baselines3.md": "stable_baselines3",
+    "systems.md": "pettingzoo",
     "datasets.md": "minari",
     "train-rllib.md": "ray.rllib",
     "train-torchrl.md": "torchrl",

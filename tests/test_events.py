@@ -12,6 +12,7 @@ import fmugym
 from fmugym import FMU, ConfigError
 from fmugym import pool as pools
 from fmugym.pool import PoolSpec
+from fmugym.tools.skeleton import Skeleton
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -309,3 +310,12 @@ class TestRefusals:
         }
         with pytest.raises(ConfigError, match=r"'strike'.*clock"):
             Env(fmu_path(), config)
+
+
+class TestProposals:
+    @pytest.mark.parametrize("event_mode", [True, False])
+    def test_name_only_clocks_that_may_be_used(self, fmu_path, event_mode):
+        skeleton = Skeleton(FMU(fmu_path(event_mode=event_mode)))
+        clocks = {name for name in clocks_tools.CLOCKS if event_mode}
+        assert {v.name for v in skeleton.inputs} == {"command", "plain"} | clocks & {"strike"}
+        assert {v.name for v in skeleton.outputs} & set(clocks_tools.CLOCKS) == clocks & {"bell"}

@@ -213,6 +213,64 @@ class TestHooks:
             observation, *_ = env.step(action)
         env.close()
 
+    def test_kept_values_move_on_together(self, tmp_path):
+        class Delayed(fmugym.FMI2CSEnv):
+            """A pendulum whose agent sees the angle three steps late."""
+
+            def __init__(self):
+                config = {
+                    "model_input_names": "tau",
+                    "model_output_names": ["q"],
+                    "model_parameters": {"theta_0": 0.5},
+                    "episode_variables": {"past": np.zeros(3), "count": 0.0},
+                    "time_step": 0.05,
+                }
+                super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config)
+
+            def _get_observation_space(self):
+                return gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+            def _update(self):
+                past = self.variables["past"]
+                self.variables["past"] = np.concatenate([[self.out["q"]], past[:-1]])
+                self.variables["count"] = self.variables["past"][2] - self.variables["count"]
+
+            def _get_observation(self):
+                return np.array([self.variables["past"][2], self.variables["count"]])
+
+            def _is_done(self):
+                return False
+
+        env = Delayed()
+        network = network_for(env)
+        agent = agent_of(env, network)
+        controller = compiled(agent, tmp_path)
+        assert "count_[1]" in (tmp_path / "agent.h").read_text()
+        observation, _ = env.reset(seed=0)
+        controller.begin()
+        for _ in range(50):
+            actions = controller.step(env.state)
+            observation, *_ = env.step(network.action(observation))
+            assert actions == pytest.approx(env.inputs, abs=1e-6)
+        env.close()
+
+    def test_an_environment_that_runs_compiled(self, tmp_path):
+        env = made("fmugym/CartPole-v0")
+        network = network_for(env)
+        texts = []
+        for name in ("before", "after"):
+            (tmp_path / name).mkdir()
+            texts.append([p.read_text() for p in write_c(agent_of(env, network), tmp_path / name)])
+            env.reset(seed=0)
+            for _ in range(1100):
+                if env.step(0)[2]:
+                    env.reset()
+        state = env.state
+        agent_of(env, network)
+        assert (env._play is not None, env.state) == (True, state)
+        assert texts[0] == texts[1]
+        env.close()
+
     def test_what_was_drawn_is_a_parameter(self):
         env = Filtered()
         logic = agent_of(env, network_for(env)).logic
@@ -348,6 +406,13 @@ class TestFiles:
             write_c(agent, tmp_path)
         with pytest.raises(ConfigError, match="nowhere"):
             write_c(agent, tmp_path / "nowhere")
+
+    @pytest.mark.parametrize("name", ["math", "fmi2", "a-b", "ä", "2a", ""])
+    def test_names_that_are_none(self, name):
+        env = made("fmugym/CartPole-v0")
+        with pytest.raises(ConfigError, match="name"):
+            agent_of(env, network_for(env), name=name)
+        env.close()
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf])
     def test_a_measurement_that_is_not_finite_changes_nothing(self, bad, tmp_path):

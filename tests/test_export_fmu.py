@@ -344,6 +344,17 @@ class TestMistakes:
             write_fmu(agent, tmp_path / "agent.fmu")
 
 
+@pytest.mark.parametrize("name", ["get", "agent", "controller"])
+def test_names_of_agents_meet_no_others(name, version, tmp_path):
+    env = made("CartPole")
+    agent = agent_of(env, network_for(env), name=name)
+    env.close()
+    path = write_fmu(agent, tmp_path / f"{name}.fmu", fmi_version=version)
+    with controller_of(path, tmp_path) as controller:
+        controller.begin()
+        controller.step(0.0, 0.02)
+
+
 class TestTypes:
     """Outputs have the types of the plant's inputs, so that they can be connected."""
 

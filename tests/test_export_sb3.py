@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from export_tools import compiled, plant_of
 from fmpy.validation import validate_fmu
+from test_export import Filtered
 
 from fmugym import ConfigError
 from fmugym.export import Scaling, agent_of, network_of
@@ -111,6 +112,27 @@ class TestClosedLoop:
         assert measured <= 1e-3
         assert written <= 1e-4
         assert steps == 672
+        env.close()
+        venv.close()
+
+    def test_dicts_of_observations_and_several_actions(self, tmp_path):
+        from stable_baselines3.common.vec_env import VecNormalize
+
+        from fmugym.sb3 import make_sb3_env
+
+        venv = VecNormalize(make_sb3_env(Filtered, 2, seed=0), norm_obs_keys=["angle"])
+        model = sb3.PPO("MultiInputPolicy", venv, device="cpu", n_steps=64, batch_size=64)
+        model.learn(256)
+        venv.training = False
+        env = Filtered()
+        controller = compiled(agent_of(env, model, venv), tmp_path)
+        observation, _ = env.reset(seed=0)
+        controller.begin(goal=env.variables["goal"])
+        for _ in range(100):
+            action, _ = model.predict(venv.normalize_obs(observation), deterministic=True)
+            inputs = controller.step(env.state)
+            observation, *_ = env.step(action)
+            assert inputs == pytest.approx(env.inputs)
         env.close()
         venv.close()
 

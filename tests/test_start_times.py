@@ -1,5 +1,6 @@
 """Start times that differ from episode to episode: pools, environments and declared tasks."""
 
+import csv
 import logging
 import pickle
 from functools import partial
@@ -9,13 +10,15 @@ import gymnasium
 import numpy as np
 import pytest
 import wine_tools
+from test_rollouts import WAYS
 
 import fmugym
-from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUVectorEnv, Uniform
+from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
 from fmugym import pool as pools
 from fmugym.errors import TaskError
 from fmugym.pool import PoolSpec
 from fmugym.pool.spec import START_TIME
+from fmugym.series import RecordSeries
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -183,21 +186,14 @@ class Sun(FMUEnv):
         return self.time % 10 > 9.5
 
     def _reward_policy(self):
-        return self.time + 10 * self.out["x"] + self.variables["target"]
+        return self.time + 10 * self.state[0] + self.variables["target"]
 
     def _get_observation(self):
         start = self.parameters["start_time"]
-        return np.array([self.time, self.out["now"], self.variables["early"], start])
+        return np.array([self.time, self.state[1], self.variables["early"], start])
 
 
 ACTION = np.zeros(1, np.float32)
-WAYS = {
-    "compiled": {"hooks": "compiled"},
-    "array": {"hooks": "array"},
-    "per_env": {"hooks": "per_env"},
-    "python": {"backend": "python"},
-    "process": {"isolation": "process"},
-}
 all_ways = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 
@@ -360,6 +356,23 @@ def test_an_episode_may_get_another_one(sun):
         env.close()
 
 
+@pytest.mark.parametrize("kind", ["python", "native", "process"])
+def test_all_parts_of_a_system_begin_at_the_same_time(sun, kind):
+    parts = {"a": sun(), "b": sun("ModelExchange", 3)}
+    system = FMUSystem(parts, ["a.sine -> b.u"], step_size=STEP)
+    own = {"model_output_names": ["b.x", "a.now", "b.now"], "model_parameters": {}}
+    way = {"isolation": "process"} if kind == "process" else {"backend": kind}
+    env = Sun(system, **own, **way, start_time=[0.0, 7.5, 100.25])
+    seen = set()
+    for seed in range(20):
+        start = env.reset(seed=seed)[1]["drawn"]["start_time"]
+        env.step(ACTION)
+        assert env.time == env.out["a.now"] == env.out["b.now"] == start + STEP
+        seen.add(start)
+    assert seen == {0.0, 7.5, 100.25}
+    env.close()
+
+
 def test_it_survives_the_trial(sun, monkeypatch):
     monkeypatch.delenv("FMUGYM_PROBE")
     env = Sun(sun("ModelExchange"))
@@ -473,6 +486,23 @@ def test_scenarios_of_a_task_with_a_clock_move_only_the_clock(task):
     observation, _ = env.reset(seed=0)
     assert (observation[0], env.time) == (5, 3 * DAY)
     env.close()
+
+
+def test_recorded_times_are_those_of_the_fmu(task, tmp_path):
+    task = task | {"start_time": ["01-03", "01-09"], "warm_up": {"period": "1d", "controller": 0}}
+    env = RecordSeries(fmugym.load(task), path=tmp_path / "run.csv")
+    times = []
+    for _ in range(4):
+        env.reset(seed=0 if not times else None)
+        times.append(env.unwrapped.time)
+        for _ in range(2):
+            env.step(np.zeros(1, np.float32))
+            times.append(env.unwrapped.time)
+    env.close()
+    with open(tmp_path / "run.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["time [s]"]) for row in rows] == times
+    assert len(set(times)) == 6
 
 
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])

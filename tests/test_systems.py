@@ -4,7 +4,9 @@ import logging
 import pickle
 from dataclasses import replace
 
+import container_tools
 import exchange_tools
+import fmpy
 import fmu_tools
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import system_tools
 from system_tools import linear, linear_fmu, masses, system, tank
 
 import fmugym
-from fmugym import FMULoadError, SimulationError, bundled_fmu
+from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.bundle import SaveMethod
@@ -236,6 +238,17 @@ class TestLoops:
         assert np.allclose(rows[:, 0], expected, rtol=1e-9, atol=1e-12)
         assert np.allclose(rows[:, 1], -0.6 * expected, rtol=1e-9, atol=1e-12)
 
+    def test_of_components_that_cannot_repeat_a_step_are_refused(self, fmus):
+        for version, what in ((1, "saved"), (3, None)):
+            plan = loop_of_gains(fmus | {2: fmus[version]}, Loop())
+            if what is None:
+                SystemFMU(plan)
+                continue
+            with pytest.raises(ConfigError, match=rf"'a'.*'b'.*{what}.*component 'a'"):
+                SystemFMU(plan)
+            with pytest.raises(ConfigError, match=r"component 'a'.*FMI 1\.0"):
+                SystemFMU(replace(plan, master="jacobi"))
+
     @in_each_engine
     def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus, native):
         for method, status in (("newton", Status.OK), ("fixed_point", Status.DISCARD)):
@@ -269,6 +282,52 @@ class TestLoops:
         rows = play(make(plan, (), outputs, native, time_step=0.05), 20)
         assert np.allclose(rows[1:, :2], rows[1:, 2:4], rtol=0, atol=1e-11)
         assert np.allclose(rows[1:, 4], rows[1:, 5], rtol=0, atol=1e-11)
+
+
+@by_each_master
+def test_the_pendulum_in_two_parts_comes_near_the_whole(make, fmus, master):
+    """A damper of its own turns the pendulum without friction into the one with friction."""
+    path, damping, errors = bundled_fmu("Pendulum"), 0.004, []
+    starts = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0))
+    for count in (100, 200, 400):
+        whole = Component("pendulum", path, starts=(*starts, ("b", damping)))
+        free = Component("pendulum", path, starts=(*starts, ("b", 0.0)))
+        damper = linear("damper", fmus[2], d=[[-damping, 0], [0, 0]])
+        links = (
+            Link("pendulum", "theta_dot", "damper", "u1"),
+            Link("damper", "y1", "pendulum", "tau"),
+        )
+        rows = [
+            play(make(plan, (), ["pendulum.theta_dot"], time_step=1.0 / count), count)
+            for plan in (system([whole], ()), system([free, damper], links, master=master))
+        ]
+        errors.append(np.abs(rows[0] - rows[1]).max())
+    assert np.abs(rows[0]).max() > 1.0
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.05)
+
+
+@in_each_engine
+def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, native, tmp_path):
+    links = (("a", "theta_dot", "b", "tau"), ("b", "theta", "c", "tau"))
+    starts = {"a": 0.3, "b": 0.6, "c": 0.9}
+    path = bundled_fmu("Pendulum", "3.0")
+    names = [(name, variable) for variable in ("theta", "q_0") for name in starts]
+    file = container_tools.container(tmp_path, path, list(starts), links, names, 0.02)
+    found = fmpy.simulate_fmu(
+        str(file),
+        stop_time=1.0,
+        step_size=0.02,
+        output_interval=0.02,
+        start_values={f"{name}.q_0": value for name, value in starts.items()},
+        output=[f"{name}.theta" for name in starts],
+        validate=False,
+    )
+    components = [Component(n, path, starts=(("q_0", q),)) for n, q in starts.items()]
+    plan = system(components, [Link(*link) for link in links], master="jacobi")
+    rows = play(make(plan, (), [f"{n}.theta" for n in starts], native, time_step=0.02), 50)
+    expected = np.array([found[f"{name}.theta"] for name in starts]).T
+    assert np.allclose(rows, expected, rtol=0, atol=1e-9)
 
 
 # Names, values and faults

@@ -8,7 +8,7 @@ import pytest
 from fmugym import Component, Connection, FMUSystem, bundled_fmu
 from fmugym.archive.structure import Feedthrough
 from fmugym.archive.units import conversion_of_link
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, FMULoadError
 from fmugym.systems.order import order_of, strong_components
 from fmugym.systems.plan import Link, Loop
 
@@ -145,6 +145,10 @@ class TestComponents:
     def test_names_that_make_no_file_or_variable_are_refused(self, name):
         with pytest.raises(ConfigError, match="named"):
             FMUSystem({name: HOUSE})
+
+    def test_an_fmu_that_does_not_exist_is_that_of_a_component(self, tmp_path):
+        with pytest.raises(FMULoadError, match=r"'h'.*none\.fmu"):
+            FMUSystem({"h": tmp_path / "none.fmu"})
 
     def test_the_smallest_step_of_a_component_is_the_default(self):
         system = FMUSystem({"h": HOUSE, "p": Component(PENDULUM, steps=10)})

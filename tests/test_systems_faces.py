@@ -8,7 +8,9 @@ import pytest
 
 import fmugym
 from fmugym import Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
+from fmugym.identification import Trajectory, fit_parameters
 from fmugym.systems.placing import layout_of
+from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
 
 HOUSE = bundled_fmu("House")
@@ -172,6 +174,62 @@ class TestEnvironments:
         env = pickle.loads(pickle.dumps(TwoHouses(two_houses())))
         assert np.array_equal(played(env), played(TwoHouses(two_houses())))
 
+    def test_the_checks_of_any_environment(self):
+        check_fmu_env(TwoHouses(two_houses()))
+
+    def test_a_snapshot_returns_all_components(self):
+        env = TwoHouses(two_houses())
+        env.reset(seed=0)
+        actions = [np.array([step % 2, 4.0 - step]) for step in range(8)]
+        for action in actions[:3]:
+            env.step(action)
+        snapshot = env.save_state()
+        first = [env.step(action)[0].tolist() for action in actions]
+        env.restore_state(snapshot)
+        assert [env.step(action)[0].tolist() for action in actions] == first
+        other = TwoHouses(two_houses())
+        other.reset(seed=9)
+        other.restore_state(snapshot)
+        assert [other.step(action)[0].tolist() for action in actions] == first
+
+    def test_rollouts_from_a_snapshot_are_what_steps_give(self):
+        env, planner = TwoHouses(two_houses()), FMUVectorEnv(lambda: TwoHouses(two_houses()), 3)
+        planner.reset(seed=1)
+        env.reset(seed=0)
+        env.step(np.array([1.0, 0.0]))
+        snapshot = env.save_state()
+        actions = np.random.default_rng(0).uniform([0, -5], [1, 10], (3, 5, 2)).astype(np.float32)
+        found = planner.rollout(snapshot, actions)
+        for candidate in range(3):
+            env.restore_state(snapshot)
+            seen = [env.step(action)[0] for action in actions[candidate]]
+            assert np.array_equal(found.observations[candidate], seen)
+        planner.close()
+
+    def test_parameters_of_a_component_are_identified(self):
+        """The data are of a house of 140 m2; the default is 150."""
+        env = TwoHouses(two_houses())
+        env.reset(seed=0, options={"model_parameters": {"east.A_f": 140.0}})
+        inputs = np.array([[step % 4 / 3, 3.0 + step % 3] for step in range(19)], np.float32)
+        states = [env.state] + [(env.step(action), env.state)[1] for action in inputs]
+        inputs = np.vstack([inputs, inputs[-1:]]).astype(float)
+        trajectory = Trajectory(
+            np.arange(20) * 900.0,
+            {"east.T_air": np.array(states)[:, 0]},
+            {"east.u": inputs[:, 0], "outside": inputs[:, 1]},
+        )
+        fit = fit_parameters(
+            two_houses(),
+            {"east.A_f": (150.0, 100.0, 200.0)},
+            [trajectory],
+            fit_initial_states=False,
+        )
+        assert fit.values["east.A_f"] == pytest.approx(140.0, rel=1e-3)
+
+    def test_a_system_has_no_derivatives(self):
+        with pytest.raises(ConfigError, match="two houses"):
+            fmugym.linearize(two_houses())
+
     def test_what_drives_a_name_is_the_only_one(self):
         """An input behind a name of the system is set by that name alone."""
         with pytest.raises(ConfigError, match=r"east\.T_out.*local"):
@@ -281,6 +339,14 @@ class TestCommandLine:
             {"components": ["west"], "is_loop": False},
         ]
 
+    def test_info_of_a_task_with_an_fmu_is_that_of_the_fmu(self, tmp_path, capsys):
+        path = tmp_path / "task.toml"
+        path.write_text('fmu = { bundled = "House" }\n')
+        assert main(["info", str(path)]) == 0
+        found = capsys.readouterr().out
+        assert main(["info", str(HOUSE)]) == 0
+        assert found == capsys.readouterr().out
+
     def test_the_plot_is_for_systems(self, tmp_path, capsys):
         assert main(["info", str(HOUSE), "--plot", str(tmp_path / "x.svg")]) == 1
         assert "--plot" in capsys.readouterr().err
@@ -289,13 +355,19 @@ class TestCommandLine:
     def test_from_an_archive_to_a_task_and_an_episode(self, archive, tmp_path, capsys):
         path = tmp_path / "new.toml"
         assert main(["new", str(archive), "--output", str(path)]) == 0
-        assert main(["validate", str(path)]) == 0
         run = ["simulate", str(path), "--steps", "3", "--output", str(tmp_path / "run.csv")]
         assert main(run) == 0
         header = (tmp_path / "run.csv").read_text().splitlines()[0]
         assert "west_E" in header
+        program = tmp_path / "houses.py"
+        assert main(["new", "--class", str(archive), "--output", str(program)]) == 0
+        assert "(fmugym.FMUEnv)" in program.read_text()
         assert main(["bench", str(archive), "--envs", "2", "--seconds", "0.1"]) == 0
         capsys.readouterr()
+
+    def test_validation_of_an_archive(self, archive, capsys):
+        assert main(["validate", str(archive)]) == 0
+        assert "repetition" in capsys.readouterr().out
 
     def test_an_archive_that_is_none(self, tmp_path, capsys):
         (tmp_path / "x.ssp").write_text("x")

@@ -1,6 +1,8 @@
 """Values of every type, and arrays, in all pools: against closed forms and FMPy."""
 
 import fmpy
+import makers
+import model_tools
 import numpy as np
 import pytest
 import values_tools
@@ -11,6 +13,7 @@ import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
 from fmugym.series import RecordSeries
 from fmugym.testing import check_fmu_env
+from fmugym.tools import cli
 
 STEP = 0.1
 POOLS = {
@@ -419,6 +422,99 @@ def test_a_task_file_names_elements(state_space, tmp_path):
     env.close()
 
 
+def test_a_task_file_gives_sizes(sized, tmp_path):
+    task = {
+        "fmu": str(sized),
+        "time_step": 0.1,
+        "agent": {"actions": ["u[1]", "u[2]"], "observations": ["y[1]", "x[3]"]},
+        "reward": {"near": "-1.0"},
+        "parameters": dict(LARGER),
+    }
+    env = fmugym.load(task)
+    env.reset(seed=0)
+    env.step(np.array([0.5, -0.25], np.float32))
+    wanted = larger(1, np.array([0.5, -0.25]))
+    assert [env.out["y[1]"], env.out["x[3]"]] == pytest.approx([wanted[0], wanted[3]], abs=1e-7)
+    env.close()
+    task["parameters"]["A"] = [[1, 2]]
+    with pytest.raises(ConfigError, match=r"'A'.*\(3, 3\)"):
+        fmugym.load(task)
+
+
+@pytest.mark.parametrize("words", [(), ("--class",)], ids=["task", "class"])
+def test_fmugym_new_knows_elements(state_space, tmp_path, words):
+    path = tmp_path / ("new.py" if words else "new.toml")
+    assert cli.main(["new", str(state_space), "--output", str(path), *words]) == 0
+    text = path.read_text()
+    for name in ("u[1]", "y[1]", "y[2]", "y[3]", "x[1]", "x[2]"):
+        assert f'"{name}"' in text
+    assert "[[-1.0, 0.5], [0.0, -2.0]]" in text
+    if not words:
+        env = fmugym.load(path)
+        env.reset()
+        env.step(env.action_space.sample())
+        env.close()
+
+
+# Strings and Binary
+
+
+@versions
+@pools
+def test_strings_are_set(feedthrough, version, options):
+    env = Writing(
+        feedthrough[version],
+        [],
+        model_input_names=[],
+        model_output_names="length",
+        model_parameters={"String_parameter": "bluish", "String_in": "green"},
+        **options,
+    )
+    for _ in range(3):
+        env.reset()
+        env.step(0)
+        assert env.state == (len("bluish"),)
+    env.close()
+
+
+@versions
+@pools
+def test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, options):
+    path = model_tools.model_fmu(
+        tmp_path / "Resource.fmu",
+        "resource",
+        version,
+        "{resource}",
+        [("y", "output", "")],
+        add={"resources/y.txt": "42.5"},
+    )
+
+    def make():
+        return Writing(path, [], model_input_names=[], model_output_names="y", **options)
+
+    envs, env = FMUVectorEnv(make, 2), make()
+    assert env.reset()[0].tolist() == [42.5]
+    assert envs.reset()[0].tolist() == [[42.5]] * 2
+    env.close()
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({"model_input_names": "String_in"}, r"'String_in'.*input.*String.*model_parameters"),
+        ({"model_output_names": "String_out"}, r"'String_out'.*output.*String.*number"),
+        ({"model_parameters": {"String_parameter": 3}}, r"'String_parameter'.*String.*3"),
+        ({"model_input_names": "Binary_in"}, r"'Binary_in'.*input.*Binary.*numbers"),
+        ({"model_parameters": {"Binary_in": "00"}}, r"'Binary_in'"),
+    ],
+)
+def test_refused_types(feedthrough, changes, facts):
+    config = {"model_input_names": "v", "model_output_names": "w", "bounds": {"v": (0, 1)}}
+    with pytest.raises(ConfigError, match=facts):
+        Env(feedthrough[3], **(config | changes))
+
+
 def test_the_contract(state_space):
     env = state_space_env(state_space, model_parameters={"A": [[-1, 0.5], [0, -2]]})
     check_fmu_env(env, num_steps=20)
@@ -517,9 +613,49 @@ def test_sizes_cannot_change_from_episode_to_episode(sized):
     env.close()
 
 
+def test_systems_have_no_arrays(sized):
+    with pytest.raises(ConfigError, match=r"'n': 3.*arrays"):
+        fmugym.FMUSystem({"part": fmugym.FMU(sized, sizes={"n": 3})}, [])
+    with pytest.raises(ConfigError, match=r"x\[1\]"):
+        fmugym.FMUSystem({"part": sized}, [("part.x[1]", "part.u[1]")])
+
+
 def test_a_parameter_that_gives_no_size(sized):
     with pytest.raises(ConfigError, match=r"'x_0'.*parameter"):
         fmugym.FMU(sized, sizes={"x_0": 3})
+
+
+# Other makers
+
+
+@pools
+def test_arrays_of_pythonfmu3(mixer, options):
+    gain = np.array([[1, 2, 3], [4, 5, 6]])
+    u = np.array([1, 0.5, -0.5], np.float32)
+
+    def make():
+        return Env(
+            mixer,
+            model_input_names="u",
+            model_output_names="y",
+            model_parameters={"gain": gain},
+            bounds={"u": (-1, 1)},
+            **options,
+        )
+
+    env = make()
+    for _ in range(2):
+        env.reset()
+        for steps in (1, 2, 3):
+            env.step(u)
+            assert env.out["y"] == pytest.approx(gain @ u * STEP * steps, abs=1e-12)
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def mixer(tmp_path_factory):
+    build = makers.by_python("pythonfmu3", "foreign_mixer3.py")
+    return build(tmp_path_factory.mktemp("mixer"))
 
 
 # Mistakes

@@ -46,6 +46,7 @@ SLOW_MODULES = {
     "test_systems",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_parts",
     "test_systems_ssp",
     "test_without_native",
 }
@@ -204,6 +205,7 @@ EXHAUSTIVE_TESTS = (
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
     "test_examples_system.py",
+    "test_systems_faces.py::TestCommandLine::test_validation",
     "test_systems_ssp.py::TestDamaged",
     "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",

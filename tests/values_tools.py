@@ -121,6 +121,7 @@ def _describe_feedthrough(version):
         name = f"Enumeration_{_NAMES[place]}"
         reference = integer + 4 + 2 * place
         variables += _variable(version, name, "Enumeration", reference, _CAUSALITIES[place])
+    variables += _variable(version, "length", TYPES[version][0], 301, "output")
     if version == 3:
         inside = '<Dimension start="2"/><Dimension start="2"/>'
         variables += (

@@ -120,8 +120,11 @@ class Variable:
 
     @property
     def numeric(self) -> bool:
-        """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration."""
-        return self.is_number and not self.shape
+        """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration.
+
+        A clock has no value between its ticks.
+        """
+        return self.is_number and not self.shape and not self.ticking
 
     @property
     def is_number(self) -> bool:
@@ -161,8 +164,6 @@ class Variable:
         Raises:
             ConfigError: If it is not a finite number.
         """
-        if self.array is not None:
-            return self.array.start_numbers[self.place]
         return _number(self.name, "0" if self.start is None else self.start)
 
     @cached_property
@@ -172,17 +173,9 @@ class Variable:
         A single start value is that of all elements; without any they are 0.
 
         Raises:
-            ConfigError: If their number is neither, or one is not a finite number.
+            ConfigError: If there is another number of them, or one is not a finite number.
         """
-        texts = (self.start or "0").split()
-        if len(texts) == 1:
-            texts *= self.size
-        if len(texts) != self.size:
-            raise ConfigError(
-                f"{self.name!r} is an array of {self.size} elements and has {len(texts)} start "
-                "values in the FMU"
-            )
-        return tuple(_number(self.name, text) for text in texts)
+        return tuple(element.start_number for element in self.elements)
 
     @property
     def size(self) -> int:
@@ -205,10 +198,25 @@ class Variable:
                 f"{self.name!r} is an array of {self.size} elements, at most {MOST_ELEMENTS} can "
                 "be used"
             )
+        places = list(product(*map(range, self.shape)))
+        starts = self._starts_of(len(places))
         return tuple(
-            replace(self, name=f"{self.name}[{_index(place)}]", shape=(), array=self, place=number)
-            for number, place in enumerate(product(*map(range, self.shape)))
+            replace(
+                self,
+                name=f"{self.name}[{_index(place)}]",
+                shape=(),
+                dimensions=(),
+                array=self,
+                place=number,
+                start=starts[number],
+            )
+            for number, place in enumerate(places)
         )
+
+    def _starts_of(self, count: int) -> list[str | None]:
+        """The start value of each element; all of them where their number is wrong."""
+        texts = (self.start or "").split()
+        return [*texts] if len(texts) == count else [self.start] * count
 
     def resized(self, sizes: Mapping[str, int]) -> Variable:
         """The same variable with these values of structural parameters.
@@ -230,6 +238,11 @@ class Variable:
             return 0, 2 ** int(self.type[4:]) - 1
         bits = _INTEGER_BITS[self.type]
         return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+def _whole(value: Any) -> int | None:
+    """Return a number as an int if it is whole, also if it is a float, as those of files are."""
+    return int(value) if isinstance(value, float) and value.is_integer() else integer_of(value)
 
 
 def _number(name: str, text: str) -> float:
@@ -462,7 +475,7 @@ class ModelDescription:
         )
 
     def _checked_size(self, name: str, size: Any) -> int:
-        variable, number = self.variable(name), integer_of(size)
+        variable, number = self.variable(name), _whole(size)
         if variable.causality != "structuralParameter" or variable.type != "UInt64":
             raise ConfigError(
                 f"{name!r} is no structural parameter of type UInt64: it is a "

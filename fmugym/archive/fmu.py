@@ -15,7 +15,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Final, Protocol, runtime_checkable
 
 import fmpy
 
@@ -33,7 +34,7 @@ from fmugym.checks import check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
-__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU"]
+__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "ExtractedFMU", "LoadableFMU", "StandsForFMU"]
 
 logger = logging.getLogger(__name__)
 
@@ -136,6 +137,14 @@ class LoadableFMU(ABC):
         return library
 
 
+@runtime_checkable
+class StandsForFMU(Protocol):
+    """What can be opened like an FMU, such as a system of FMUs."""
+
+    def as_fmu(self) -> FMU:
+        """Open it, with a temporary folder of its own."""
+
+
 class ExtractedFMU(LoadableFMU):
     """An FMU in a folder that somebody else owns, and that stays when this object is closed.
 
@@ -188,6 +197,8 @@ class FMU(LoadableFMU):
         FMULoadError: If the file is missing, not a sound FMU archive, or lacks the interface.
     """
 
+    sizes: Mapping[str, int] = MappingProxyType({})
+
     def __init__(
         self,
         path: str | os.PathLike[str],
@@ -210,8 +221,8 @@ class FMU(LoadableFMU):
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
         description = read_model_description(self._archive, self.limits, interface)
-        self.sizes = {} if sizes is None else check_mapping("sizes", sizes)
-        if self.sizes:
+        if sizes:
+            self.sizes = check_mapping("sizes", sizes)
             description = description.resized(self.sizes)
         super().__init__(file, description, libraries)
         self._library_place, note = self._choose_library()
@@ -241,8 +252,10 @@ class FMU(LoadableFMU):
             )
 
     @classmethod
-    def of(cls, source: FMU | str | os.PathLike[str]) -> FMU:
+    def of(cls, source: FMU | StandsForFMU | str | os.PathLike[str]) -> FMU:
         """Open an FMU by its path, or open a second one with the arguments of the first."""
+        if isinstance(source, StandsForFMU):
+            return source.as_fmu()
         return source.again() if isinstance(source, FMU) else cls(source)
 
     def again(self) -> FMU:

@@ -17,7 +17,7 @@ from fmugym.declared.quantities import duration
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, shown, unknown_name
 from fmugym.systems import Component, Connection, FMUSystem
-from fmugym.systems.fmu import SystemFMU
+from fmugym.task.interface import structural_values
 
 __all__ = ["describe", "fmu_of", "system_of"]
 
@@ -150,13 +150,22 @@ def describe(task: Task, source: Path | FMUSystem) -> ModelDescription:
         FMULoadError: If it cannot be read.
     """
     if isinstance(source, FMUSystem):
-        return SystemFMU(source.plan).description
+        return source.as_fmu().description
     entry = task.root.child("fmu")
     status = _status(entry, source)
     try:
-        return _read_description(source, status.st_mtime_ns, status.st_size)
+        description = _read_description(source, status.st_mtime_ns, status.st_size)
     except FMULoadError as error:
         raise type(error)(str(entry.error(error))) from error
+    return _resized(description, task.root.child("parameters"))
+
+
+def _resized(description: ModelDescription, parameters: Entry) -> ModelDescription:
+    """Give arrays the sizes that the task gives to structural parameters."""
+    given = parameters.value if isinstance(parameters.value, dict) else {}
+    with parameters.placing():
+        sizes = structural_values(description, given)
+        return description.resized(sizes) if sizes else description
 
 
 def _status(entry: Entry, path: Path) -> Any:
@@ -172,5 +181,5 @@ def _status(entry: Entry, path: Path) -> Any:
 @lru_cache(maxsize=16)
 def _read_description(path: Path, changed: int, size: int) -> ModelDescription:
     if path.suffix.lower() == ".ssp":
-        return SystemFMU(FMUSystem.read(path).plan).description
+        return FMUSystem.read(path).as_fmu().description
     return FMU(path).description

@@ -17,7 +17,7 @@ from fmugym.declared.values import number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import SAMPLINGS
-from fmugym.task.interface import checked, input_variable, output_variable
+from fmugym.task.interface import checked, input_variable, output_variable, spread
 
 __all__ = [
     "VARIABLE_KEYS",
@@ -324,6 +324,8 @@ def start_value(record: Record, entry: Entry) -> Any:
     name, variable = record.fmu_name, record.variable
     if variable is None or not variable.settable_at_start:
         raise entry.error(f"{name!r} cannot be set at the start of an episode")
+    if variable.shape:
+        return _array_start(variable, entry)
     if isinstance(entry.value, str) and (variable.items or variable.kind == "string"):
         value: Any = entry.value
     else:
@@ -331,6 +333,15 @@ def start_value(record: Record, entry: Entry) -> Any:
     with entry.placing():
         value = _in_unit_of_fmu(record.conversion, value)
         return value if variable.kind == "string" else checked(variable, value)
+
+
+def _array_start(variable: Variable, entry: Entry) -> Any:
+    """The value of an array: nested lists, or one value for all elements, in the FMU's unit."""
+    with entry.placing():
+        parts = spread(variable.name, variable.elements, entry.value)
+        for element, part in zip(variable.elements, parts, strict=True):
+            checked(element, part)
+    return entry.value
 
 
 def _in_unit_of_fmu(conversion: Conversion, value: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 from fmugym.archive.description import Unit
 from fmugym.checks import check_text
@@ -17,6 +17,15 @@ from fmugym.export.network import Network
 from fmugym.export.policies import network_of_model
 
 __all__ = ["Agent", "agent_of"]
+
+
+_TAKEN: Final = frozenset(
+    {"math", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string"}
+    | {"fmi2", "fmi3", "fmu_instance", "fmu_model"}
+    | {f"fmi{n}{part}" for n in (2, 3) for part in ("Functions", "FunctionTypes", "TypesPlatform")}
+    | {"fmi3PlatformTypes"}
+)
+"""The headers and sources that stand beside those of an agent."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +91,8 @@ def agent_of(
     """
     if not check_text("name", name).isidentifier() or not name.isascii():
         raise ConfigError(f"the name must have letters, digits and _ only, got {shown(name)}")
+    if name in _TAKEN:
+        raise ConfigError(f"the name {name!r} is that of a file of C; choose another one")
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     with without_imperfections(env) as ideal:
         logic = logic_of(ideal, all_inputs=all_inputs, external=external)

@@ -22,53 +22,58 @@ __all__ = ["field_names", "header", "source"]
 _LONGEST_INLINE: Final = 56
 
 
+_HEADER: Final = """{comment}
+#ifndef {upper}_H
+#define {upper}_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+/* Seconds from one sample to the next. */
+#define {upper}_SAMPLE_TIME {time_step}
+
+/* The places of the measurements. */
+{measurements}
+
+/* The places of the actions. */
+{actions}
+
+/* What the agent keeps from one sample to the next. */
+typedef struct {{
+    int64_t count; /* of the samples until now */
+{fields}}} {name}_state;
+
+/* Begin an episode. */
+void {name}_init({name}_state *state);
+
+/* Take a sample: from the measurements to the actions.
+ *
+ * Returns 0. If a measurement is not finite, or a value is looked up outside of its
+ * table, it returns 1, and changes neither the state nor the actions. */
+int {name}_step({name}_state *state, const double *measurements, double *actions);
+
+#ifdef __cplusplus
+}}
+#endif
+
+#endif
+"""
+
+
 def header(agent: Agent) -> str:
     """The header of an agent."""
-    name, upper = agent.name, agent.name.upper()
-    logic = agent.logic
-    return "\n".join(
-        [
-            *_comment(agent),
-            f"#ifndef {upper}_H",
-            f"#define {upper}_H",
-            "",
-            "#include <stdint.h>",
-            "",
-            "#ifdef __cplusplus",
-            'extern "C" {',
-            "#endif",
-            "",
-            "/* Seconds from one sample to the next. */",
-            f"#define {upper}_SAMPLE_TIME {constant(logic.time_step, 'd')}",
-            "",
-            "/* The places of the measurements. */",
-            *_enumeration(f"{upper}_MEASUREMENT", logic.measurements),
-            "",
-            "/* The places of the actions. */",
-            *_enumeration(f"{upper}_ACTION", logic.inputs),
-            "",
-            "/* What the agent keeps from one sample to the next. */",
-            "typedef struct {",
-            "    int64_t count; /* of the samples until now */",
-            *_fields(agent),
-            f"}} {name}_state;",
-            "",
-            "/* Begin an episode. */",
-            f"void {name}_init({name}_state *state);",
-            "",
-            "/* Take a sample: from the measurements to the actions.",
-            " *",
-            " * Returns 0. If a measurement is not finite, or a value is looked up outside of its",
-            " * table, it returns 1, and changes neither the state nor the actions. */",
-            f"int {name}_step({name}_state *state, const double *measurements, double *actions);",
-            "",
-            "#ifdef __cplusplus",
-            "}",
-            "#endif",
-            "",
-            "#endif",
-            "",
-        ]
+    name, upper, logic = agent.name, agent.name.upper(), agent.logic
+    return _HEADER.format(
+        comment="\n".join(_comment(agent)),
+        name=name,
+        upper=upper,
+        time_step=constant(logic.time_step, "d"),
+        measurements="\n".join(_enumeration(f"{upper}_MEASUREMENT", logic.measurements)),
+        actions="\n".join(_enumeration(f"{upper}_ACTION", logic.inputs)),
+        fields="".join(f"{line}\n" for line in _fields(agent)),
     )
 
 
@@ -94,7 +99,8 @@ def _unit(variable: Variable) -> str:
 
 def field_names(agent: Agent) -> list[str]:
     """The names of the fields of the state after ``count``."""
-    return identifiers(kept.name for kept in agent.logic.kept)
+    taken = ["measurements", "actions"]  # of ONNX models
+    return identifiers([*taken, *(kept.name for kept in agent.logic.kept)])[len(taken) :]
 
 
 def _fields(agent: Agent) -> Iterator[str]:
@@ -172,7 +178,8 @@ class _Source:
                 yield from self._checked_place(node)
             text = self._expression(number, node)
             is_short = len(text) <= _LONGEST_INLINE and self._uses[number] < 2
-            if is_short or (number in self._logic.loads and "state->" not in text):
+            is_load = number in self._logic.loads
+            if (is_short or is_load) and "state->" not in text:  # the end of a step changes that
                 self._texts[number] = text
                 continue
             self._texts[number] = f"t{number}"

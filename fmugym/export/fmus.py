@@ -83,11 +83,11 @@ def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
     ports = ports_of(agent, fmi_version)
     texts = {f"{agent.name}.h": header(agent), f"{agent.name}.c": source(agent)}
     own = resources.files("fmugym.export") / "sources"
-    for name in ("controller.h", f"fmi{fmi_version[0]}.c"):
+    for name in ("fmu_instance.h", f"fmi{fmi_version[0]}.c"):
         texts[name] = (own / name).read_text(encoding="ascii")
     told = "\0".join([*texts.values(), *map(repr, ports)])
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, told)}}}"
-    texts["model.h"] = "\n".join(_model(agent, ports, token))
+    texts["fmu_model.h"] = "\n".join(_model(agent, ports, token))
     if fmi_version == "3.0":
         texts["buildDescription.xml"] = _build_description(agent)
     for name, text in texts.items():

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive.fmu import FMU
+from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError, shown
@@ -136,7 +136,7 @@ def _simulate(
 
 
 def fit_parameters(
-    fmu: FMU | str | os.PathLike[str],
+    fmu: FMU | StandsForFMU | str | os.PathLike[str],
     parameters: Mapping[str, Limits],
     trajectories: Sequence[Trajectory],
     *,
@@ -157,8 +157,8 @@ def fit_parameters(
     Jacobian run at once, each in its own instance of one pool.
 
     Args:
-        fmu: The path of the FMU, or an ``FMU`` with its own ``limits``, ``preload`` and
-            ``probe_timeout``.
+        fmu: The path of the FMU, an ``FMUSystem``, or an ``FMU`` with its own ``limits``,
+            ``preload`` and ``probe_timeout``.
         parameters: The variables to fit by name, each with a start value, with bounds
             ``(low, high)``, or with ``(start, low, high)``. Missing bounds are the variable's min
             and max. A missing start is the variable's start value, or the middle of the bounds.
@@ -210,7 +210,7 @@ def fit_parameters(
 
 
 def _opened(fmu: Any) -> FMU:
-    if not isinstance(fmu, FMU):
+    if not isinstance(fmu, FMU | StandsForFMU):
         try:
             fmu = check_text("fmu", os.fspath(fmu))
         except Exception:  # a path may be any object

@@ -225,8 +225,9 @@ class Rows:
     ) -> Block:
         is_due = mask[self._indices]
         which = self._indices[is_due]
-        spec = self._episodes.prototype._spec
-        passed: Any = (spec.warm_up_steps + self._steps[which]) * spec.substeps
+        env = self._episodes.prototype
+        spec = env._spec
+        passed: Any = (env._warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
             *([which] if self._is_vector else []),
             *(self._number[which], self._steps[which]),

@@ -19,7 +19,7 @@ from fmugym.checks import (
     check_option,
     check_path,
 )
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, FMULoadError, shown, unknown_name
 from fmugym.systems import plan
 
 __all__ = ["Component", "OpenComponent", "start_number"]
@@ -89,7 +89,10 @@ class OpenComponent:
         if not name or not name.isprintable() or _NO_NAME & set(name) or name != name.strip():
             raise ConfigError(f"a component cannot be named {shown(name)}")
         self.name, self.given = name, given
-        self.fmu = _opened(given)
+        try:
+            self.fmu = _opened(given)
+        except FMULoadError as error:
+            raise type(error)(f"component {name!r}: {error}") from None
         self.starts = tuple(map(self._start, given.start_values.items()))
 
     def _start(self, item: tuple[str, Any]) -> tuple[str, float | str]:
@@ -167,6 +170,11 @@ def _opened(given: Component) -> FMU:
     if not isinstance(given.fmu, FMU):
         path = check_path("the path of an FMU", given.fmu)
         return FMU(path, interface=given.interface)
+    if given.fmu.sizes:
+        name, sizes = given.fmu.path.name, shown(dict(given.fmu.sizes))
+        raise ConfigError(
+            f"{name} cannot be a component with sizes = {sizes}: systems have no arrays"
+        )
     if given.interface in (None, given.fmu.description.interface):
         return given.fmu
     source = given.fmu

@@ -73,7 +73,7 @@ class SystemFMU(FMU):
             raise ConfigError(f"the system {plan.name!r} has no components")
         self._opened = tuple(map(_open, plan.components))
         description = describe_system(plan, [fmu.description for fmu in self._opened])
-        Layout(description)  # refuses names that are unknown
+        _require_solvable(Layout(description))
         path = Path(plan.name) if plan.file is None else plan.file
         LoadableFMU.__init__(self, path, description, ())
         self.limits, self.interface = ArchiveLimits(), None
@@ -145,6 +145,32 @@ class SystemFMU(FMU):
             raise
         self._folder = folder
         return folder
+
+
+def _require_solvable(layout: Layout) -> None:
+    """Refuse loops that no master could solve.
+
+    Raises:
+        ConfigError: If a component of a loop cannot repeat a step, or has no Initialization Mode.
+    """
+    repeated = [group for group in layout.plan.groups if group.loop is not None]
+    for group in repeated if layout.plan.master == "gauss_seidel" else ():
+        numbers = layout.parts_of(group)
+        for part in (layout.parts[i] for i in numbers):
+            if not part.description.capabilities.can_get_and_set_fmu_state:
+                raise ConfigError(
+                    f"{layout.loop_label(numbers)} cannot be solved: its steps are repeated from "
+                    f"saved FMU states, and {part.label} cannot save its own. master='jacobi' "
+                    "needs no repetition"
+                )
+    for evaluation in layout.plan.initialization:
+        numbers = tuple(layout.routes[i].source_part for i in layout.routes_of(evaluation))
+        for part in (layout.parts[i] for i in numbers if evaluation.loop is not None):
+            if not part.has_mode:
+                raise ConfigError(
+                    f"{layout.loop_label(numbers)} cannot be solved at the start: {part.label} is "
+                    "an FMU of FMI 1.0, which has no Initialization Mode"
+                )
 
 
 _WINDOWS_ONLY = (

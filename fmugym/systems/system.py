@@ -6,11 +6,13 @@ import os
 from pathlib import Path
 from typing import Any, Self
 
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import check_path
 from fmugym.errors import FMUGymError
 from fmugym.systems.components import Component
 from fmugym.systems.drawing import draw
+from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.ssp.reading import arguments_of
 from fmugym.systems.ssp.writing import write_ssp
 from fmugym.systems.wired import WiredSystem
@@ -100,6 +102,17 @@ class FMUSystem(WiredSystem):
         file = check_path("the path of a system", path)
         write_ssp(self, file)
         return file
+
+    def as_fmu(self, probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT) -> SystemFMU:
+        """Open the system as an ``FMU``, for functions that take one.
+
+        Args:
+            probe_timeout: See ``FMU``.
+
+        Raises:
+            FMULoadError: If an FMU of a component cannot be read any more.
+        """
+        return SystemFMU(self.plan, probe_timeout=probe_timeout)
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
         """Draw the system: components, connections with their gains, inputs, outputs, loops.

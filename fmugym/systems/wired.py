@@ -121,7 +121,8 @@ class WiredSystem:
             for link in self.order.late
         ]
         untold = [
-            f"{name} does not tell which outputs depend on which inputs at once: all, it is taken"
+            f"{name} does not tell its direct feed-through; each output is taken to depend on all "
+            "inputs"
             for name, one in self.components.items()
             if not one.feedthrough.known
         ]

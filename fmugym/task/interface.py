@@ -237,7 +237,6 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     bounded = inputs + outputs
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
     _check_rest_is_known(inputs)
-    _check_no_arrays_beside_clocks(description, inputs)
     return Interface(
         inputs=inputs,
         outputs=outputs,
@@ -248,19 +247,6 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         description=description,
         limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
     )
-
-
-def _check_no_arrays_beside_clocks(
-    description: ModelDescription, inputs: Sequence[Variable]
-) -> None:
-    """Inputs are set one by one where some of them wait for clocks."""
-    arrays = [variable for variable in inputs if variable.array is not None]
-    if arrays and description.clocked_inputs:
-        raise ConfigError(
-            f"{arrays[0].name!r} cannot be an input: it belongs to an array, and "
-            f"{description.model_name} has inputs with clocks, such as "
-            f"{description.clocked_inputs[0].name!r}"
-        )
 
 
 def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
@@ -434,11 +420,6 @@ def _check_input(description: ModelDescription, variable: Variable) -> None:
             f"{variable.name!r} cannot be an input: it is a {variable.variability} "
             f"{variable.causality}; only inputs and tunable parameters may be set between steps"
         )
-    if variable.array is not None and description.clocks:
-        raise ConfigError(
-            f"{variable.name!r} cannot be an input: it is an element of an array, and inputs of "
-            f"FMUs with clocks must be scalars, as in {description.model_name}"
-        )
 
 
 def output_variable(description: ModelDescription, name: str) -> Variable:
@@ -474,12 +455,26 @@ def _require_known_clock(description: ModelDescription, variable: Variable, role
 
 
 def _require_numeric(variable: Variable, role: str) -> None:
-    if not variable.numeric:
-        what = "an array" if variable.shape else f"of type {variable.type}"
+    if variable.numeric or variable.ticking:
+        return
+    if variable.is_number:
         raise ConfigError(
-            f"{variable.name!r} cannot be {role}: it is {what}; expected a scalar Real, "
-            "Integer, Boolean or Enumeration"
+            f"{variable.name!r} cannot be {role}: it is an array; name its elements, as in "
+            f"'{variable.name}[1]'"
         )
+    element = "" if variable.array is None else "an element of an array "
+    raise ConfigError(
+        f"{variable.name!r} cannot be {role}: it is {element}of type {variable.type}; "
+        f"expected a Real, Integer, Boolean or Enumeration{_CURES.get(variable.type, '')}"
+    )
+
+
+_CURES: Final = {
+    "String": ". A scalar String can be given a text in 'model_parameters'; to read one, let the "
+    "FMU tell the same by a number or an Enumeration",
+    "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
+    "numbers",
+}
 
 
 def start_variable(description: ModelDescription, name: str, value: Any) -> Variable:
@@ -508,7 +503,7 @@ def _check_start(variable: Variable, value: Any) -> None:
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "
             f"with initial={variable.initial!r}"
         )
-    if variable.kind == "string" and not variable.shape:
+    if variable.kind == "string" and not variable.shape and variable.array is None:
         _require_text(name, value)
     else:
         _require_numeric(variable, "given a start value")

@@ -20,7 +20,6 @@ from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.systems import FMUSystem
-from fmugym.systems.fmu import SystemFMU
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.interface import structural_values
 from fmugym.trial.opening import make_pool
@@ -114,7 +113,7 @@ def _open_system(system: FMUSystem, config: EnvConfig) -> FMU:
             raise ConfigError(
                 f"config key {key!r} is for a single FMU; give it to a component of {system.name!r}"
             )
-    return SystemFMU(system.plan, probe_timeout=config.probe_timeout)
+    return system.as_fmu(config.probe_timeout)
 
 
 def _interface_of(cls: type, wanted: str | None, own: str | None) -> str | None:

@@ -47,8 +47,15 @@ class NamedValues(Mapping[str, Any]):
     ) -> None:
         self._kind = kind
         self._index = {name: index for index, name in enumerate(names)}
-        self._arrays = array_places(names)
         self._get_values = get_values
+        self._found_arrays: dict[str, list[int]] | None = None
+
+    @property
+    def _arrays(self) -> dict[str, list[int]]:
+        """The places of the elements of arrays, found when first asked for."""
+        if self._found_arrays is None:
+            self._found_arrays = array_places(self._index)
+        return self._found_arrays
 
     def __getitem__(self, name: str) -> Any:
         try:
@@ -58,20 +65,23 @@ class NamedValues(Mapping[str, Any]):
         return self._get_values()[index]
 
     def _array(self, name: Any) -> Any:
-        places = self._arrays.get(name) if isinstance(name, str) else None
+        places = self._arrays.get(str.__str__(name)) if isinstance(name, str) else None
         if places is None:
-            raise unknown_name(self._kind, name, self._index)
+            raise unknown_name(self._kind, name, self._index) from None
         values = self._get_values()
         return stacked([values[place] for place in places])
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and (name in self._index or name in self._arrays)
+        if not isinstance(name, str):
+            return False
+        plain = str.__str__(name)
+        return plain in self._index or plain in self._arrays
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the value of a name, or the default if the name is unknown."""
         if name not in self:
             return default
-        return self[name]
+        return self[str.__str__(name)]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._index)

@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.bundled import is_bundled
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.env import FMUEnv
@@ -111,7 +110,7 @@ class Replay:
         """
         spec = replace(self.spec, warm_up_steps=0, **changes)
         opening = replace(self.opening, fmu=_untried(self.opening.fmu), spec=spec)
-        isolation = None if is_bundled(opening.fmu.path) else "process"
+        isolation = None if opening.fmu.bundled else "process"
         try:
             pool = opening.open(1, rehearse=False, isolation=isolation)
         except FMUGymError:
@@ -143,8 +142,9 @@ def _untried(fmu: FMU) -> FMU:
 
     So an FMU that is not bundled runs in a worker process, whose end is a failure of the setting.
     """
-    arguments: Any = {"limits": fmu.limits, "preload": fmu.preload, "interface": fmu.interface}
-    return FMU(fmu.path, **arguments, probe_timeout=None)
+    own = fmu.again()
+    own.probe_timeout = None
+    return own
 
 
 def error_of(course: Course | None, reference: Course, steps: int | None = None) -> float:

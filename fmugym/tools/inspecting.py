@@ -9,6 +9,7 @@ from pathlib import Path
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError
+from fmugym.systems import FMUSystem
 from fmugym.tools.compiling import compile_fmu
 from fmugym.tools.options import (
     Commands,
@@ -23,7 +24,7 @@ from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.proposal import Proposal
 from fmugym.tools.skeleton import Skeleton
 from fmugym.tools.stand_in import build_stand_in
-from fmugym.tools.systems import as_text_of_system, open_model, open_system, overview_of_system
+from fmugym.tools.systems import as_text_of_system, find_model, open_model, overview_of_system
 from fmugym.tools.targets import maker_of
 from fmugym.tools.validation import validate
 
@@ -56,18 +57,17 @@ def _add_fmu(command: argparse.ArgumentParser) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    system = open_system(arguments.fmu)
+    model = find_model(arguments.fmu)
     wanted = {"everything": arguments.all, "pattern": arguments.filter}
-    if system is None:
+    if isinstance(model, FMUSystem):
+        facts, as_lines = overview_of_system(model, **wanted), as_text_of_system
         if arguments.plot is not None:
-            raise ConfigError("--plot is for systems; an FMU alone has no connections to draw")
-        facts = overview(FMU(arguments.fmu), **wanted)
+            model.plot(arguments.plot)
+    elif arguments.plot is None:
+        facts, as_lines = overview(model, **wanted), as_text
     else:
-        facts = overview_of_system(system, **wanted)
-        if arguments.plot is not None:
-            system.plot(arguments.plot)
-    text = as_text if system is None else as_text_of_system
-    say(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else text(facts))
+        raise ConfigError("--plot is for systems; an FMU alone has no connections to draw")
+    say(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else as_lines(facts))
 
 
 def add_new(commands: Commands) -> None:

@@ -9,13 +9,16 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Final
+
+import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError
+from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain, start_value
 
 __all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
@@ -25,6 +28,9 @@ MOST_PARAMETERS: Final = 40
 
 DEFAULT_STEP: Final = 0.01
 """The step size in seconds where the FMU tells nothing about its time."""
+
+MOST_ELEMENTS: Final = 100
+"""Larger arrays are left out."""
 
 MOST_LOCALS: Final = 8
 """Locals that replace outputs where the FMU has none."""
@@ -118,19 +124,18 @@ class Skeleton:
         self._description = fmu.description
         if not self.outputs:
             raise ConfigError(
-                f"{fmu.path.name} has no scalar Real, Integer, Boolean or Enumeration to observe"
+                f"{fmu.path.name} has no Real, Integer, Boolean or Enumeration to observe"
             )
 
     @cached_property
     def inputs(self) -> list[Variable]:
         """The numeric inputs."""
-        return [v for v in self._of("input") if v.numeric]
+        return _scalars(self._of("input"))
 
     @cached_property
     def outputs(self) -> list[Variable]:
         """The numeric outputs, or some locals if there are none."""
-        outputs = [v for v in self._of("output") if v.numeric]
-        return outputs or [v for v in self._of("local") if v.numeric][:MOST_LOCALS]
+        return _scalars(self._of("output")) or _scalars(self._of("local"))[:MOST_LOCALS]
 
     @cached_property
     def parameters(self) -> list[Variable]:
@@ -146,7 +151,14 @@ class Skeleton:
         return [v for v in usable if not _SOLVER.search(v.name)]
 
     def _of(self, causality: str) -> list[Variable]:
-        return [v for v in self._description.variables.values() if v.causality == causality]
+        """The variables that an environment may use in this role; not all clocks are."""
+        clocks, everything = self._description.clocks, self._description.variables.values()
+        return [
+            v
+            for v in everything
+            if v.causality == causality
+            and (not v.ticking or (v in clocks and (causality != "input" or v.settable_in_step)))
+        ]
 
     @property
     def class_name(self) -> str:
@@ -171,6 +183,8 @@ class Skeleton:
     @property
     def _base(self) -> str:
         """The name of the base class."""
+        if isinstance(self._description, SystemDescription):
+            return "FMUEnv"
         kind = "CS" if self._description.interface == "co_simulation" else "ME"
         return f"FMI{self._description.fmi_major_version}{kind}Env"
 
@@ -315,8 +329,16 @@ def _round_down(value: float) -> float:
     return float(f"{digit * power:.0e}")
 
 
+def _scalars(variables: Sequence[Variable]) -> list[Variable]:
+    """The numeric scalars, and the elements of numeric arrays that are not large."""
+    usable = (v for v in variables if v.is_number and v.size <= MOST_ELEMENTS)
+    return [element for variable in usable for element in variable.elements]
+
+
 def literal(variable: Variable) -> str:
     """The start value as the config takes it; empty if the config takes none."""
+    if variable.shape and variable.is_number and variable.start is not None:
+        return _array_literal(variable)
     value = start_value(variable)
     if variable.kind == "string" and not variable.shape and isinstance(value, str):
         return _quoted(value)
@@ -326,6 +348,15 @@ def literal(variable: Variable) -> str:
     if variable.items:
         return _quoted(names[0]) if names else ""
     return repr(value)
+
+
+def _array_literal(variable: Variable) -> str:
+    """Nested lists of the start values; empty if they are many, or are malformed."""
+    try:
+        numbers = variable.start_numbers if 0 < variable.size <= MOST_ELEMENTS else ()
+    except ConfigError:
+        numbers = ()
+    return repr(np.reshape(numbers, variable.shape).tolist()) if numbers else ""
 
 
 def _quoted(text: str) -> str:

@@ -11,14 +11,13 @@ from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.systems import fmu_of
 from fmugym.systems import FMUSystem
-from fmugym.systems.fmu import SystemFMU
 from fmugym.tools.overview import overview, plain, tables
 
-__all__ = ["as_text_of_system", "open_model", "open_system", "overview_of_system"]
+__all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"]
 
 
-def open_system(path: Path) -> FMUSystem | None:
-    """Read the system of an SSP archive or a task file; None if the path names an FMU.
+def find_model(path: Path) -> FMU | FMUSystem:
+    """Find what a file is or names: an FMU, an SSP archive, or a task file with one of both.
 
     Raises:
         ConfigError: If the task file or the system has a mistake.
@@ -27,9 +26,9 @@ def open_system(path: Path) -> FMUSystem | None:
     if path.suffix.lower() == ".ssp":
         return FMUSystem.read(path)
     if path.suffix.lower() != ".toml":
-        return None
+        return FMU(path)
     source = fmu_of(Task.read(path))
-    return source if isinstance(source, FMUSystem) else open_system(source)
+    return source if isinstance(source, FMUSystem) else find_model(source)
 
 
 def open_model(path: Path) -> FMU:
@@ -39,9 +38,7 @@ def open_model(path: Path) -> FMU:
         ConfigError: If the system has a mistake.
         FMULoadError: If it cannot be read.
     """
-    if path.suffix.lower() == ".ssp":
-        return SystemFMU(FMUSystem.read(path).plan)
-    return FMU(path)
+    return FMUSystem.read(path).as_fmu() if path.suffix.lower() == ".ssp" else FMU(path)
 
 
 def overview_of_system(
@@ -57,7 +54,7 @@ def overview_of_system(
     Returns:
         As ``overview``, with ``system``, a dict; ``docs/command-line.md`` describes the keys.
     """
-    facts = overview(SystemFMU(system.plan), everything=everything, pattern=pattern)
+    facts = overview(system.as_fmu(), everything=everything, pattern=pattern)
     groups = [
         {"components": list(group.components), "is_loop": group.loop is not None}
         for group in system.order.groups

@@ -401,6 +401,7 @@ def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
         variable.name
         for variable in env.fmu.description.variables.values()
         if variable.causality == "input"
+        and not variable.ticking
         and variable.is_number
         and written.isdisjoint(one.name for one in variable.elements)
     ]

@@ -2,7 +2,7 @@
 
    The value references: ten times the number of the type, and 0 for an input, 1 for the output with
    its value, 2 for a parameter, 3 for the output with this one's value; 4 and 5 are more inputs, with
-   the outputs 6 and 7. FMI 3.0 has a matrix of Int16, 204, with the output 205. Reference
+   the outputs 6 and 7. 301 is a real output, the length of the String parameter. FMI 3.0 has a matrix of Int16, 204, with the output 205. Reference
    4 of Int64, or of Integer, is an enumeration, which begins with 1. */
 
 #include <stdbool.h>
@@ -12,7 +12,7 @@
 #include <string.h>
 
 enum { OK, WARNING, DISCARD, ERROR };
-enum { INPUT, OUTPUT, PARAMETER, TOLD, MORE, PLACES = 8, MATRIX = 4, LONGEST = 200 };
+enum { INPUT, OUTPUT, PARAMETER, TOLD, MORE, PLACES = 8, MATRIX = 4, LONGEST = 200, LENGTH = 301 };
 
 #if FMI_VERSION == 3
 #define PREFIX(name) fmi3##name
@@ -39,6 +39,7 @@ typedef struct {
     TYPES(MEMBER)
     int16_t matrix[MATRIX];
     char texts[PLACES][LONGEST];
+    double length; /* of the String parameter */
 } Model;
 
 /* The value of an output is that of its input or parameter. */
@@ -48,6 +49,9 @@ static unsigned source_of(unsigned place) {
 
 /* The values of a variable, and their size in bytes. */
 static char *find(Model *me, unsigned reference, size_t *size) {
+    if (reference == LENGTH) {
+        return *size = sizeof me->length, (char *)&me->length;
+    }
     switch (reference >= 200 ? STRINGS : reference / 10) {
 #define FIND(name, type)                                                                           \
     case TYPE_##name: return *size = sizeof(type), (char *)&me->name[source_of(reference % 10)];
@@ -95,6 +99,7 @@ int PREFIX(SetString)(Model *me, const unsigned *references, size_t count,
     for (size_t i = 0; i < count; i++) {
         snprintf(me->texts[references[i] - 10 * STRINGS], LONGEST, "%s", values[i]);
     }
+    me->length = (double)strlen(me->texts[PARAMETER]);
     return OK;
 }
 

@@ -2,7 +2,7 @@
 
 #include "fmi2Functions.h"
 
-#include "controller.h"
+#include "fmu_instance.h"
 
 #define OR_ERROR(done) ((done) ? fmi2OK : fmi2Error)
 
@@ -104,11 +104,11 @@ fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference references[],
 }
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    return OR_ERROR(get_state((Controller *)c, state));
+    return OR_ERROR(remember((Controller *)c, state));
 }
 
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-    return OR_ERROR(set_state((Controller *)c, state));
+    return OR_ERROR(recall((Controller *)c, state));
 }
 
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
@@ -130,7 +130,7 @@ fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte b
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
                                    fmi2FMUstate *state) {
     *state = NULL;
-    if (!get_state((Controller *)c, state)) {
+    if (!remember((Controller *)c, state)) {
         return fmi2Error;
     }
     return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));

@@ -2,7 +2,7 @@
 
 #include "fmi3Functions.h"
 
-#include "controller.h"
+#include "fmu_instance.h"
 
 #define OR_ERROR(done) ((done) ? fmi3OK : fmi3Error)
 
@@ -117,11 +117,11 @@ ACCESS(UInt64, 'Q')
 ACCESS(Boolean, '?')
 
 fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
-    return OR_ERROR(get_state((Controller *)c, state));
+    return OR_ERROR(remember((Controller *)c, state));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
-    return OR_ERROR(set_state((Controller *)c, state));
+    return OR_ERROR(recall((Controller *)c, state));
 }
 
 fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
@@ -143,7 +143,7 @@ fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte by
 fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
                                    fmi3FMUState *state) {
     *state = NULL;
-    if (!get_state((Controller *)c, state)) {
+    if (!remember((Controller *)c, state)) {
         return fmi3Error;
     }
     return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));

@@ -4,8 +4,8 @@
  * set before. Its actions hold until the next sample. A communication step may be shorter or longer
  * than the time between two samples. In the initialization, outputs show what the first one gives. */
 
-#ifndef CONTROLLER_H
-#define CONTROLLER_H
+#ifndef FMU_INSTANCE_H
+#define FMU_INSTANCE_H
 
 #include <math.h>
 #include <stdbool.h>
@@ -14,7 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "model.h"
+#include "fmu_model.h"
 
 /* A sample is due if it lies this part of its time before the end of a step: times are rounded. */
 #define TOLERANCE 1e-6
@@ -178,7 +178,7 @@ static bool step(Controller *controller, double time, double size) {
 
 /* States */
 
-static bool get_state(const Controller *controller, void **state) {
+static bool remember(const Controller *controller, void **state) {
     if (*state == NULL) {
         *state = malloc(sizeof(Memory));
     }
@@ -189,7 +189,7 @@ static bool get_state(const Controller *controller, void **state) {
     return true;
 }
 
-static bool set_state(Controller *controller, const void *state) {
+static bool recall(Controller *controller, const void *state) {
     if (state == NULL) {
         return fail(controller, "there is no such state");
     }

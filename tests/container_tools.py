@@ -1,0 +1,54 @@
+"""FMPy's container: an FMU of FMI 3.0 that holds others, as a reference for systems."""
+
+import copy
+
+import fmpy
+from fmpy.container_fmu import config
+from fmpy.container_fmu.cli import create_container_fmu
+
+
+def container(folder, path, components, links, names, step):
+    """Build a container of several components with one FMU. All of its steps are Jacobi steps.
+
+    Args:
+        folder: Where to.
+        path: The FMU, of FMI 3.0.
+        components: The names of the components.
+        links: Tuples of component and output, component and input.
+        names: Component and variable of each variable of the container.
+        step: Its communication step size, in seconds.
+
+    Returns:
+        The file.
+    """
+    read = {name: fmpy.read_model_description(str(path)) for name in components}
+    parts = {name: config.Component(name, path, read[name]) for name in components}
+    own = {(n, v.name): v for n in components for v in read[n].modelVariables}
+    variables = []
+    for pair in names:
+        variable = copy.copy(own[pair])
+        variable.name = ".".join(pair)
+        variables.append(variable)
+    whole = fmpy.read_model_description(str(path))
+    # the value reference 0 is that of time, whatever the description says
+    _simplify(whole, [copy.copy(own[components[0], "time"]), *variables], step)
+    connections = [
+        config.Connection(parts[a], [own[a, x]], parts[b], [own[b, y]]) for a, x, b, y in links
+    ]
+    pairs = zip(variables, names, strict=True)
+    mappings = {v: [(parts[pair[0]], own[pair])] for v, pair in pairs}
+    configuration = config.Configuration(False, whole, list(parts.values()), connections, mappings)
+    (folder / "container").mkdir()
+    create_container_fmu(configuration, folder / "container", folder / "Container.fmu")
+    return folder / "Container.fmu"
+
+
+def _simplify(whole, variables, step):
+    """Leave in the description of an FMU what the container can do."""
+    whole.modelName = "Container"
+    whole.coSimulation.fixedInternalStepSize = step
+    whole.coSimulation.canGetAndSetFMUstate = False
+    whole.coSimulation.canSerializeFMUstate = False
+    whole.coSimulation.providesDirectionalDerivative = False
+    whole.modelVariables = variables
+    whole.outputs, whole.derivatives, whole.initialUnknowns = [], [], []
