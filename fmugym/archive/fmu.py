@@ -15,6 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Protocol, runtime_checkable
 
 import fmpy
@@ -196,6 +197,8 @@ class FMU(LoadableFMU):
         FMULoadError: If the file is missing, not a sound FMU archive, or lacks the interface.
     """
 
+    sizes: Mapping[str, int] = MappingProxyType({})
+
     def __init__(
         self,
         path: str | os.PathLike[str],
@@ -218,8 +221,8 @@ class FMU(LoadableFMU):
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
         description = read_model_description(self._archive, self.limits, interface)
-        self.sizes = {} if sizes is None else check_mapping("sizes", sizes)
-        if self.sizes:
+        if sizes:
+            self.sizes = check_mapping("sizes", sizes)
             description = description.resized(self.sizes)
         super().__init__(file, description, libraries)
         self._library_place, note = self._choose_library()

@@ -170,6 +170,11 @@ def _opened(given: Component) -> FMU:
     if not isinstance(given.fmu, FMU):
         path = check_path("the path of an FMU", given.fmu)
         return FMU(path, interface=given.interface)
+    if given.fmu.sizes:
+        name, sizes = given.fmu.path.name, shown(dict(given.fmu.sizes))
+        raise ConfigError(
+            f"{name} cannot be a component with sizes = {sizes}: systems have no arrays"
+        )
     if given.interface in (None, given.fmu.description.interface):
         return given.fmu
     source = given.fmu

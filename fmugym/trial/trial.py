@@ -110,7 +110,7 @@ class Candidate:
     @classmethod
     def of(cls, fmu: FMU) -> Candidate:
         """Make a candidate from an open FMU."""
-        sizes = tuple(getattr(fmu, "sizes", {}).items())
+        sizes = tuple(fmu.sizes.items())
         interface, plan = fmu.description.interface, getattr(fmu, "plan", None)
         return cls(fmu.path, fmu.limits, fmu.preload, fmu.probe_timeout, interface, plan, sizes)
 
