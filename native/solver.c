@@ -11,14 +11,12 @@
 
 enum {
     MOST_UPDATES = 1000,  /* of the discrete states in one event */
-    MOST_EVENTS = 100000, /* in one communication step */
-    MOST_GUESSES = 200    /* of the time of one event */
+    MOST_EVENTS = 100000  /* in one communication step */
 };
 
 static const double GROWTH = 6.0, SHRINKAGE = 0.2, SAFETY = 0.9;
 static const double SMALL = 0.01;   /* part of a nominal value that errors are compared with */
 static const double FIRST = 0.01;   /* part of its value that a state changes in the first step */
-static const double SHARP = 1e-3;   /* part of the tolerance to which events are located */
 static const double ROOT = 0x1p-26; /* of the resolution of doubles; for differences */
 
 static bool good(Status status) {
@@ -113,14 +111,14 @@ static inline Status move(Solver *me, double time, const double *x) {
                : status;
 }
 
-static Status place(Solver *me, double time, const double *x) {
+Status solver_place(Solver *me, double time, const double *x) {
     const Status status = move(me, time, x);
 
     solver_restore_floats(me);
     return status;
 }
 
-static Status get_indicators(Solver *me, double *z) {
+Status solver_indicators(Solver *me, double *z) {
     const size_t count = me->solving->indicators;
     const Status status =
         count == 0 ? STATUS_OK : sane(me->equations->get_indicators(me->component, z, count));
@@ -176,7 +174,7 @@ static Status know(Solver *me) {
         status = solver_rates(me, me->memory.time, me->x, me->rates);
     }
     if (good(status) && !me->knows_indicators) {
-        status = get_indicators(me, me->z);
+        status = solver_indicators(me, me->z);
     }
     me->knows_rates = me->knows_indicators = good(status);
     return status;
@@ -244,94 +242,6 @@ static Status handle_event(Solver *me) {
     return good(status) ? solver_settle(me) : status;
 }
 
-/* Whether an indicator becomes positive or ceases to be: FMI's events. */
-static bool crosses(const Solver *me, const double *before, const double *after) {
-    bool any = false;
-
-    for (size_t i = 0; i < me->solving->indicators; i++) {
-        any |= (before[i] > 0.0) != (after[i] > 0.0);
-    }
-    return any;
-}
-
-/* An interval of fractions of a step: no indicator has crossed zero at low, one has at high. */
-typedef struct {
-    double low, high;
-    double low_weight, high_weight; /* halved while an end stays where it is (Illinois method) */
-} Bracket;
-
-/* The fraction at which straight lines between the ends cross first. */
-static double first_crossing(const Solver *me, const Bracket *b) {
-    double first = 1.0;
-
-    for (size_t i = 0; i < me->solving->indicators; i++) {
-        const double low = b->low_weight * me->low_z[i], high = b->high_weight * me->next_z[i];
-        if ((low > 0.0) != (high > 0.0) && low / (low - high) < first) {
-            first = low / (low - high);
-        }
-    }
-    return b->low + first * (b->high - b->low);
-}
-
-/* Keeps a guess so far from both ends that one of them moves by at least this much. Each fourth
- * guess halves the interval. */
-static double next_guess(const Solver *me, const Bracket *b, int guesses, double least) {
-    const double middle = 0.5 * (b->low + b->high);
-    const double guess = guesses % 4 == 3 ? middle : first_crossing(me, b);
-
-    if (!(guess > b->low + least)) {
-        return fmin(b->low + least, middle);
-    }
-    return guess < b->high - least ? guess : fmax(b->high - least, middle);
-}
-
-/* Goes to a fraction of the step, and reads the indicators there. */
-static Status go_to(Solver *me, double end, double fraction) {
-    const double time = me->memory.time;
-    Status status = me->solving->method->between(me, end, fraction, me->found);
-
-    if (good(status)) {
-        status = place(me, time + fraction * (end - time), me->found);
-    }
-    return good(status) ? get_indicators(me, me->found_z) : status;
-}
-
-static void narrow(Solver *me, Bracket *b, double guess) {
-    const size_t size = me->solving->indicators * sizeof(double);
-
-    if (crosses(me, me->z, me->found_z)) {
-        *b = (Bracket){b->low, guess, 0.5 * b->low_weight, 1.0};
-        memcpy(me->next_z, me->found_z, size);
-    } else {
-        *b = (Bracket){guess, b->high, 1.0, 0.5 * b->high_weight};
-        memcpy(me->low_z, me->found_z, size);
-    }
-}
-
-/* Finds the first crossing in the step that ends at *end. Moves the end and next to just after
- * it. */
-static Status locate(Solver *me, double *end) {
-    const double time = me->memory.time, step = *end - time;
-    const double width = fmax(SHARP * me->solving->tolerance,
-                              4.0 * DBL_EPSILON * fmax(fabs(time), fabs(*end)) / step);
-    Bracket b = {0.0, 1.0, 1.0, 1.0};
-    Status status = STATUS_OK;
-
-    memcpy(me->low_z, me->z, me->solving->indicators * sizeof(double));
-    for (int i = 0; b.high - b.low > width && i < MOST_GUESSES && good(status); i++) {
-        const double guess = next_guess(me, &b, i, 0.5 * width);
-        status = go_to(me, *end, guess);
-        narrow(me, &b, guess);
-    }
-    if (b.high == 1.0 || !good(status)) {
-        return good(status) ? place(me, *end, me->next) : status;
-    }
-    status = go_to(me, *end, b.high);
-    memcpy(me->next, me->found, me->n * sizeof(double));
-    *end = time + b.high * step;
-    return status;
-}
-
 /* Steps */
 
 double solver_norm(const Solver *me, const double *errors) {
@@ -386,7 +296,7 @@ static Status differentiate_by_time(Solver *me, double step) {
 Status solver_differentiate(Solver *me, double step) {
     double *column = me->found;
     const bool asks = me->solving->state_references != NULL && !me->has_jacobian;
-    Status status = asks ? place(me, me->memory.time, me->x) : STATUS_OK;
+    Status status = asks ? solver_place(me, me->memory.time, me->x) : STATUS_OK;
 
     for (size_t j = 0; j < me->n && good(status) && !me->has_jacobian; j++) {
         status = differentiate_by(me, j, column);
@@ -516,11 +426,11 @@ static Status leave_zero(Solver *me, double until, double *end, bool *event) {
     for (size_t i = 0; i < me->n; i++) {
         me->next[i] = me->x[i] + (*end - me->memory.time) * me->rates[i];
     }
-    Status status = place(me, *end, me->next);
+    Status status = solver_place(me, *end, me->next);
     if (good(status)) {
-        status = get_indicators(me, me->next_z);
+        status = solver_indicators(me, me->next_z);
     }
-    *event = good(status) && crosses(me, me->z, me->next_z);
+    *event = good(status) && solver_crosses(me, me->z, me->next_z);
     return status;
 }
 
@@ -529,13 +439,13 @@ static Status take_whole_step(Solver *me, double until, double *end, bool *event
     Status status = take_step(me, until, end);
 
     if (good(status)) {
-        status = place(me, *end, me->next);
+        status = solver_place(me, *end, me->next);
     }
     if (good(status)) {
-        status = get_indicators(me, me->next_z);
+        status = solver_indicators(me, me->next_z);
     }
-    *event = good(status) && crosses(me, me->z, me->next_z);
-    return *event ? locate(me, end) : status;
+    *event = good(status) && solver_crosses(me, me->z, me->next_z);
+    return *event ? solver_locate(me, end) : status;
 }
 
 /* Lets the FMU step to this time, or until it wants an event or returns early. */
@@ -592,7 +502,7 @@ static bool is_due(const Solver *me, double until) {
 static Status handle_time_event(Solver *me) {
     me->memory.time = fmax(me->memory.time, me->memory.next_event);
     const bool is_there = me->model->step != NULL; /* the FMU itself keeps its time */
-    const Status status = is_there ? STATUS_OK : place(me, me->memory.time, me->x);
+    const Status status = is_there ? STATUS_OK : solver_place(me, me->memory.time, me->x);
     return good(status) ? handle_event(me) : status;
 }
 

@@ -110,6 +110,22 @@ Status solver_enter_events(Solver *me);
 /* Integrates to this time, and handles all events until then and at it. */
 Status solver_advance(Solver *me, double until);
 
+/* For crossings.c: moves the FMU to a time and state, and reads the event indicators there. */
+Status solver_place(Solver *me, double time, const double *x);
+Status solver_indicators(Solver *me, double *z);
+/* Finds the first crossing in the step that ends at *end. Moves the end and next to just after
+ * it. */
+Status solver_locate(Solver *me, double *end);
+/* Whether an indicator becomes positive or ceases to be: FMI's events. */
+static inline bool solver_crosses(const Solver *me, const double *before, const double *after) {
+    bool any = false;
+
+    for (size_t i = 0; i < me->solving->indicators; i++) {
+        any |= (before[i] > 0.0) != (after[i] > 0.0);
+    }
+    return any;
+}
+
 /* For clocks.c. The first logs a message like one of the FMU, and returns an Error. */
 Status solver_fail(const Solver *me, const char *format, ...);
 void solver_restore_floats(const Solver *me);

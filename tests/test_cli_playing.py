@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import sys
 import tomllib
 from pathlib import Path
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 import fmugym
+from fmugym import __main__ as program
 from fmugym.series import TimeSeries
 from fmugym.tools.cli import _parsed, _parser, main
 
@@ -155,7 +157,8 @@ class TestEvaluate:
         options = "--episodes", "2", "--steps", "60", "--scenario", "frost", "--action", "0"
         code, out, _ = run(capsys, "evaluate", "fmugym/House-v0", *options, "--json")
         assert code == 130
-        assert [one["name"] for one in json.loads(out)["scores"]] == ["random"]
+        found = {one["name"]: len(one["rewards"]) for one in json.loads(out)["scores"]}
+        assert found == {"random": 2, "action 0": 1}
 
     def test_all_scenarios(self, capsys):
         options = "--scenario", "all", "--steps", "2", "--episodes", "1"
@@ -256,3 +259,62 @@ def test_arguments_of_an_algorithm_may_stand_anywhere(capsys, monkeypatch):
         with pytest.raises(SystemExit) as caught:
             _parsed(wrong)
         assert caught.value.code == 2
+
+
+class TestInterruption:
+    """Ctrl-C in an episode keeps those before it."""
+
+    @pytest.fixture(autouse=True)
+    def third_episode(self, monkeypatch):
+        resets = iter(range(2))
+        original = fmugym.TaskEnv.reset
+
+        def reset(self, **arguments):
+            if arguments.get("seed") is not None and next(resets, None) is None:
+                raise KeyboardInterrupt
+            return original(self, **arguments)
+
+        monkeypatch.setattr(fmugym.TaskEnv, "reset", reset)
+
+    def test_of_simulate(self, capsys):
+        code, out, _ = run(capsys, "simulate", CART_POLE, "--episodes", "9", "--json")
+        assert (code, len(json.loads(out)["episodes"])) == (130, 2)
+
+    def test_of_record(self, tmp_path, capsys):
+        options = "--output", tmp_path / "a.csv", "--episodes", "9", "--json"
+        code, out, _ = run(capsys, "record", CART_POLE, *options)
+        assert (code, len(json.loads(out)["runs"]["random"])) == (130, 2)
+
+    def test_of_evaluate(self, capsys):
+        code, out, _ = run(capsys, "evaluate", CART_POLE, "--episodes", "9", "--json")
+        (score,) = json.loads(out)["scores"]
+        assert (code, len(score["rewards"])) == (130, 2)
+
+    def test_while_modules_are_loaded(self, monkeypatch):
+        def interrupted(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.delitem(sys.modules, "fmugym.tools.cli")
+        monkeypatch.delattr("fmugym.tools.cli", raising=False)
+        monkeypatch.setattr("builtins.__import__", interrupted)
+        code = program.main()
+        monkeypatch.undo()
+        assert code == 130
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fact"),
+    [
+        (["simulate", "FOLDER/plant.tml"], "FOLDER/plant.toml'"),
+        (["simulate", "fmugym/Hause-v0"], "'fmugym/House-v0'"),
+        (["new", "FOLDER/a.fmu", "--output", "FOLDER/plant.toml"], "plant.toml exists"),
+        (["new", "FOLDER/a.fmu", "--output", "FOLDER/no/b.toml"], "b.toml: No such file"),
+    ],
+)
+def test_wrong_names_are_told_without_numbers_of_the_system(arguments, fact, tmp_path, capsys):
+    (tmp_path / "plant.toml").write_text("")
+    shutil.copy(fmugym.bundled_fmu("Pendulum"), tmp_path / "a.fmu")
+    code, _, err = run(capsys, *(one.replace("FOLDER", str(tmp_path)) for one in arguments))
+    assert code == 1
+    assert fact.replace("FOLDER", str(tmp_path)) in err
+    assert "Errno" not in err

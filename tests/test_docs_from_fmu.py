@@ -1,7 +1,9 @@
 """The tutorial "From FMU to agent": its commands run in their order, as written."""
 
+import importlib
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+import fmugym
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.tools.cli import main
 
@@ -26,7 +29,9 @@ def commands():
 
 
 def shortened(words):
-    """A training of seconds instead of minutes."""
+    """A training or a search of seconds instead of minutes."""
+    if words[1] == "tune":
+        return [*words, "--rounds", "1", "--candidates", "8", "--episodes", "1", "--steps", "100"]
     if words[1] != "train":
         return words
     short = {
@@ -48,6 +53,7 @@ def test_its_task_is_that_of_the_house():
 
 def test_its_commands_run(tmp_path, monkeypatch, capsys):
     pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3: the extra sb3")
+    pytest.importorskip("scipy", reason="needs SciPy: the extra identification")
     monkeypatch.setattr("fmugym.tools.training._EVALUATIONS", 1)
     monkeypatch.chdir(tmp_path)
     Path("house.toml").write_text(TASK, encoding="ascii")
@@ -58,10 +64,43 @@ def test_its_commands_run(tmp_path, monkeypatch, capsys):
         elif words[0] == "fmugym":
             assert main(shortened(words)[1:]) == 0, words
             printed[words[1]] = capsys.readouterr().out
-    assert {"info", "new", "validate", "simulate", "record", "train", "evaluate"} == set(printed)
+    told = {"info", "new", "validate", "simulate", "record", "train", "tune", "evaluate"}
+    assert told == set(printed)
+    assert tomllib.loads(Path("tuned.toml").read_text())["controllers"]["tuned"].startswith("pid")
     assert "T_op" in printed["info"]
     assert "agent" in printed["evaluate"]
     for name in re.findall(r"--output (\S+\.png)|--plot (\S+\.png)", TEXT):
         with Image.open("".join(name)) as image:
             assert min(image.size) > 200
     assert "<html" in Path("frost.html").read_text(encoding="utf-8")[:500].lower()
+
+
+MEASURED = re.compile(r"takes|first meeting|this machine|episodes begin|recommended for a training")
+"""Lines with times of this machine, or what earlier runs have shown on it."""
+
+
+def test_its_pictures_show_what_is_printed_today(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(DOCUMENT.parent / "_site")
+    tutorial = importlib.import_module("tutorial")
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(fmugym.bundled_fmu("House"), "House.fmu")
+    shutil.copy(HOUSE_TASK.with_name("house_year.csv"), ".")
+    Path("house.toml").write_text(TASK, encoding="ascii")
+    for name, commands in tutorial.PRINTED.items():
+        assert all(command in TEXT for command in commands) or name == "new"
+        picture = (tutorial.IMAGES / f"tutorial_{name}.svg").read_text(encoding="utf-8")
+        drawn = tutorial.terminal(tutorial.printed(commands))
+        assert kept(picture) == kept(drawn), name
+
+
+def kept(picture):
+    """The texts of a picture that are the same everywhere."""
+    texts = re.findall(r">([^<]*)</text>", picture.replace("\u00a0", " "))
+    return [text for text in texts if not MEASURED.search(text)]
+
+
+def test_each_step_has_a_small_picture():
+    for heading in TEXT.split("\n## ")[1:]:
+        names = re.findall(r"!\[[^]]{20,}\]\((\S+)\)", heading)
+        assert names, heading.splitlines()[0]
+        assert all((DOCUMENT.parent / name).stat().st_size < 100_000 for name in names)

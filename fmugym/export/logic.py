@@ -19,7 +19,7 @@ from fmugym.archive.description import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.external import found_in
-from fmugym.task.readings import LATE, Readings, reading
+from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive
 from fmugym.vector.hooks.graph import Graph, Node
@@ -136,20 +136,13 @@ def logic_of(env: FMUEnv, *, all_inputs: bool = False, external: Collection[str]
             f"{env.action_space}"
         )
     try:
-        with exclusive(), borrowed(env), tables_in(env):
-            _make_present(env)
-            with reading(env, Readings.of(env)):
-                traced = _ControllerTracer(env, {}).traced()
+        if env._play is not None:  # compiled steps keep in the pool what hooks read
+            env._player.give_back(env)
+        with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+            traced = _ControllerTracer(env, {}).traced()
         return _Assembly(env, traced, all_inputs, external).logic()
     except UntraceableError as error:
         raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
-
-
-def _make_present(env: FMUEnv) -> None:
-    """Give an environment the readings that the pool keeps while it does whole steps."""
-    if env._play is not None:
-        vars(env).update({name: getattr(env, name) for name in (*LATE, "variables")})
-        env._play = None
 
 
 @dataclass(frozen=True)

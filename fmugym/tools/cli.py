@@ -127,9 +127,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, for example ``head``, has ended
         _drop_output()
     except (FMUGymError, OSError) as error:
-        note(str(error), "error")
+        note(_told(error), "error")
         return 1
     return 0
+
+
+def _told(error: Exception) -> str:
+    """An error in a line; those of the system without their numbers."""
+    if not isinstance(error, OSError) or error.filename is None:
+        return str(error)
+    if isinstance(error, FileExistsError):
+        return f"{error.filename} exists; name a new file"
+    return f"{error.filename}: {error.strerror}"
 
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:

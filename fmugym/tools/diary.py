@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -109,6 +109,13 @@ def curve_of(folder: Path) -> Mapping[str, list[float]]:
     return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
+def _limits(curves: Iterable[Sequence[float]]) -> tuple[float, float]:
+    """Those of the axis of rewards: the first quarter of a training may leave them."""
+    shown = [value for curve in curves for value in curve[len(curve) // 4 :]]
+    margin = 0.08 * (max(shown) - min(shown)) or 1.0
+    return min(shown) - margin, max(shown) + margin
+
+
 def draw_curve(columns: Mapping[str, list[float]], title: str) -> Any:
     """Draw the rewards of all evaluations of a training.
 
@@ -133,7 +140,8 @@ def draw_curve(columns: Mapping[str, list[float]], title: str) -> Any:
         axes.plot(steps, mean, "o-", markersize=4, color=COLOURS[0], linewidth=2, label="mean")
         best = max(range(len(mean)), key=mean.__getitem__)
         axes.plot(steps[best], mean[best], "*", markersize=13, color=COLOURS[0], label="best agent")
-        axes.set(xlabel="steps of training", ylabel="reward in evaluation", title="")
+        axes.set(xlabel="steps of training", ylabel="reward in evaluation")
+        axes.set_ylim(*_limits([mean, *each.values()]))
         axes.legend(frameon=False, loc="lower right")
         figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     return figure

@@ -149,7 +149,14 @@ def each_score(
         played = wrap(env)
         for name, make_policy in policies.items():
             policy, begin = make_policy(env), perf_counter()
-            episodes = [simulate(played, policy, seed, most_steps, advance) for seed in seeds]
+            episodes: list[Summary] = []
+            each = (simulate(played, policy, seed, most_steps, advance) for seed in seeds)
+            try:
+                episodes.extend(each)
+            except KeyboardInterrupt:
+                if episodes:
+                    yield _score(name, episodes, perf_counter() - begin, scenario)
+                raise
             yield _score(name, episodes, perf_counter() - begin, scenario)
     finally:
         played.close()
@@ -206,6 +213,9 @@ def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
 def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     """Draw rewards and costs: each episode, the mean, and its 95 % confidence interval.
 
+    Random actions are left out beside two others or more: they are so much worse that the others
+    could not be told apart.
+
     Args:
         scores: The scores.
         path: The file to write.
@@ -215,6 +225,8 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
         ConfigError: If Matplotlib is missing.
     """
     figures: Any = imported("matplotlib.figure", "plot")
+    others = [score for score in scores if score.name != "random"]
+    scores = others if len({score.name for score in others}) > 1 else scores
     groups = {"reward of an episode": [score.rewards for score in scores]}
     if all(score.costs for score in scores):
         groups["cost of an episode"] = [score.costs for score in scores]

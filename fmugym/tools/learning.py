@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from fmugym.errors import ConfigError
 from fmugym.tools.agents import FACTS
+from fmugym.tools.checkpoints import CHECKPOINT
 from fmugym.tools.diary import Diary
 from fmugym.tools.evaluation import Score, table
 from fmugym.tools.options import (
@@ -107,11 +108,21 @@ def _train(arguments: argparse.Namespace) -> None:
         try:
             scores = train(plan, resume=arguments.resume, watch=watch)
         except KeyboardInterrupt:
-            tell(f"{plan.folder} has the best agent until now; --resume goes on with the training")
+            _tell_what_is_kept(plan)
             write_outcome(plan, title_of(arguments.task), tell)
             raise
     write_outcome(plan, title_of(arguments.task), tell)
     _show(plan, scores, arguments)
+
+
+def _tell_what_is_kept(plan: Plan) -> None:
+    """After Ctrl-C."""
+    if not (plan.folder / FACTS).exists():
+        tell("nothing was trained yet")
+    elif (plan.folder / CHECKPOINT).exists():
+        tell(f"{plan.folder} has the best agent until now; --resume goes on with the training")
+    else:
+        tell(f"{plan.folder} has the best agent until now; the training was too short to resume it")
 
 
 def _plan_of(arguments: argparse.Namespace) -> Plan:

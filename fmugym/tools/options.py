@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +32,7 @@ __all__ = [
     "players_of",
     "say",
     "say_json",
+    "shown_in_any_case",
     "tell",
     "write_text",
 ]
@@ -154,6 +156,17 @@ def tell(text: str) -> None:
 def say_json(facts: dict[str, Any]) -> None:
     """Print one JSON object."""
     say(json.dumps({"schema": SCHEMA, **facts}, indent=2, default=str))
+
+
+@contextmanager
+def shown_in_any_case(show: Callable[[], None]) -> Iterator[None]:
+    """Show what was found, also after Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        show()
+        raise
+    show()
 
 
 def write_text(text: str, output: Path | None, notes: Iterable[str]) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 from fmugym.env import FMUEnv
+from fmugym.errors import FMUGymError
 from fmugym.series import RecordSeries
 from fmugym.tools.evaluation import Score, each_score, plot_scores, table
 from fmugym.tools.options import (
@@ -22,11 +24,12 @@ from fmugym.tools.options import (
     players_of,
     say,
     say_json,
+    shown_in_any_case,
 )
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import progress
 from fmugym.tools.records import Recording, require_format, title_of
-from fmugym.tools.simulation import Summary, simulate
+from fmugym.tools.simulation import Policy, Summary, simulate
 from fmugym.tools.speed import bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
@@ -50,7 +53,12 @@ def _simulate(arguments: argparse.Namespace) -> None:
     make_policy = only_player(arguments)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     summaries: list[Summary] = []
-    with ExitStack() as stack:
+
+    def show() -> None:
+        if arguments.json:
+            say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
+
+    with shown_in_any_case(show), ExitStack() as stack:
         env: Any = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
         policy = make_policy(env)
         if arguments.output is not None:
@@ -61,8 +69,6 @@ def _simulate(arguments: argparse.Namespace) -> None:
             summaries.append(simulate(env, policy, seed, arguments.steps, advance))
             if not arguments.json:
                 say(plain(summaries[-1].as_text()))
-    if arguments.json:
-        say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
 
 
 def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
@@ -102,24 +108,40 @@ def _record(arguments: argparse.Namespace) -> None:
         require_format(path, len(players))
     recording = Recording(arguments.task, arguments.scenario, arguments.output)
     summaries: dict[str, list[Summary]] = {name: [] for name in players}
-    try:
-        for name, make_policy in players.items():
-            with (
-                closing(maker_of(arguments.task, arguments.scenario)()) as env,
-                progress(_steps_of(env, arguments), name) as advance,
-            ):
-                policy = make_policy(env)
-                recorder = recording.begin(name, env, arguments.variables, arguments.every)
-                for seed in range(arguments.seed, arguments.seed + arguments.episodes):
-                    one = simulate(recorder, policy, seed, arguments.steps, advance)
-                    summaries[name].append(one)
-                    if not arguments.json:
-                        say(plain(f"{name}: {one.as_text()}"))
-    finally:
+
+    def show() -> None:
         recording.finish(arguments.seed)
-    if arguments.json:
-        runs = {name: [one.as_dict() for one in found] for name, found in summaries.items()}
-        say_json({"task": arguments.task, "output": arguments.output, "runs": runs})
+        if arguments.json:
+            runs = {name: [one.as_dict() for one in found] for name, found in summaries.items()}
+            say_json({"task": arguments.task, "output": arguments.output, "runs": runs})
+
+    try:
+        with shown_in_any_case(show):
+            for name, make_policy in players.items():
+                _record_one(arguments, recording, name, make_policy, summaries[name])
+    except FMUGymError:
+        recording.finish(arguments.seed)
+        raise
+
+
+def _record_one(
+    arguments: argparse.Namespace,
+    recording: Recording,
+    name: str,
+    make_policy: Callable[[FMUEnv], Policy],
+    summaries: list[Summary],
+) -> None:
+    """Record the episodes of one who acts."""
+    with (
+        closing(maker_of(arguments.task, arguments.scenario)()) as env,
+        progress(_steps_of(env, arguments), name) as advance,
+    ):
+        policy = make_policy(env)
+        recorder = recording.begin(name, env, arguments.variables, arguments.every)
+        for seed in range(arguments.seed, arguments.seed + arguments.episodes):
+            summaries.append(simulate(recorder, policy, seed, arguments.steps, advance))
+            if not arguments.json:
+                say(plain(f"{name}: {summaries[-1].as_text()}"))
 
 
 def add_evaluate(commands: Commands) -> None:
@@ -147,21 +169,17 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     players = players_of(arguments, random=True)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     scores: list[Score] = []
-    try:
+    with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         for scenario in _scenarios(arguments):
             make_env = maker_of(arguments.task, scenario)
             label = "evaluate" if scenario is None else scenario
             with progress(None, label) as advance:
                 played = each_score(make_env, players, seeds, arguments.steps, scenario, advance)
                 scores.extend(played)  # one by one, so that an interruption keeps them
-    except KeyboardInterrupt:
-        _show_scores(scores, arguments)
-        raise
-    _show_scores(scores, arguments)
 
 
 def _show_scores(scores: list[Score], arguments: argparse.Namespace) -> None:
-    if arguments.plot is not None and scores is not None:
+    if arguments.plot is not None and scores:
         plot_scores(scores, arguments.plot, title_of(arguments.task))
     if arguments.json:
         say_json({"task": arguments.task, "scores": [one.as_dict() for one in scores]})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable
 from contextlib import closing
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -50,6 +51,15 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
     return partial(_registered, target, {} if scenario is None else {"scenario": scenario})
 
 
+def _nearest(target: str) -> str:
+    """The file or id that was probably meant, in words."""
+    folder = Path(target).parent
+    files = [str(path) for kind in ("*.toml", "*.fmu") for path in folder.glob(kind)]
+    ids = [name for name in gymnasium.registry if name.startswith("fmugym/")]
+    near = get_close_matches(target, [*files, *ids], n=1)
+    return f" Did you mean {shown(near[0])}?" if near else ""
+
+
 def scenarios_of(target: str) -> list[str]:
     """The names of the scenarios of a declared task; none for anything else.
 
@@ -71,9 +81,8 @@ def _registered(env_id: str, arguments: dict[str, Any], **more: Any) -> FMUEnv:
     try:
         made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:
-        raise ConfigError(
-            f"{shown(env_id)} is no task file, no class and no registered id: {error}"
-        ) from None
+        text = f"{shown(env_id)} is no task file, no class and no registered id: {error}"
+        raise ConfigError(f"{text}{_nearest(env_id)}") from None
     env = made.unwrapped
     if not isinstance(env, FMUEnv):
         env.close()
