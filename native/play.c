@@ -19,20 +19,21 @@ WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t low
     return outside != 0;
 }
 
-#define ANY_NAN(Type, name, is_nan)                                                                \
+/* The notes are as wide as the values, so that the compiler can vectorize. */
+#define ANY_NAN(Type, name, Whole, is_nan)                                                         \
     WIDE static bool name(const Type *values, size_t count) {                                      \
-        size_t number = 0;                                                                         \
+        Whole any = 0;                                                                             \
         for (size_t i = 0; i < count; i++) {                                                       \
-            number += is_nan(values[i]);                                                           \
+            any |= is_nan(values[i]);                                                              \
         }                                                                                          \
-        return number > 0;                                                                         \
+        return any != 0;                                                                           \
     }
 
 #define DIFFERS(value) ((value) != (value))
 
-ANY_NAN(double, is_any_nan, DIFFERS)
-ANY_NAN(float, is_any_nan32, DIFFERS)
-ANY_NAN(Half, is_any_nan16, half_is_nan)
+ANY_NAN(double, is_any_nan, int64_t, DIFFERS)
+ANY_NAN(float, is_any_nan32, int32_t, DIFFERS)
+ANY_NAN(Half, is_any_nan16, int16_t, half_is_nan)
 
 bool play_has_bad_action(const Turn *turn) {
     const Actions *a = &turn->play->actions;

@@ -38,6 +38,8 @@ def test_examples_of_commands_run(block, tmp_path, monkeypatch, capsys):
     else:
         shutil.copy(fmugym.bundled_fmu("Pendulum"), "model.fmu")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
+    if "system.ssp" in block:
+        write_system("system.ssp")
     if "fmugym new" not in block:
         assert main(["new", "model.fmu", "--output", "task.toml"]) == 0
     for command in commands(block):
@@ -48,6 +50,11 @@ def test_examples_of_commands_run(block, tmp_path, monkeypatch, capsys):
         assert program == "fmugym"
         assert main(arguments) == 0, capsys.readouterr().err
     capsys.readouterr()
+
+
+def write_system(path):
+    house = fmugym.bundled_fmu("House")
+    fmugym.FMUSystem({"first": house, "second": house}, ["first.T_air -> second.T_out"]).write(path)
 
 
 def test_every_command_has_an_example_or_a_link():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fmugym.pool import has_native_pool
-from fmugym.vector.hooks import loops, lowering
+from fmugym.vector.hooks import loops, lowering, program
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.loops import has_known_sines, loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
@@ -327,3 +327,29 @@ def test_powers_that_are_less_exact_are_not_taken_for_squares():
     values = np.linspace(1.0, 2.0, 1001)
     assert loops._is_within(np.float_power(values, 2.0), values, 0.515)
     assert not loops._is_within(np.nextafter(values * values, 9.0), values, 0.515)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "operations"),
+    [
+        (-1.0, 2.0, ["maximum d", "minimum d"]),
+        (2.0, -1.0, ["maximum d", "minimum d"]),
+        (-np.inf, 1e-300, ["maximum d", "minimum d"]),
+        (0.0, 1.0, ["call"]),  # -0.0 may stay or become 0.0
+        (-1.0, -0.0, ["call"]),
+        (np.nan, 1.0, ["call"]),
+    ],
+)
+def test_limits_that_need_no_loop_of_numpy(low, high, operations):
+    graph = Graph()
+    limits = graph.constant(low, DOUBLE), graph.constant(high, DOUBLE)
+    cells = graph.load("row", ("output", 0), DOUBLE, None), *limits
+    node = graph.apply(np._core.umath.clip, cells, DOUBLE).node
+    compiled = lowering.compile_graph(graph, [lowering.Store(node, ("input", 0))], [], 0)
+    names = [OPERATIONS[line[0]] for line in compiled.code]
+    assert names == ["load_row", *operations, "store_row"]
+    x = np.array([-0.0, 0.0, np.nan, np.inf, -np.inf, 1e-300, -1e-300, -1.0, 2.0, 7.0, -7.0])
+    stored = np.zeros_like(x)
+    rows = {("output", 0): x, ("input", 0): stored}
+    program.evaluate(compiled, rows.__getitem__, (x, x))
+    assert stored.tobytes() == np.clip(x, low, high).tobytes()

@@ -442,7 +442,7 @@ def test_a_task_file_gives_sizes(sized, tmp_path):
 
 
 @pytest.mark.parametrize("words", [(), ("--class",)], ids=["task", "class"])
-def test_fmugym_new_knows_elements(state_space, tmp_path, words):
+def test_fmugym_new_knows_elements(state_space, tmp_path, capsys, words):
     path = tmp_path / ("new.py" if words else "new.toml")
     assert cli.main(["new", str(state_space), "--output", str(path), *words]) == 0
     text = path.read_text()
@@ -450,6 +450,9 @@ def test_fmugym_new_knows_elements(state_space, tmp_path, words):
         assert f'"{name}"' in text
     assert "[[-1.0, 0.5], [0.0, -2.0]]" in text
     if not words:
+        path.write_text(text.replace("# A = [[-1.0, 0.5]", "A = [[-1.0, 0.25]"))
+        assert cli.main(["validate", str(path)]) == 0
+        assert "each parameter of the task has an effect" in capsys.readouterr().out
         env = fmugym.load(path)
         env.reset()
         env.step(env.action_space.sample())

@@ -356,9 +356,9 @@ def _differ(first: _Episode, second: _Episode) -> bool:
 
 
 def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
-    """Compare episodes with two values of each parameter of the task."""
-    given = env.config.model_parameters
-    useless = [name for name, value in given.items() if not _has_effect(env, name, value)]
+    """Compare episodes with two values of each parameter of the task, or of all of an array."""
+    given = {name: _numbers_of(env, name) for name in env.config.model_parameters}
+    useless = [name for name, values in given.items() if not _has_effect(env, values)]
     if useless:
         yield Finding(
             "warning",
@@ -370,12 +370,22 @@ def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
         yield Finding("ok", "parameters", "each parameter of the task has an effect")
 
 
-def _has_effect(env: FMUEnv, name: str, value: Any) -> bool:
+def _numbers_of(env: FMUEnv, name: str) -> dict[str, Any]:
+    """What a parameter is, by scalars; nothing for Strings and structural parameters."""
+    known = env._interface.parameters
+    scalars = env.fmu.description.scalars(name)
+    return {v.name: known[v.name] for v in scalars if v.name in known}
+
+
+def _has_effect(env: FMUEnv, given: Mapping[str, Any]) -> bool:
     """Whether two values give different episodes; also true if only one value is possible."""
-    values = _two_values(env, name, value)
-    if values[0] == values[1]:
+    pairs = {name: _two_values(env, name, value) for name, value in given.items()}
+    if all(first == second for first, second in pairs.values()):
         return True
-    options = [{"model_parameters": {name: one}} for one in values]
+    options = [
+        {"model_parameters": {name: pair[place] for name, pair in pairs.items()}}
+        for place in (0, 1)
+    ]
     try:
         episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
     except FMUGymError:  # the FMU does not take a value that was made up here

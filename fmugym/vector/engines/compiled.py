@@ -43,6 +43,7 @@ __all__ = ["CompiledEngine", "find_programs"]
 logger = logging.getLogger(__name__)
 
 _BOOL = np.dtype(np.bool_)
+_empty = np.empty  # in each step, so the look-ups count
 
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
@@ -371,8 +372,8 @@ class CompiledEngine(BatchEngine):
             actions = self._checked_ahead(actions, resetting)
         drawn, last, started = self._spare or self._make_spare()
         drawn = drawn if resetting is None else self._draw_ahead(resetting)
-        seen, rewards = self._new_arrays(), np.empty(self._n)
-        done, cut = np.empty(self._n, _BOOL), np.empty(self._n, _BOOL)
+        seen, n = self._new_arrays(), self._n
+        rewards, done, cut = _empty(n), _empty(n, _BOOL), _empty(n, _BOOL)
         play = self._play if resetting is started is None else self._play_with_resets
         self.has_moved = True  # unless the call refuses its arguments
         try:
@@ -576,6 +577,10 @@ class CompiledEngine(BatchEngine):
         self._require_finite_inputs(resetting)
 
 
+def _named_arrays(shapes: Sequence[tuple[str, Any, Any]]) -> dict[str, npt.NDArray[Any]]:
+    return {name: _empty(shape, dtype) for name, shape, dtype in shapes}
+
+
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
 
@@ -604,9 +609,8 @@ class _Layout:
         self._n = len(env.step_count)
         self._paths = [array.path for array in task.seen]
         self._shapes = [((self._n, *array.shape), array.dtype) for array in task.seen]
-        self._named_shapes = [
-            (path[-1], *shape) for path, shape in zip(self._paths, self._shapes, strict=True)
-        ]
+        paths = zip(self._paths, self._shapes, strict=True)
+        self._named_shapes = [(path[-1], *shape) for path, shape in paths]
         self.new_arrays: Callable[[], Any] = self._stored
         self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
         if not task.seen and env._pool_observes:
@@ -615,13 +619,10 @@ class _Layout:
         elif self._paths == [("observation",)]:
             self.new_arrays, self.divided = partial(np.empty, *self._shapes[0]), None
         elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
-            self.new_arrays, self.divided = self._named, None
+            self.new_arrays, self.divided = partial(_named_arrays, self._named_shapes), None
 
     def _stored(self) -> tuple[npt.NDArray[Any], ...]:
         return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
-
-    def _named(self) -> dict[str, npt.NDArray[Any]]:
-        return {name: np.empty(shape, dtype) for name, shape, dtype in self._named_shapes}
 
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""

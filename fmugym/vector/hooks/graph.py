@@ -119,8 +119,20 @@ class Graph:
         """A function of numpy of values that have the types of one of its loops."""
         if ufunc in _IDENTITIES:
             return cells[0]
+        if ufunc is _CLIP and dtype.kind == "f" and all(map(self._is_limit, cells[1:])):
+            value, low, high = cells
+            raised = self.apply(np.maximum, (value, low), dtype)
+            return self.apply(np.minimum, (raised, high), dtype)
         _require_free(self, ufunc, cells, dtype)
         return self.compute("ufunc", ufunc, cells, dtype, ufunc)
+
+    def _is_limit(self, cell: Cell) -> bool:
+        """Whether it is a constant to which ``numpy.clip`` limits as minimum and maximum do.
+
+        Of zeros with different signs and of NaNs, they may choose different ones.
+        """
+        value = self.value(cell)
+        return value is not None and bool(value != 0.0) and not np.isnan(value)
 
     def part(
         self,
@@ -181,6 +193,8 @@ class Graph:
 _LARGEST: Final = sys.float_info.max
 
 _FINITE_ROWS: Final = frozenset({"output", "kept", "input", "parameter"})
+
+_CLIP: Final[np.ufunc] = np._core.umath.clip  # type: ignore[attr-defined]  # no stub has it
 
 _IDENTITIES: Final = frozenset({np.positive, np.conjugate})
 
