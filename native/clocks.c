@@ -73,7 +73,10 @@ static Status prepare(Solver *me, const Clock *clock, Ticks *ticks) {
     Status status = STATUS_OK;
     int qualifier;
 
-    if (clock->kind == CLOCK_FIXED) {
+    if (clock->kind == CLOCK_CONSTANT || clock->kind == CLOCK_FIXED) {
+        status = check_interval(me, clock, interval); /* the XML may give none */
+    }
+    if (clock->kind == CLOCK_FIXED && status <= STATUS_WARNING) {
         status = set_interval(me, clock);
     } else if (clock->kind >= CLOCK_CALCULATED && clock->kind <= CLOCK_CHANGING) {
         status = ask_interval(me, clock, &interval, &qualifier);

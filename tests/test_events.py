@@ -5,6 +5,7 @@ from contextlib import closing
 
 import clocks_tools
 import exchange_tools
+import fmu_tools
 import numpy as np
 import pytest
 
@@ -172,6 +173,19 @@ class TestEarlyReturn:
                 ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
         plain, early = ends.values()
         np.testing.assert_allclose(early, plain, rtol=2e-3)  # its Euler steps end elsewhere
+
+    @all_kinds
+    @pytest.mark.parametrize("name", ["constant", "fixed"])
+    def test_a_clock_without_interval_is_named(self, fmu_path, tmp_path, kind, name):
+        if kind == "native" and not pools.has_native_pool():
+            pytest.skip("the C extension was not built")
+        given = {"constant": ' intervalDecimal="0.1"', "fixed": ' intervalCounter="1"'}[name]
+        fmu = FMU(fmu_tools.edited_fmu(fmu_path(), tmp_path, {given: ""}), probe_timeout=None)
+        spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1)
+        with closing(opening.make_pool(fmu, spec, 1, LOG, **OPTIONS[kind])) as pool:
+            pool.reset((), np.zeros((0, 1)))
+            reference = list(clocks_tools.CLOCKS).index(name)
+            assert f"value reference {reference} has an interval of nan" in pool.failure(0)
 
 
 class TestTriggeredClocks:

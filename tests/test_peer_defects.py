@@ -127,7 +127,7 @@ class TestFMUGym:
 
         for owner, name in [
             (zipfile, "ZipFile"),
-            (fmugym.pool.python, "Library"),
+            (fmugym.pool.python, "open_library"),
             (fmugym.fmi.library.Library, "instantiate"),
         ]:
             monkeypatch.setattr(owner, name, refuse)

@@ -19,6 +19,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
+from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import (
     MASTERS,
@@ -187,14 +188,16 @@ class TestBothEngines:
             found.append(play(pool, 4, np.linspace(1, 2, 4).reshape(4, 1, 1)))
         assert found[0].tobytes() == found[1].tobytes()
 
-    def test_exchange_model_exchange_and_co_simulation(self, make, fmus, tmp_path):
-        """x' = u - x with its solver beside a gain; FMI 1.0, 2.0 and 3.0 in one system."""
+    @pytest.mark.parametrize("versions", [(1, 2), (2, 1), (3, 3), (1, 1)])
+    def test_exchange_model_exchange_and_co_simulation(self, make, fmus, tmp_path, versions):
+        """x' = 0.5 x - x with its solver beside a gain; two episodes of the same instance."""
         found = []
         for native in (False, True):
-            plan = decay_with_gain(tmp_path, fmus)
-            pool = make(plan, (), ["decay.x", "gain.y1"], native, time_step=0.05)
-            found.append(play(pool, 40))
-        assert found[0].tobytes() == found[1].tobytes()
+            plan = decay_with_gain(tmp_path, fmus, versions)
+            pool = make(plan, (), ["decay.x", "gain.y1"], native, time_step=0.02)
+            found += [play(pool, 50), play(pool, 50)]
+        assert all(rows.tobytes() == found[0].tobytes() for rows in found)
+        assert np.allclose(found[0][:, 0], np.exp(-0.5 * np.arange(51) * 0.02), atol=0.01)
 
     def test_serialize_alike(self, make):
         found = []
@@ -540,6 +543,24 @@ def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
     assert known_verdict(SystemFMU(masses([fmus[2], fmus[3]]))) is not None
     other = masses([fmus[2], fmus[3]], steps=(2, 1))
     assert known_verdict(SystemFMU(other)) is None
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+@pytest.mark.parametrize("method", list(ResetMethod)[:4])
+def test_episodes_begin_anew_by_each_method(make, method):
+    """Each instance has private copies of all libraries, which are also loaded anew."""
+    fmu = SystemFMU(pendulums())
+    outputs = tuple(map(fmu.variable, PENDULUM_OUTPUTS))
+    spec = PoolSpec((), outputs, 0.02, reset_method=method)
+    pool = local_pool(fmu, spec, 2, LOG, native=True, private_libraries=True)
+    try:
+        episodes = [play(pool, 10) for _ in range(4)]
+        assert all(rows.tobytes() == episodes[0].tobytes() for rows in episodes)
+    finally:
+        pool.close()
+    assert play(make(pendulums(), (), PENDULUM_OUTPUTS, time_step=0.02), 10).tobytes() == (
+        episodes[0].tobytes()
+    )
 
 
 @pytest.mark.parametrize("workers", [1, 2])

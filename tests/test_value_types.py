@@ -302,6 +302,19 @@ def test_vector_environments_do_as_single_ones(state_space, options):
     envs.close()
 
 
+def test_each_environment_has_its_own_array(state_space):
+    envs = FMUVectorEnv(lambda: state_space_env(state_space, model_parameters={"x_0": 0.0}), 2)
+    envs.set_attr("x_0", [[1, 2], [3, 4]])
+    envs.set_attr("A[1,2]", [0.5, 0.0])
+    assert envs.reset()[0][:, 3:].tolist() == [[1, 2], [3, 4]]
+    rows = envs.step(np.zeros((2, 1), np.float32))[0]
+    assert rows[0, 3:] == pytest.approx(exact([1, 2], 0, 1), rel=1e-6)
+    assert rows[1, 3] == pytest.approx(3 * np.exp(-STEP), rel=1e-6)
+    with pytest.raises(ConfigError, match=r"'x_0'.*\(2,\)"):
+        envs.set_attr("x_0", [[1, 2], [3]])
+    envs.close()
+
+
 def test_hooks_on_arrays_of_environments(state_space):
     class Sum(Env):
         def _is_done(self):

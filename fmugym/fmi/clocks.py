@@ -128,6 +128,8 @@ class Timetable:
 
     def _first(self, clock: Variable, time: float) -> Ticks:
         interval, shift = clock.interval, clock.shift
+        if clock.ticking in ("constant", "fixed"):
+            self._check(clock, interval, time)  # the XML may give none
         if clock.ticking == "fixed":
             self._calls.set_interval(clock)
         elif clock.ticking in ("calculated", *_MAY_CHANGE):

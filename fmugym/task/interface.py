@@ -29,6 +29,7 @@ __all__ = [
     "output_variable",
     "outputs_named",
     "resolve",
+    "spread",
     "start_values",
     "start_variable",
     "structural_values",

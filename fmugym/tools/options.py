@@ -55,7 +55,7 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Add a command that calls a function with the arguments."""
     command: argparse.ArgumentParser = commands.add_parser(
-        name, help=text, description=f"{text.capitalize()}."
+        name, help=text, description=f"{text[0].upper()}{text[1:]}."
     )
     command.set_defaults(run=run)
     return command

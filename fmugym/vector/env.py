@@ -20,7 +20,7 @@ from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.task.interface import checked_value
+from fmugym.task.interface import checked_value, spread
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.vector.arguments import (
@@ -597,14 +597,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _is_parameter(self, name: str) -> bool:
         env = self._prototype
-        return not hasattr(env, name) and name in env.fmu.description.variables
+        return not hasattr(env, name) and env.fmu.description.find(name) is not None
 
     def _set_parameter(self, name: str, values: Sequence[Any]) -> None:
         """Set a parameter of all environments, from their next episodes on."""
         self._prototype._plan_episode({name: values[0]})  # it refuses what cannot be set
-        variable = self._prototype.fmu.variable(name)
-        numbers: FloatArray = np.array([checked_value(variable, value) for value in values])
-        self._engine.set_parameter(name, numbers)
+        scalars = self._prototype.fmu.description.scalars(name)
+        rows = [spread(name, scalars, value) for value in values]
+        columns: dict[str, FloatArray] = {
+            variable.name: np.array([checked_value(variable, row[place]) for row in rows])
+            for place, variable in enumerate(scalars)
+        }
+        for scalar, numbers in columns.items():
+            self._engine.set_parameter(scalar, numbers)
 
     def _set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute of some environments."""
