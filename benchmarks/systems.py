@@ -1,4 +1,4 @@
-"""Measure a system of three bundled FMUs: beside their own steps, and beside FMPy's container."""
+"""Measure systems of three bundled FMUs: beside their own steps, and beside FMPy's container."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import fmpy
 import numpy as np
@@ -24,17 +26,69 @@ from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, Sys
 
 __all__ = ["tables"]
 
-STEP = 0.05
 SIZE = 1024
 BATCH = 20
 """Steps between two looks at the clock."""
 
 NAMES = ("a", "b", "c")
-HEAT = 0.29
-"""The input of every heat pump; in the system, two of them get it from the house before."""
 
-LINKS = (("a", "T_air", "b", "T_out"), ("b", "T_air", "c", "T_out"))
-"""Component and output, component and input."""
+
+class Model(NamedTuple):
+    """The FMU of all three components, in FMI 3.0.
+
+    Attributes:
+        name: Of the bundled FMU.
+        told: What the table calls it.
+        step: The communication step size in seconds.
+        value: What is written to the inputs that are not connected.
+        input, outputs: The variables that the pool exchanges.
+        link: The output that goes to an input of the next component.
+        starts: Start values.
+    """
+
+    name: str
+    told: str
+    step: float
+    value: float
+    input: str
+    outputs: tuple[str, str]
+    link: tuple[str, str]
+    starts: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return bundled_fmu(self.name, "3.0")
+
+    @property
+    def links(self) -> tuple[tuple[str, str, str, str], ...]:
+        """Component and output, component and input."""
+        pairs = pairwise(NAMES)
+        return tuple((one, self.link[0], other, self.link[1]) for one, other in pairs)
+
+    @property
+    def inputs(self) -> list[str]:
+        """The inputs of the system: those that no component writes."""
+        driven = {f"{other}.{name}" for _, _, other, name in self.links}
+        return [name for name in (f"{one}.{self.input}" for one in NAMES) if name not in driven]
+
+    @property
+    def read(self) -> list[str]:
+        """The outputs of the system."""
+        return [f"{one}.{name}" for one in NAMES for name in self.outputs]
+
+
+MODELS = (
+    Model(
+        *("House", "houses (a step of 50 ms)", 0.05, 0.29),
+        *("u", ("T_air", "T_w"), ("T_air", "T_out")),
+    ),
+    Model(
+        *("Pendulum", "pendulums (a step of explicit Euler)", 0.02, 0.0),
+        *("tau", ("q", "q_dot"), ("q", "tau")),
+        (("solver", 1), ("max_step", 1.0)),
+    ),
+)
 
 OWN = "the three FMUs, each in a pool of its own"
 CONTAINER = "FMPy's container in a Python loop (Jacobi)"
@@ -42,53 +96,61 @@ CONTAINER = "FMPy's container in a Python loop (Jacobi)"
 
 def tables(effort: Effort) -> list[Table]:
     """Measure."""
-    header = ["one thread", f"{SIZE:,} systems", "to their own steps", "one system", "to FMPy"]
-    table = Table("Steps/s of systems of three houses (FMI 3.0, a step of 50 ms)", header)
+    return [_table(model, effort) for model in MODELS]
+
+
+def _table(model: Model, effort: Effort) -> Table:
+    header = ["one thread", f"{SIZE:,} systems", "to their own steps", "to FMPy", "one system"]
+    table = Table(f"Steps/s of systems of three {model.told}", [*header, "to FMPy"])
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, ExitStack() as stack:
         try:
             require_native_pool()
         except MissingError as reason:
-            table.rows.append([str(reason), *[""] * (len(header) - 1)])
-            return [table]
-        _add(table, by_turns(_runs(stack, Path(folder)), effort))
-    return [table]
+            table.rows.append([str(reason), *[""] * len(header)])
+            return table
+        _add(table, by_turns(_runs(stack, model, Path(folder)), effort))
+    return table
 
 
-def _runs(stack: ExitStack, folder: Path) -> dict[str, Run]:
-    runs = {OWN: _run(_step_all([_alone(stack) for _ in NAMES]), SIZE)}
+def _runs(stack: ExitStack, model: Model, folder: Path) -> dict[str, Run]:
+    runs = {OWN: _run(_step_all([_alone(stack, model) for _ in NAMES]), SIZE)}
     for master in MASTERS:
         for count in (1, SIZE):
-            runs[f"{master} {count}"] = _run(_step_all([_system(stack, master, count)]), count)
-    runs[CONTAINER] = _run(_stepping(stack, _container(folder)), 1)
+            runs[f"{master} {count}"] = _run(
+                _step_all([_system(stack, model, master, count)]), count
+            )
+    runs[CONTAINER] = _run(_stepping(stack, model, _container(folder, model)), 1)
     return runs
 
 
-def _alone(stack: ExitStack) -> Pool:
-    fmu = FMU(bundled_fmu("House", "3.0"))
-    return _pool(stack, fmu, ["u"], ["T_air", "T_w"], SIZE)
+def _alone(stack: ExitStack, model: Model) -> Pool:
+    fmu = FMU(model.path)
+    return _pool(stack, model, fmu, [model.input], list(model.outputs), SIZE)
 
 
-def _system(stack: ExitStack, master: str, count: int) -> Pool:
-    path = bundled_fmu("House", "3.0")
+def _system(stack: ExitStack, model: Model, master: str, count: int) -> Pool:
     plan = SystemPlan(
-        "houses",
-        tuple(Component(name, path) for name in NAMES),
-        tuple(Link(*link) for link in LINKS),
+        model.name,
+        tuple(Component(name, model.path) for name in NAMES),
+        tuple(Link(*link) for link in model.links),
         tuple(Group((name,)) for name in NAMES),
-        tuple(Evaluation((index,)) for index in range(len(LINKS))),
+        tuple(Evaluation((index,)) for index in range(len(model.links))),
         master,
     )
-    inputs = [f"{name}.u" for name in NAMES]
-    outputs = [f"{name}.{own}" for name in NAMES for own in ("T_air", "T_w")]
-    return _pool(stack, SystemFMU(plan), inputs, outputs, count)
+    return _pool(stack, model, SystemFMU(plan), model.inputs, model.read, count)
 
 
-def _pool(stack: ExitStack, fmu: FMU, inputs: list[str], outputs: list[str], count: int) -> Pool:
-    spec = PoolSpec(tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), STEP)
+def _pool(
+    stack: ExitStack, model: Model, fmu: FMU, inputs: list[str], outputs: list[str], count: int
+) -> Pool:
+    spec = PoolSpec(tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), model.step)
     pool = local_pool(fmu, spec, count, logging.getLogger(__name__), threads=1)
     stack.callback(pool.close)
-    pool.reset((), np.empty((0, count)))
-    pool.inputs[:] = HEAT
+    of_one = {f"{one}.{name}": value for one in NAMES for name, value in model.starts}
+    starts = of_one if isinstance(fmu, SystemFMU) else dict(model.starts)
+    values = np.repeat(np.array([list(starts.values())], float).T, count, axis=1)
+    pool.reset(tuple(map(fmu.variable, starts)), values)
+    pool.inputs[:] = model.value
     return pool
 
 
@@ -115,19 +177,20 @@ def _run(step: Callable[[int], None], count: int) -> Run:
     return run
 
 
-def _container(folder: Path) -> Path:
+def _container(folder: Path, model: Model) -> Path:
     tests = str(Path(__file__).parent.parent / "tests")
     if tests not in sys.path:
         sys.path.append(tests)
     from container_tools import container
 
-    names = [(name, variable) for variable in ("T_air", "T_w", "u") for name in NAMES]
-    path: Path = container(folder, bundled_fmu("House", "3.0"), NAMES, LINKS, names, STEP)
+    own = [*model.outputs, model.input, *(name for name, _ in model.starts)]
+    names = [(one, variable) for variable in own for one in NAMES]
+    path: Path = container(folder, model.path, NAMES, model.links, names, model.step)
     return path
 
 
-def _stepping(stack: ExitStack, path: Path) -> Callable[[int], None]:
-    """Set three inputs, step and get six outputs, as the pool does."""
+def _stepping(stack: ExitStack, model: Model, path: Path) -> Callable[[int], None]:
+    """Set the inputs, step and get six outputs, as the pool does."""
     description = fmpy.read_model_description(str(path), validate=False)
     fmu = FMU3Slave(
         guid=description.instantiationToken,
@@ -137,17 +200,22 @@ def _stepping(stack: ExitStack, path: Path) -> Callable[[int], None]:
     )
     fmu.instantiate()
     stack.callback(fmu.freeInstance)
+    known = {v.name: v for v in description.modelVariables}
+    for name, value in model.starts:
+        for one in NAMES:
+            variable = known[f"{one}.{name}"]
+            setter = fmu.setFloat64 if variable.type == "Float64" else fmu.setInt64
+            setter([variable.valueReference], [value])
     fmu.enterInitializationMode()
     fmu.exitInitializationMode()
-    references = {v.name: v.valueReference for v in description.modelVariables}
-    inputs = [references[f"{name}.u"] for name in NAMES]
-    outputs = [references[f"{n}.{v}"] for n in NAMES for v in ("T_air", "T_w")]
-    values, count = [HEAT] * len(NAMES), 0
+    inputs = [known[name].valueReference for name in model.inputs]
+    outputs = [known[name].valueReference for name in model.read]
+    values, count = [model.value] * len(inputs), 0
 
     def step(_: int) -> None:
         nonlocal count
         fmu.setFloat64(inputs, values)
-        fmu.doStep(count * STEP, STEP)
+        fmu.doStep(count * model.step, model.step)
         fmu.getFloat64(outputs)
         count += 1
 
@@ -156,12 +224,12 @@ def _stepping(stack: ExitStack, path: Path) -> Callable[[int], None]:
 
 def _add(table: Table, samples: dict[str, list[Sample]]) -> None:
     own, base = samples[OWN], samples[CONTAINER]
-    table.rows.append([OWN, rate(wall_rate(own)), times(1.0), "", ""])
+    table.rows.append([OWN, rate(wall_rate(own)), times(1.0), "", "", ""])
     for master in MASTERS:
         many, one = samples[f"{master} {SIZE}"], samples[f"{master} 1"]
-        cells = [rate(wall_rate(many)), times(ratio(many, own))]
-        cells += [rate(wall_rate(one)), times(ratio(many, base))]
+        cells = [rate(wall_rate(many)), times(ratio(many, own)), times(ratio(many, base))]
+        cells += [rate(wall_rate(one)), times(ratio(one, base))]
         table.rows.append([f'a system, `"{master}"`', *cells])
         table.data.append({"way": master, "many": wall_rate(many), "one": wall_rate(one)})
-    table.rows.append([CONTAINER, "", "", rate(wall_rate(base)), times(1.0)])
+    table.rows.append([CONTAINER, "", "", "", rate(wall_rate(base)), times(1.0)])
     table.data.append({"way": CONTAINER, "one": wall_rate(base)})

@@ -28,6 +28,8 @@ def container(folder, path, components, links, names, step):
     for pair in names:
         variable = copy.copy(own[pair])
         variable.name = ".".join(pair)
+        if variable.type == "Enumeration":  # whose functions are those of Int64
+            variable.type = "Int64"
         variables.append(variable)
     whole = fmpy.read_model_description(str(path))
     # the value reference 0 is that of time, whatever the description says

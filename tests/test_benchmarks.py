@@ -74,7 +74,7 @@ def test_systems_are_compared_with_their_fmus_and_with_fmpy():
     assert (result.returncode, result.stderr) == (0, "")
     rows = tables_in(result.stdout)
     assert rows["the three FMUs, each in a pool of its own"][1] == "1.00x"
-    assert rows["FMPy's container in a Python loop (Jacobi)"][3] == "1.00x"
+    assert rows["FMPy's container in a Python loop (Jacobi)"][4] == "1.00x"
     assert all(rows['a system, `"jacobi"`'])
 
 
