@@ -1,4 +1,4 @@
-#include "clocks.h"
+#include "clock.h"
 
 #include <float.h>
 #include <math.h>

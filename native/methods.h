@@ -4,7 +4,7 @@
 #ifndef FMUGYM_METHODS_H
 #define FMUGYM_METHODS_H
 
-#include "clocks.h"
+#include "clock.h"
 #include "fmi.h"
 
 struct Solver;

@@ -1,4 +1,4 @@
-#include "ramps.h"
+#include "ramp.h"
 
 #include <math.h>
 

@@ -9,7 +9,7 @@
 
 #include "fmi.h"
 #include "methods.h"
-#include "ramps.h"
+#include "ramp.h"
 
 /* What the FMU tells after one update of its discrete states. */
 typedef struct {

@@ -14,7 +14,7 @@ from fmugym import FMU, ConfigError
 from fmugym.archive.dependencies import missing_libraries
 from fmugym.archive.loader import ask, ask_in_a_child
 from fmugym.archive.packages import source_of
-from fmugym.tools import stand_in
+from fmugym.tools import compilers, stand_in
 from fmugym.tools.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
@@ -83,8 +83,8 @@ STEPPED = "[0.30000001192092896, 1.0]"
 def compiler(request, monkeypatch):
     """Build with the system's compiler, and without one with that of a package."""
     if request.param == "ziglang":
-        monkeypatch.setattr(stand_in, "_COMPILERS", ("no-such-compiler",))
-    elif not any(map(shutil.which, stand_in._COMPILERS)):
+        monkeypatch.setattr(compilers, "_PROGRAMS", {"C": ("no-such-compiler",)})
+    elif not any(map(shutil.which, compilers._PROGRAMS["C"])):
         pytest.skip("there is no system compiler")
     return request.param
 
@@ -161,8 +161,8 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
 
 
 def test_without_a_compiler(fmu_path, tmp_path, monkeypatch):
-    monkeypatch.setattr(stand_in, "_COMPILERS", ())
-    monkeypatch.setattr(stand_in.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(compilers, "_PROGRAMS", {"C": ()})
+    monkeypatch.setattr(compilers.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"needs a C compiler: install gcc .* or ziglang"):
         stand_in.build_stand_in(FMU(fmu_path), tmp_path)
 

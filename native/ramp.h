@@ -1,8 +1,8 @@
 /* Inputs of FMI 1.0 and 2.0 that change linearly within a step: from the value of the last step to
  * that of this one. The FMU gets the value and the derivative at each communication point. */
 
-#ifndef FMUGYM_RAMPS_H
-#define FMUGYM_RAMPS_H
+#ifndef FMUGYM_RAMP_H
+#define FMUGYM_RAMP_H
 
 #include "fmi.h"
 

@@ -2,8 +2,8 @@
  *
  * For the solver, which enters event mode when a clock is due: solver.h. */
 
-#ifndef FMUGYM_CLOCKS_H
-#define FMUGYM_CLOCKS_H
+#ifndef FMUGYM_CLOCK_H
+#define FMUGYM_CLOCK_H
 
 #include "fmi.h"
 
