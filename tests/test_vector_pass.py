@@ -247,7 +247,7 @@ class TestGuards:
     @pytest.mark.parametrize("shapes", [((3,), (4, 4)), ((4,), (4, 3))])
     def test_starts(self, pool, shapes):
         mask, observations = np.ones(shapes[0], np.bool_), np.empty(shapes[1], np.float32)
-        with pytest.raises(ValueError, match="must have the shape|has 48 bytes, expected 64"):
+        with pytest.raises(ValueError, match=r"must have the shape|has 48 bytes, expected 64"):
             pool.start(mask, observations, np.empty((4, 4)))
 
 
