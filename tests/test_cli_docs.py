@@ -20,6 +20,7 @@ BLOCKS += re.findall(
 )
 NEEDS = {
     "fmugym train": "stable_baselines3",
+    "fmugym tune": "scipy",
     "--agent": "stable_baselines3",
     "record": "matplotlib",
 }
