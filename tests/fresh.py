@@ -1,6 +1,7 @@
 """Episodes as FMPy plays them: each on a fresh instance of a fresh copy of the library."""
 
 import contextlib
+import math
 import os
 import shutil
 import tempfile
@@ -8,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import fmpy
+import numpy as np
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import fmi2Discard, fmi2Terminated
 from fmpy.simulation import (
@@ -87,8 +89,8 @@ class FreshInstance:
         self._fmu.exitInitializationMode()
 
     def get(self, names):
-        """The values of variables as floats."""
-        return [self._get(self._variables[name]) for name in names]
+        """The values of variables and of elements of arrays, such as ``y[2]``, as floats."""
+        return [self._get(name) for name in names]
 
     def get_at_start(self, names):
         """The same before the first step; start values if the FMU cannot be read yet."""
@@ -97,17 +99,33 @@ class FreshInstance:
         except FMICallException:
             return [float(self._variables[name].start or 0.0) for name in names]
 
-    def _get(self, variable):
-        get = getattr(self._fmu, f"get{self._kind(variable)}")
-        return float(get([variable.valueReference])[0])
+    def _get(self, name):
+        variable, element = self._found(name)
+        return float(self._all(variable)[element])
 
     def set(self, values):
         """Set variables by name."""
         for name, value in values.items():
-            variable = self._variables[name]
+            variable, element = self._found(name)
             convert = {"Real": float, "Float64": float, "Float32": float, "Boolean": bool}
-            value = convert.get(variable.type, round)(float(value))
-            getattr(self._fmu, f"set{self._kind(variable)}")([variable.valueReference], [value])
+            changed = [0] if not variable.shape else self._all(variable)
+            changed[element] = convert.get(variable.type, round)(float(value))
+            getattr(self._fmu, f"set{self._kind(variable)}")([variable.valueReference], changed)
+
+    def _found(self, name):
+        """The variable that a name stands for, and the place of the element in it."""
+        if name in self._variables:
+            return self._variables[name], 0
+        array, _, place = name.removesuffix("]").rpartition("[")
+        variable = self._variables[array]
+        indices = [int(index) - 1 for index in place.split(",")]
+        return variable, int(np.ravel_multi_index(indices, variable.shape))
+
+    def _all(self, variable):
+        get = getattr(self._fmu, f"get{self._kind(variable)}")
+        if not variable.shape:
+            return get([variable.valueReference])
+        return get([variable.valueReference], nValues=math.prod(variable.shape))
 
     def _kind(self, variable):
         if variable.type == "Enumeration":

@@ -65,11 +65,11 @@ def config_of(path):
 
 def inputs_of(path, config, length, index):
     """Inputs of one environment that move within their limits, shape (steps, inputs)."""
-    variables = fmugym.FMU(path).description.variables
+    fmu = fmugym.FMU(path)
     rows = np.empty((length, len(config["model_input_names"])))
     for column, name in enumerate(config["model_input_names"]):
         fraction = 0.5 + 0.45 * np.sin((0.7 + 0.3 * column) * np.arange(length) + index)
-        rows[:, column] = _values(variables[name], config.get("bounds", {}), fraction)
+        rows[:, column] = _values(fmu.variable(name), config.get("bounds", {}), fraction)
     return rows
 
 
