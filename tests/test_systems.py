@@ -540,6 +540,7 @@ def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
     assert verdict.complete
     assert verdict.deterministic
     assert str(verdict.reset_method) == "restore"
+    assert verdict.neighbours == "independent"
     assert known_verdict(SystemFMU(masses([fmus[2], fmus[3]]))) is not None
     other = masses([fmus[2], fmus[3]], steps=(2, 1))
     assert known_verdict(SystemFMU(other)) is None

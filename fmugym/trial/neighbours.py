@@ -22,6 +22,7 @@ from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
+from fmugym.fmi.system import open_library
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.patience import licence_errors, require_licence
@@ -187,7 +188,7 @@ def disturb_in_threads(
         FMULoadError: If FMPy cannot load the FMU.
         SimulationError: If an instance alone fails.
     """
-    library = Library(candidate.open(), logger, spec.solving)
+    library = open_library(candidate.open(), logger, spec.solving, spec.inputs, spec.outputs)
     try:
         lives = _two_lives(library, spec)
         if lives[0]() != lives[0].outputs:
