@@ -86,7 +86,7 @@ class FMUParallelEnv(ParallelEnv[str, Array, Array]):
             or to two.
     """
 
-    metadata: dict[str, Any] = {"name": "fmugym", "render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"name": "fmugym", "render_modes": []}  # noqa: RUF012  # PettingZoo
 
     def __init__(self, env: FMUEnv, agents: Mapping[str, Agent] | None = None) -> None:
         self.env = env

@@ -53,7 +53,7 @@ class TestCompile:
         np.testing.assert_allclose(found, expected, rtol=1e-15)
 
     def test_ziglang_where_the_system_has_no_compiler(self, tmp_path, source_fmu, monkeypatch):
-        pytest.importorskip("ziglang")
+        pytest.importorskip("ziglang", reason="needs ziglang: the extra windows")
         monkeypatch.setattr(compilers.shutil, "which", lambda name: None)
         made = compile_fmu(source_fmu(3))
         assert np.isfinite(simulated(made, "co_simulation")).all()

@@ -13,6 +13,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.onnx_nodes import Nodes
+from fmugym.vector.hooks.graph import CLIP
 
 __all__ = ["computed", "interpolated"]
 
@@ -65,8 +66,6 @@ _OF_FLAGS: Final[Mapping[Any, str]] = {
 
 _ANGLES: Final[Mapping[Any, str]] = {np.arcsin: "Asin", np.arccos: "Acos", np.arctan: "Atan"}
 """Functions that ONNX Runtime computes with float32 only."""
-
-_CLIP: Final[Any] = np._core.umath.clip  # type: ignore[attr-defined]  # no stub has it
 
 
 def computed(nodes: Nodes, ufunc: Any, operands: Sequence[str], dtype: np.dtype[Any]) -> str:
@@ -182,7 +181,7 @@ def _logical(name: str) -> Callable[..., str]:
 _COMPOSED: Final[Mapping[Any, Callable[..., str]]] = {
     np.square: lambda nodes, dtype, x: nodes.add("Mul", x, x),
     np.not_equal: lambda nodes, dtype, a, b: nodes.add("Not", nodes.add("Equal", a, b)),
-    _CLIP: lambda nodes, dtype, x, a, b: nodes.add("Min", nodes.add("Max", x, a), b),
+    CLIP: lambda nodes, dtype, x, a, b: nodes.add("Min", nodes.add("Max", x, a), b),
     np.remainder: _remainder,
     np.floor_divide: _floor_divide,
     np.fmod: lambda nodes, dtype, a, b: nodes.add("Mod", a, b, fmod=1),

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import ConfigError
+from fmugym.vector.hooks.graph import CLIP
 
 __all__ = ["HELPERS", "TYPES", "constant", "expression"]
 
@@ -81,7 +82,6 @@ _OF_MATH: Final[Mapping[Any, str]] = {
 }
 """Functions of the C library for numbers of floating point."""
 
-_CLIP: Final[Any] = np._core.umath.clip  # type: ignore[attr-defined]  # no stub has it
 
 _OWN: Final[Mapping[Any, str]] = {
     np.minimum: "minimum",
@@ -90,7 +90,7 @@ _OWN: Final[Mapping[Any, str]] = {
     np.remainder: "remainder",
     np.floor_divide: "floor_divide",
     np.square: "square",
-    _CLIP: "clip",
+    CLIP: "clip",
 }
 
 HELPERS: Final[Mapping[str, str]] = {
@@ -193,7 +193,7 @@ def _of_whole_numbers(ufunc: Any, operands: Sequence[str], kind: str, use: Any) 
         return f"(!{first})"
     if kind == "?":
         return first if ufunc is np.absolute else None
-    if ufunc in {np.minimum, np.maximum, np.square, np.sign, _CLIP}:
+    if ufunc in {np.minimum, np.maximum, np.square, np.sign, CLIP}:
         return f"{use(_OWN[ufunc], kind)}({', '.join(operands)})"
     if ufunc is np.absolute:
         return f"({first} < 0 ? -{first} : {first})"

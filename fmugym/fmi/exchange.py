@@ -42,8 +42,9 @@ class _LastSet(NamedTuple):
 
     def is_that(self, other: _LastSet | None) -> bool:
         """Whether the same access set the same values, to the last bit."""
-        same = other is not None and other.access is self.access
-        return same and other.values.tobytes() == self.values.tobytes()  # type: ignore[union-attr]
+        if other is None or other.access is not self.access:
+            return False
+        return other.values.tobytes() == self.values.tobytes()
 
 
 class ExchangeInstance(Instance):

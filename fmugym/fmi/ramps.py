@@ -56,7 +56,7 @@ class _Ramped(Instance):
 
     def _prepare_step(self) -> Callable[[float, float], int]:
         # the class of the FMI version, which stands between this one and Instance
-        step = super()._prepare_step()  # type: ignore[safe-super]
+        step = super()._prepare_step()  # type: ignore[safe-super]  # a mixin
 
         def ramped_step(time: float, step_size: float) -> int:
             status = self._set_ramps(time)
@@ -86,7 +86,7 @@ class _Ramped(Instance):
         return sane(set_slopes(self._component, references, size, orders, numbers))
 
     def _prepare_initialization(self) -> Initialize:
-        initialize = super()._prepare_initialization()  # type: ignore[safe-super]
+        initialize = super()._prepare_initialization()  # type: ignore[safe-super]  # a mixin
 
         def run(span: Span, set_start_values: Callable[[], None]) -> None:
             self._ramps = ()

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fmugym.vector.hooks.program import UntraceableError, letter_of
 
-__all__ = ["Cell", "Graph", "Node"]
+__all__ = ["CLIP", "Cell", "Graph", "Node"]
 
 
 class Node(NamedTuple):
@@ -119,7 +119,7 @@ class Graph:
         """A function of numpy of values that have the types of one of its loops."""
         if ufunc in _IDENTITIES:
             return cells[0]
-        if ufunc is _CLIP and dtype.kind == "f" and all(map(self._is_limit, cells[1:])):
+        if ufunc is CLIP and dtype.kind == "f" and all(map(self._is_limit, cells[1:])):
             value, low, high = cells
             raised = self.apply(np.maximum, (value, low), dtype)
             return self.apply(np.minimum, (raised, high), dtype)
@@ -194,7 +194,7 @@ _LARGEST: Final = sys.float_info.max
 
 _FINITE_ROWS: Final = frozenset({"output", "kept", "input", "parameter"})
 
-_CLIP: Final[np.ufunc] = np._core.umath.clip  # type: ignore[attr-defined]  # no stub has it
+CLIP: Final[np.ufunc] = np._core.umath.clip  # type: ignore[attr-defined]  # no stub has it
 
 _IDENTITIES: Final = frozenset({np.positive, np.conjugate})
 
