@@ -6,7 +6,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "solver.h"
+#include "stages.h"
 
 enum { STAGES = 6 };
 
@@ -41,15 +41,6 @@ static const double dense[2][STAGES] = {
      -6.594389125716872},
 };
 
-static double sum(const Solver *me, const double *factors, int count, size_t state) {
-    double total = 0.0;
-
-    for (int j = 0; j < count; j++) {
-        total += factors[j] * me->stages[(size_t)j * me->n + state];
-    }
-    return total;
-}
-
 /* The row of the largest element in or below the diagonal. */
 static size_t pivot_of(const double *matrix, size_t n, size_t column) {
     size_t best = column;
@@ -70,14 +61,15 @@ static void swap(double *matrix, size_t n, size_t a, size_t b) {
     }
 }
 
-/* Factorizes in place, with partial pivoting. A singular matrix gives infinite or undefined
- * results, so that the step is refused. */
+/* Factorizes in place, with partial pivoting. The diagonal holds reciprocals, because divisions are
+ * slow. A singular matrix gives infinite or undefined results, so that the step is refused. */
 static void factorize(double *matrix, size_t n, uint32_t *pivots) {
     for (size_t k = 0; k < n; k++) {
         pivots[k] = (uint32_t)pivot_of(matrix, n, k);
         swap(matrix, n, k, pivots[k]);
+        const double reciprocal = matrix[k * n + k] = 1.0 / matrix[k * n + k];
         for (size_t row = k + 1; row < n; row++) {
-            const double factor = matrix[row * n + k] / matrix[k * n + k];
+            const double factor = matrix[row * n + k] * reciprocal;
             matrix[row * n + k] = factor;
             for (size_t i = k + 1; i < n; i++) {
                 matrix[row * n + i] -= factor * matrix[k * n + i];
@@ -86,22 +78,21 @@ static void factorize(double *matrix, size_t n, uint32_t *pivots) {
     }
 }
 
-static void solve(const double *matrix, size_t n, const uint32_t *pivots, double *b) {
-    for (size_t k = 0; k < n; k++) {
-        const double value = b[pivots[k]];
-        b[pivots[k]] = b[k];
-        b[k] = value;
-    }
-    for (size_t row = 1; row < n; row++) {
+static void solve(const double *matrix, size_t n, const uint32_t *pivots, double *restrict b) {
+    for (size_t row = 0; row < n; row++) {
+        double value = b[pivots[row]];
+        b[pivots[row]] = b[row];
         for (size_t i = 0; i < row; i++) {
-            b[row] -= matrix[row * n + i] * b[i];
+            value -= matrix[row * n + i] * b[i];
         }
+        b[row] = value;
     }
     for (size_t row = n; row-- > 0;) {
+        double value = b[row];
         for (size_t i = row + 1; i < n; i++) {
-            b[row] -= matrix[row * n + i] * b[i];
+            value -= matrix[row * n + i] * b[i];
         }
-        b[row] /= matrix[row * n + row];
+        b[row] = value * matrix[row * n + row];
     }
 }
 
@@ -117,24 +108,43 @@ static void prepare_matrix(Solver *me, double size) {
     factorize(me->matrix, me->n, me->pivots);
 }
 
-static Status do_stage(Solver *me, int s, double end) {
+/* Adds what the rates of a stage lack. The arrays do not overlap. */
+static ALWAYS_INLINE void couple(size_t n, const int s, double size,
+                                 const double *restrict slope, const double *restrict stages,
+                                 double *restrict stage) {
+    const double inverse = 1.0 / size, shift = size * slopes[s];
+
+    for (size_t i = 0; i < n; i++) {
+        stage[i] += weighted_sum(couplings[s], s, stages + i, n) * inverse + shift * slope[i];
+    }
+}
+
+/* A stage with the states where it is evaluated. */
+static ALWAYS_INLINE Status do_stage(Solver *me, const int s, double end) {
     const double time = me->memory.time, size = end - time;
     double *stage = me->stages + (size_t)s * me->n;
     Status status = STATUS_OK;
 
-    for (size_t i = 0; i < me->n; i++) {
-        me->next[i] = me->x[i] + sum(me, weights[s], s, i);
-    }
+    move_by_sums(me->n, me->x, 1.0, weights[s], s, me->stages, me->next);
     if (s == 0) {
         memcpy(stage, me->rates, me->n * sizeof *stage);
     } else {
         status = solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next, stage);
     }
-    for (size_t i = 0; i < me->n; i++) {
-        stage[i] += sum(me, couplings[s], s, i) / size + size * slopes[s] * me->slope[i];
-    }
+    couple(me->n, s, size, me->slope, me->stages, stage);
     solve(me->matrix, me->n, me->pivots, stage);
     return status;
+}
+
+/* Written out, so that the compiler knows the number of each stage. */
+static Status do_stages(Solver *me, double end) {
+    Status status = do_stage(me, 0, end);
+
+    status = status <= STATUS_WARNING ? do_stage(me, 1, end) : status;
+    status = status <= STATUS_WARNING ? do_stage(me, 2, end) : status;
+    status = status <= STATUS_WARNING ? do_stage(me, 3, end) : status;
+    status = status <= STATUS_WARNING ? do_stage(me, 4, end) : status;
+    return status <= STATUS_WARNING ? do_stage(me, 5, end) : status;
 }
 
 static Status step(Solver *me, double end, double *error) {
@@ -144,9 +154,7 @@ static Status step(Solver *me, double end, double *error) {
 
     if (status <= STATUS_WARNING) {
         prepare_matrix(me, size);
-    }
-    for (int s = 0; s < STAGES && status <= STATUS_WARNING; s++) {
-        status = do_stage(me, s, end);
+        status = do_stages(me, end);
     }
     for (size_t i = 0; i < me->n; i++) {
         me->next[i] += last[i];
@@ -160,8 +168,8 @@ static Status between(Solver *me, double end, double fraction, double *x) {
 
     (void)end;
     for (size_t i = 0; i < me->n; i++) {
-        const double first = sum(me, dense[0], STAGES - 1, i);
-        const double second = sum(me, dense[1], STAGES - 1, i);
+        const double first = weighted_sum(dense[0], STAGES - 1, me->stages + i, me->n);
+        const double second = weighted_sum(dense[1], STAGES - 1, me->stages + i, me->n);
         x[i] = me->x[i] * rest + fraction * (me->next[i] + rest * (first + fraction * second));
     }
     return STATUS_OK;

@@ -73,6 +73,7 @@ typedef struct Solver {
     const Floats *floats;
     uint64_t environment; /* for messages */
     Memory memory;
+    double fmu_time;       /* the time of the FMU; NaN if it must be set */
     bool is_there;         /* whether the FMU is at the time of the memory and at x */
     bool stale;            /* whether x and the nominal values must be read */
     bool knows_rates;      /* whether rates are those at x */

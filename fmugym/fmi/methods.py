@@ -89,8 +89,9 @@ class RungeKutta4(Method):
         k2 = me.rates_at(time + 0.5 * step, _moved(me.x, 0.5 * step, k1))
         k3 = me.rates_at(time + 0.5 * step, _moved(me.x, 0.5 * step, k2))
         k4 = me.rates_at(time + step, _moved(me.x, step, k3))
+        sixth = step / 6.0
         return [
-            x + step * (a + 2.0 * b + 2.0 * c + d) / 6.0
+            x + sixth * (a + 2.0 * b + 2.0 * c + d)
             for x, a, b, c, d in zip(me.x, k1, k2, k3, k4, strict=True)
         ]
 
@@ -220,6 +221,7 @@ class Rosenbrock(Method):
     def _do_stage(self, me: Equations, stage: int, end: float, slope: State) -> State:
         """Add the right-hand side of a stage to the stages; return the states where it is."""
         time, size, n = me.time, end - me.time, len(me.x)
+        inverse, shift = 1.0 / size, size * self._SLOPES[stage]
         sums = _sums(self._WEIGHTS[stage], self._stages, n)
         at = [x + s for x, s in zip(me.x, sums, strict=True)]
         node = self._NODES[stage]
@@ -227,9 +229,8 @@ class Rosenbrock(Method):
         if stage:
             rates = me.rates_at(end if node == 1.0 else time + node * size, at)
         couplings = _sums(self._COUPLINGS[stage], self._stages, n)
-        shift = size * self._SLOPES[stage]
         rows = zip(rates, couplings, slope, strict=True)
-        self._stages.append([rate + (c / size + shift * s) for rate, c, s in rows])
+        self._stages.append([rate + (c * inverse + shift * s) for rate, c, s in rows])
         return at
 
     def between(self, me: Equations, end: float, fraction: float) -> State:
@@ -249,22 +250,24 @@ def _moved(x: State, step: float, rates: State) -> State:
 
 def _sums(factors: Sequence[float], stages: list[State], n: int) -> State:
     """The weighted sum of the first stages, state by state, added in their order."""
-    sums = []
-    for i in range(n):
-        total = 0.0
-        for factor, stage in zip(factors, stages, strict=False):
-            total += factor * stage[i]
-        sums.append(total)
+    if not factors:
+        return [0.0] * n
+    sums = [factors[0] * value for value in stages[0]]
+    for factor, stage in zip(factors[1:], stages[1:], strict=False):
+        sums = [total + factor * value for total, value in zip(sums, stage, strict=True)]
     return sums
 
 
-def _ratio(a: float, b: float) -> float:
-    """A ratio that is not a number where the divisor is 0, so that the step is refused."""
-    return a / b if b else math.nan
+def _reciprocal(value: float) -> float:
+    """Not a number for 0, so that the step is refused."""
+    return 1.0 / value if value else math.nan
 
 
 def factorize(matrix: list[State]) -> list[int]:
-    """Factorize a square matrix in place, with partial pivoting; return the pivots."""
+    """Factorize a square matrix in place, with partial pivoting; return the pivots.
+
+    The diagonal then holds reciprocals, because divisions are slow.
+    """
     n, pivots = len(matrix), []
     for k in range(n):
         best = k
@@ -273,8 +276,9 @@ def factorize(matrix: list[State]) -> list[int]:
                 best = row
         pivots.append(best)
         matrix[k], matrix[best] = matrix[best], matrix[k]
+        matrix[k][k] = _reciprocal(matrix[k][k])
         for row in range(k + 1, n):
-            factor = matrix[row][k] = _ratio(matrix[row][k], matrix[k][k])
+            factor = matrix[row][k] = matrix[row][k] * matrix[k][k]
             for i in range(k + 1, n):
                 matrix[row][i] -= factor * matrix[k][i]
     return pivots
@@ -291,7 +295,7 @@ def solve(matrix: list[State], pivots: list[int], b: State) -> None:
     for row in reversed(range(n)):
         for i in range(row + 1, n):
             b[row] -= matrix[row][i] * b[i]
-        b[row] = _ratio(b[row], matrix[row][row])
+        b[row] *= matrix[row][row]
 
 
 METHODS: Final[dict[str, type[Method]]] = {
