@@ -17,6 +17,7 @@ enum {
 static const double GROWTH = 6.0, SHRINKAGE = 0.2, SAFETY = 0.9;
 static const double SMALL = 0.01;   /* part of a nominal value that errors are compared with */
 static const double FIRST = 0.01;   /* part of its value that a state changes in the first step */
+static const double ROUNDED = 1.0 + 1e-6; /* a step may be longer than allowed by a rounding */
 static const double ROOT = 0x1p-26; /* of the resolution of doubles; for differences */
 
 static bool good(Status status) {
@@ -351,13 +352,13 @@ static double size_of_step(Solver *me, double remaining) {
     const double most = me->solving->max_step;
 
     if (me->solving->method->order == 0.0) {
-        return remaining / larger(1.0, ceil(remaining / most - 1e-6));
+        return remaining / larger(1.0, ceil(remaining / (ROUNDED * most)));
     }
     if (!(me->memory.step > 0.0)) {
         me->memory.step = first_step(me);
     }
     const double size = smaller(me->memory.step, most);
-    if (remaining <= smaller(1.1 * size, most)) {
+    if (remaining <= smaller(1.1 * size, ROUNDED * most)) {
         return remaining;
     }
     return remaining < 2.0 * size ? 0.5 * remaining : size;

@@ -31,6 +31,8 @@ _SMALL: Final = 0.01
 _FIRST: Final = 0.01
 _SHARP: Final = 1e-3
 _ROOT: Final = 2.0**-26
+_ROUNDED: Final = 1.0 + 1e-6
+"""A step may be longer than allowed by a rounding."""
 _EPSILON: Final = sys.float_info.epsilon
 _LARGEST: Final = sys.float_info.max
 
@@ -212,6 +214,7 @@ class Solver:
         if memory.ticks:
             self.timetable.ticks = list(memory.ticks)
         self._stale = True
+        self._fmu_time = math.nan  # of the FMU; it must be set
         self._knows_rates = self._knows_indicators = False
         self._jacobian: list[State] | None = None
 
@@ -230,7 +233,10 @@ class Solver:
     # Calls of the FMU.
 
     def _place(self, time: float, x: State) -> None:
-        self._fmu.set_time(time)
+        if time != self._fmu_time:
+            self._fmu_time = math.nan
+            self._fmu.set_time(time)
+            self._fmu_time = time
         if self._n:
             self._fmu.set_states(x)
 
@@ -248,6 +254,7 @@ class Solver:
         adaptive = self._n and self._method.order
         nominals = map(abs, self._fmu.get_nominals() if adaptive else [0.0] * self._n)
         self._nominals = [value if 0.0 < value <= _LARGEST else 1.0 for value in nominals]
+        self._fmu_time = math.nan
         self._stale = self._knows_rates = self._knows_indicators = False
         self._jacobian = None
 
@@ -374,11 +381,11 @@ class Solver:
         """Divide what remains so that no very short step is left at the end."""
         most = self._solving.max_step
         if not self._method.order:
-            return remaining / max(1.0, math.ceil(remaining / most - 1e-6))
+            return remaining / max(1.0, math.ceil(remaining / (_ROUNDED * most)))
         if not self.memory.step > 0.0:
             self._remember(step=self._first_step())
         size = min(self.memory.step, most)
-        if remaining <= min(1.1 * size, most):
+        if remaining <= min(1.1 * size, _ROUNDED * most):
             return remaining
         return 0.5 * remaining if remaining < 2.0 * size else size
 
@@ -452,7 +459,8 @@ class Solver:
         event, z = left is not None, self._z
         end, after = left or self._take_step(until)
         if not event:
-            self._place(end, after)
+            if self._method.end_rates is None:  # the last stage of the others was there
+                self._place(end, after)
             z = self._indicators()
             event = _crosses(self._z, z)
             if event:
