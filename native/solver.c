@@ -283,7 +283,18 @@ static double step_for_difference(double value, double nominal) {
     return ROOT * larger(fabs(value), 1e-3 * nominal);
 }
 
-/* The derivatives of the rates by one state, from the FMU or from a difference. */
+/* How fast the rates change from those at x, per change. The arrays do not overlap. */
+static void take_slope(size_t n, const double *restrict rates, double change,
+                       double *restrict column) {
+    const double inverse = 1.0 / change;
+
+    for (size_t i = 0; i < n; i++) {
+        column[i] = (column[i] - rates[i]) * inverse;
+    }
+}
+
+/* The derivatives of the rates by one state, from the FMU or from a difference. Between two calls
+ * the trial is x. */
 static Status differentiate_by(Solver *me, size_t state, double *column) {
     const Solving *s = me->solving;
     const double value = me->x[state];
@@ -295,13 +306,26 @@ static Status differentiate_by(Solver *me, size_t state, double *column) {
         solver_restore_floats(me);
         return status;
     }
-    memcpy(me->trial, me->x, me->n * sizeof(double));
     me->trial[state] = value + step_for_difference(value, me->nominals[state]);
     const double change = me->trial[state] - value; /* as rounded */
     const Status status = solver_rates(me, me->memory.time, me->trial, column);
-    for (size_t i = 0; i < me->n; i++) {
-        column[i] = (column[i] - me->rates[i]) / change;
+    me->trial[state] = value;
+    take_slope(me->n, me->rates, change, column);
+    return status;
+}
+
+static Status differentiate_by_states(Solver *me) {
+    const bool asks = me->solving->state_references != NULL;
+    Status status = asks ? solver_place(me, me->memory.time, me->x) : STATUS_OK;
+
+    memcpy(me->trial, me->x, me->n * sizeof *me->trial);
+    for (size_t j = 0; j < me->n && good(status); j++) {
+        status = differentiate_by(me, j, me->found);
+        for (size_t i = 0; i < me->n; i++) {
+            me->jacobian[i * me->n + j] = me->found[i];
+        }
     }
+    me->has_jacobian = good(status);
     return status;
 }
 
@@ -310,24 +334,13 @@ static Status differentiate_by_time(Solver *me, double step) {
     const double later = time + larger(1e-4 * step, ROOT * fabs(time));
     const Status status = solver_rates(me, later, me->x, me->slope);
 
-    for (size_t i = 0; i < me->n; i++) {
-        me->slope[i] = (me->slope[i] - me->rates[i]) / (later - time);
-    }
+    take_slope(me->n, me->rates, later - time, me->slope);
     return status;
 }
 
 Status solver_differentiate(Solver *me, double step) {
-    double *column = me->found;
-    const bool asks = me->solving->state_references != NULL && !me->has_jacobian;
-    Status status = asks ? solver_place(me, me->memory.time, me->x) : STATUS_OK;
+    const Status status = me->has_jacobian ? STATUS_OK : differentiate_by_states(me);
 
-    for (size_t j = 0; j < me->n && good(status) && !me->has_jacobian; j++) {
-        status = differentiate_by(me, j, column);
-        for (size_t i = 0; i < me->n; i++) {
-            me->jacobian[i * me->n + j] = column[i];
-        }
-    }
-    me->has_jacobian = good(status);
     return good(status) ? differentiate_by_time(me, step) : status;
 }
 

@@ -351,9 +351,12 @@ class Solver:
             columns = [self._differentiate_by(state) for state in range(self._n)]
             self._jacobian = [list(row) for row in zip(*columns, strict=True)]
         later = self.time + max(1e-4 * step, _ROOT * abs(self.time))
-        rates, change = self.rates_at(later, self.x), later - self.time
-        slope = [(b - a) / change for a, b in zip(self.rates, rates, strict=True)]
-        return self._jacobian, slope
+        return self._jacobian, self._slope(self.rates_at(later, self.x), later - self.time)
+
+    def _slope(self, rates: State, change: float) -> State:
+        """How fast the rates change from those at x, per change."""
+        inverse = 1.0 / change
+        return [(b - a) * inverse for a, b in zip(self.rates, rates, strict=True)]
 
     def _differentiate_by(self, state: int) -> State:
         column = self._fmu.differentiate_by(state)
@@ -362,8 +365,7 @@ class Solver:
         value, trial = self.x[state], list(self.x)
         trial[state] = value + _ROOT * max(abs(value), 1e-3 * self._nominals[state])
         change = trial[state] - value  # as rounded
-        column = self.rates_at(self.time, trial)
-        return [(b - a) / change for a, b in zip(self.rates, column, strict=True)]
+        return self._slope(self.rates_at(self.time, trial), change)
 
     def _resolution(self, until: float) -> float:
         """Two times that are this close are the same."""
