@@ -5,7 +5,6 @@
  * matrix and vector: Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.7. */
 
 #include <math.h>
-#include <string.h>
 
 #include "stages.h"
 
@@ -77,10 +76,16 @@ static void swap(double *matrix, size_t n, size_t a, size_t b) {
 
 /* Factorizes in place, with partial pivoting. The diagonal holds reciprocals, because divisions are
  * slow. A singular matrix gives infinite or undefined results, so that the step is refused. */
-static void factorize(double *matrix, size_t n, uint32_t *pivots) {
+static void factorize(double *matrix, size_t n, uint32_t *order) {
     for (size_t k = 0; k < n; k++) {
-        pivots[k] = (uint32_t)pivot_of(matrix, n, k);
-        swap(matrix, n, k, pivots[k]);
+        order[k] = (uint32_t)k;
+    }
+    for (size_t k = 0; k < n; k++) {
+        const size_t pivot = pivot_of(matrix, n, k);
+        const uint32_t row_of_pivot = order[pivot];
+        order[pivot] = order[k];
+        order[k] = row_of_pivot;
+        swap(matrix, n, k, pivot);
         const double reciprocal = matrix[k * n + k] = 1.0 / matrix[k * n + k];
         for (size_t row = k + 1; row < n; row++) {
             const double factor = matrix[row * n + k] * reciprocal;
@@ -92,21 +97,23 @@ static void factorize(double *matrix, size_t n, uint32_t *pivots) {
     }
 }
 
-static ALWAYS_INLINE void solve(const double *matrix, size_t n, const uint32_t *pivots, double *restrict b) {
+/* The order tells which element of b belongs to each row. The arrays do not overlap. */
+static ALWAYS_INLINE void solve(const double *restrict matrix, size_t n,
+                                const uint32_t *restrict order, const double *restrict b,
+                                double *restrict x) {
     for (size_t row = 0; row < n; row++) {
-        double value = b[pivots[row]];
-        b[pivots[row]] = b[row];
+        double value = b[order[row]];
         for (size_t i = 0; i < row; i++) {
-            value -= matrix[row * n + i] * b[i];
+            value -= matrix[row * n + i] * x[i];
         }
-        b[row] = value;
+        x[row] = value;
     }
     for (size_t row = n; row-- > 0;) {
-        double value = b[row];
+        double value = x[row];
         for (size_t i = row + 1; i < n; i++) {
-            value -= matrix[row * n + i] * b[i];
+            value -= matrix[row * n + i] * x[i];
         }
-        b[row] = value * matrix[row * n + row];
+        x[row] = value * matrix[row * n + row];
     }
 }
 
@@ -119,34 +126,33 @@ static void prepare_matrix(Solver *me, double size) {
     for (size_t i = 0; i < me->n; i++) {
         me->matrix[i * me->n + i] += diagonal;
     }
-    factorize(me->matrix, me->n, me->pivots);
+    factorize(me->matrix, me->n, me->order);
 }
 
-/* Adds what the rates of a stage lack. The arrays do not overlap. */
-static ALWAYS_INLINE void couple(size_t n, const int s, double size,
+/* The right-hand side of a stage. The arrays do not overlap. */
+static ALWAYS_INLINE void couple(size_t n, const int s, double size, const double *restrict rates,
                                  const double *restrict slope, const double *restrict stages,
-                                 double *restrict stage) {
+                                 double *restrict side) {
     const double inverse = 1.0 / size, shift = size * slopes[s];
 
     for (size_t i = 0; i < n; i++) {
-        stage[i] += weighted_sum(couplings[s], s, stages + i, n) * inverse + shift * slope[i];
+        const double sum = weighted_sum(couplings[s], s, stages + i, n);
+        side[i] = rates[i] + (sum * inverse + shift * slope[i]);
     }
 }
 
 /* A stage with the states where it is evaluated. */
 static ALWAYS_INLINE Status do_stage(Solver *me, size_t n, const int s, double end) {
     const double time = me->memory.time, size = end - time;
-    double *stage = me->stages + (size_t)s * n;
+    double *rates = s == 0 ? me->rates : me->found, *side = me->trial;
     Status status = STATUS_OK;
 
     move_by_sums(n, me->x, 1.0, weights[s], s, me->stages, me->next);
-    if (s == 0) {
-        memcpy(stage, me->rates, n * sizeof *stage);
-    } else {
-        status = solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next, stage);
+    if (s > 0) {
+        status = solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next, rates);
     }
-    couple(n, s, size, me->slope, me->stages, stage);
-    solve(me->matrix, n, me->pivots, stage);
+    couple(n, s, size, rates, me->slope, me->stages, side);
+    solve(me->matrix, n, me->order, side, me->stages + (size_t)s * n);
     return status;
 }
 

@@ -71,11 +71,11 @@ bool solver_open(Solver *me) {
 
     me->n = s->states;
     double *memory = calloc(me->n * rows + 4 * s->indicators + 1, sizeof *memory);
-    me->pivots = calloc(me->n + 1, sizeof *me->pivots);
+    me->order = calloc(me->n + 1, sizeof *me->order);
     me->kept = calloc(solver_kept_size(me) + 1, 1);
     me->active = calloc(s->number_of_clocks + 1, sizeof *me->active);
     me->arrays = memory;
-    if (memory == NULL || me->pivots == NULL || me->kept == NULL || me->active == NULL) {
+    if (memory == NULL || me->order == NULL || me->kept == NULL || me->active == NULL) {
         solver_close(me);
         return false;
     }
@@ -87,7 +87,7 @@ bool solver_open(Solver *me) {
 
 void solver_close(Solver *me) {
     free(me->arrays);
-    free(me->pivots);
+    free(me->order);
     free(me->kept);
     free(me->active);
 }

@@ -264,8 +264,7 @@ class Rosenbrock(Method):
         rest, n = 1.0 - fraction, len(me.x)
         sums = (_sums(row, self._stages, n) for row in self._DENSE)
         return [
-            x * rest
-            + fraction * (after + rest * (first + fraction * (second + fraction * third)))
+            x * rest + fraction * (after + rest * (first + fraction * (second + fraction * third)))
             for x, after, first, second, third in zip(me.x, self._next, *sums, strict=True)
         ]
 
