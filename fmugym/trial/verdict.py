@@ -10,9 +10,14 @@ from typing import Any, Final
 
 from fmugym.pool.spec import ResetMethod
 
-__all__ = ["Grade", "Neighbours", "Verdict"]
+__all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
 
 _FORMAT: Final = 4
+
+FRUGAL: Final = (
+    "its initializations are slow or need licences, so no episode returned to earlier start values"
+)
+"""What a trial leaves out to need fewer initializations."""
 
 
 class Grade(StrEnum):
