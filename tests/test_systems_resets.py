@@ -58,7 +58,7 @@ def chain(fmu_of, *tokens, version=2):
     """Components in a row, the first of which feels the second."""
     paths = [fmu_of(token, version) for token in tokens]
     return FMUSystem(
-        {name: path for name, path in zip(NAMES, paths, strict=False)},
+        dict(zip(NAMES, paths, strict=False)),
         [
             *(f"{one}.y -> {other}.u" for one, other in itertools.pairwise(NAMES[: len(paths)])),
             "go -> a.gain",
