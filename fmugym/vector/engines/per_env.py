@@ -6,7 +6,6 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -106,11 +105,10 @@ class PerEnvEngine(Engine):
         for index, value in values.items():
             setattr(self._envs[index], name, value)
 
-    def set_parameter(self, name: str, values: FloatArray) -> None:
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
-        for env, value in zip(self._envs, values.tolist(), strict=True):
-            parameters = {**env._interface.parameters, name: value}
-            env._interface = replace(env._interface, parameters=parameters)
+        for index, env in enumerate(self._envs):
+            env._interface = env._interface.with_parameter(name, values, index)
             env._plan = env._plan_episode({})
 
     def reset(
