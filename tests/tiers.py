@@ -48,6 +48,7 @@ SLOW_MODULES = {
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",
+    "test_systems_resets",
     "test_systems_ssp",
     "test_without_native",
 }
@@ -85,6 +86,7 @@ EVERY_IN_CI = {
     "test_start_times": 5,
     "test_strings": 5,
     "test_systems": 5,
+    "test_systems_resets": 5,
     "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,

@@ -80,7 +80,8 @@ class Replay:
         env.action_space.seed(0)
         env.reset(seed=0)
         plan, pool = env._plan, env._open_pool("a repetition")
-        starts = [float(env.parameters[name]) for name in plan.parameter_names]
+        pairs = zip(plan.model_variables, plan.parameter_names, strict=True)
+        starts = [checked_value(variable, env.parameters[name]) for variable, name in pairs]
         inputs: list[Any] = []
         fails = False
         while len(inputs) < _STEPS:
