@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import fmpy
 
@@ -22,7 +22,9 @@ from fmugym.errors import ConfigError, shown, unknown_name
 __all__ = [
     "CLOCK_KINDS",
     "INTERFACES",
+    "UNKNOWN",
     "Capabilities",
+    "Interval",
     "ModelDescription",
     "ModelExchange",
     "Unit",
@@ -66,6 +68,32 @@ CLOCK_KINDS = (
 )
 """The interval variabilities of clocks. Those before the last one have ticks of their own."""
 
+MOST_FRACTIONS: Final = 2**52
+"""The largest counter and resolution of an interval: float64 can hold a few of them exactly."""
+
+
+class Interval(NamedTuple):
+    """A time between two ticks of a clock, or before the first one.
+
+    Attributes:
+        seconds: NaN where only the FMU knows.
+        counter: The same in units of a second divided by the resolution, which is exact.
+        resolution: 0 where the time is no such fraction.
+    """
+
+    seconds: float
+    counter: int = 0
+    resolution: int = 0
+
+    @classmethod
+    def of_fraction(cls, counter: int, resolution: int) -> Interval:
+        """Make one from a fraction of a second; both numbers are at most ``MOST_FRACTIONS``."""
+        return cls(counter / resolution, counter, resolution)
+
+
+UNKNOWN: Final = Interval(math.nan)
+"""Only the FMU knows the interval."""
+
 
 @dataclass(frozen=True, eq=False)
 class Variable:
@@ -85,8 +113,8 @@ class Variable:
         place: Of an element, its place in the array, in row-major order.
         clocks: The value references of the clocks that must tick whenever the value changes.
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
-        interval, shift: Of a clock: the time between its ticks and that before the first one in
-            seconds; NaN where only the FMU knows.
+        interval, shift: Of a clock: the time between its ticks and that before the first one.
+        by_fractions: Of a clock: whether the FMU takes and tells these times as fractions.
     """
 
     name: str
@@ -108,8 +136,9 @@ class Variable:
     place: int = 0
     clocks: tuple[int, ...] = ()
     ticking: str = ""
-    interval: float = math.nan
-    shift: float = math.nan
+    interval: Interval = UNKNOWN
+    shift: Interval = UNKNOWN
+    by_fractions: bool = False
 
     @property
     def kind(self) -> str:
@@ -154,7 +183,7 @@ class Variable:
 
     @property
     def number(self) -> int:
-        """Of a clock: its kind as ``enum ClockKind`` of ``native/clocks.h``."""
+        """Of a clock: its kind as ``enum ClockKind`` of ``native/clock.h``."""
         is_output = self.ticking == "triggered" and self.causality != "input"
         return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
 
