@@ -180,7 +180,7 @@ typedef struct {
     bool logging;
     bool hears, has_chosen; /* whether the parts are asked for messages, if they were told */
     void *beginning; /* the state before a step whose error is estimated */
-    double *coarse;  /* the values after a step that is repeated by halves */
+    double *coarse;  /* the values after a step that is repeated by halves; then scratch memory */
     double *loop, *typed; /* scratch memory */
     Pending *pending;
     size_t number_pending, room;

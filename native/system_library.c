@@ -78,7 +78,7 @@ static bool allocate(Composite *me, const System *s) {
     me->parts.failed = calloc(s->count, sizeof(bool));
     me->parts.before = calloc(s->count, sizeof(void *));
     me->parts.names = calloc(s->count, LOG_NAME);
-    me->coarse = calloc(s->control.count + 1, sizeof(double));
+    me->coarse = calloc(ERROR_OF_FIRST + 2 * s->control.count, sizeof(double));
     me->loop = calloc(s->memory + 1, sizeof(double));
     me->typed = calloc(s->scratch + 1, sizeof(double));
     return me->parts.dead != NULL && me->parts.started != NULL && me->parts.failed != NULL &&

@@ -91,7 +91,7 @@ def _control(layout: Layout) -> tuple[Any, ...] | None:
         control.tolerance,
         control.min_step_size or 0.0,
         _numbers(place for place, _ in layout.compared),
-        _doubles(layout.nominals),
+        _doubles(nominal for _, nominal in layout.compared),
     )
 
 

@@ -49,7 +49,7 @@ STATISTICS: Final = {
     "step_size": "communication step size that is tried next",
     "error": "largest estimated error in the last step, as a part of the tolerance",
 }
-"""What the master tells if it estimates errors, in the order of the slots in ``native/system.h``."""
+"""What the master tells if it estimates errors; ``native/system.h`` has the same order."""
 
 LOOP_METHODS: Final = ("newton", "fixed_point")
 """How algebraic loops are solved, the preferred method first."""
