@@ -254,6 +254,8 @@ def flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
         value = list(value)
     if not isinstance(value, list | tuple):
         return (), [value]
+    if not value:
+        return (0,), []
     parts = [flattened(one) for one in value]
     shapes = {shape for shape, _ in parts}
     elements = [element for _, own in parts for element in own]

@@ -37,6 +37,8 @@ typedef struct {
     const double *start_values;
     PartString *strings;
     size_t number_of_strings;
+    size_t number_of_structural; /* see Experiment */
+    const char *structural_references, *structural_values;
 } Component;
 
 /* target = gain * source + offset; without arithmetic if they are 1 and 0. */

@@ -94,14 +94,19 @@ static Status begin_next(void *context) {
 
 static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
     Composite *me = b->me;
+    const Component *part = &me->system->parts[index];
     Place place = {b, index};
     const StartValues values = {
         .set = set_starts, .context = &place, .exchange = goes_on ? begin_next : NULL};
+    Experiment experiment = *b->experiment;
 
+    experiment.number_of_structural = part->number_of_structural;
+    experiment.structural_references = part->structural_references;
+    experiment.structural_values = part->structural_values;
     me->parts.started[index] = true;
-    return part_judge(me, index, me->system->parts[index].fmi->initialize(
-                                     &me->libraries[index], me->components[index],
-                                     b->experiment, values, b->doing));
+    return part_judge(me, index,
+                      part->fmi->initialize(&me->libraries[index], me->components[index],
+                                            &experiment, values, b->doing));
 }
 
 /* Exchanging values */

@@ -71,6 +71,7 @@ def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
         listing([v for v, _ in numbers], version),
         _doubles(x for _, x in numbers),
         tuple(texts),
+        (known["structural_references"], known["structural_values"]),
     )
 
 

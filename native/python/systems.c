@@ -96,23 +96,28 @@ static bool take_part_strings(PyObject *tuple, Component *part) {
 static bool take_part(PyObject *tuple, Component *part) {
     PyObject *categories, *solving, *strings;
     Variables inputs, outputs, starts;
-    Bytes input_starts, start_values, none = {NULL, 0};
+    Bytes input_starts, start_values, structural_references, structural_values, none = {NULL, 0};
     int version, manner, has_mode;
     long long steps;
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(iip)(yyy)O!LO(y#y#y#)y#(y#y#y#)(y#y#y#)y#O!", &part->name, &part->label,
+            tuple, "(yyy)(iip)(yyy)O!LO(y#y#y#)y#(y#y#y#)(y#y#y#)y#O!(y#y#)", &part->name, &part->label,
             &part->not_finite, &version, &manner, &has_mode, &part->model, &part->token,
             &part->resources, &PyTuple_Type, &categories, &steps, &solving, VARIABLES(inputs),
             BYTES(input_starts), VARIABLES(outputs), VARIABLES(starts), BYTES(start_values),
-            &PyTuple_Type, &strings)) {
+            &PyTuple_Type, &strings, BYTES(structural_references), BYTES(structural_values))) {
         return refuse("parts");
     }
     part->fmi = version == 0 ? NULL : fmi_of(version, manner);
-    if (part->fmi == NULL || steps < 1) {
+    const size_t structural = count_of(structural_references, sizeof(uint32_t));
+    if (part->fmi == NULL || steps < 1 ||
+        count_of(structural_values, sizeof(uint64_t)) != structural) {
         return refuse("parts");
     }
+    part->number_of_structural = structural;
+    part->structural_references = structural_references.data;
+    part->structural_values = structural_values.data;
     part->has_mode = has_mode;
     part->steps = steps;
     part->input_starts = doubles_of(input_starts);
