@@ -220,9 +220,8 @@ EXHAUSTIVE_TESTS = (
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
     return (
-        node_id.startswith("test_windows_fmus.py::TestInWine")
-        or "wine" in node_id.partition("[")[2]
-    )
+        node_id.startswith("test_windows_") and "::TestInWine" in node_id
+    ) or "wine" in node_id.partition("[")[2]
 
 
 def is_slow(node_id, number):

@@ -136,7 +136,8 @@ class Supervisor:
             raise
         output.release_writing_ends()
         self._output = output
-        return process, Channel(end, process.sentinel, output, self._transport.coding())
+        coding, bell = self._transport.coding(), self._transport.bell()
+        return process, Channel(end, process.sentinel, output, coding, bell)
 
     def revive(self) -> None:
         """Start a process if there is none, with longer and longer pauses between deaths.
