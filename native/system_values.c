@@ -237,8 +237,15 @@ Status system_set(const Library *library, void *component, Type type, const uint
 Status system_set_string(const Library *library, void *component, uint32_t reference,
                          const char *text) {
     Composite *me = component;
+    const System *s = me->system;
+    bool good = true;
 
     (void)library;
-    const End *end = first_end(me, reference);
-    return end == NULL ? STATUS_ERROR : note(me, end, 0.0, text);
+    if (reference >= s->number_of_variables) {
+        return STATUS_ERROR;
+    }
+    for (uint32_t i = s->first_ends[reference]; i < s->first_ends[reference + 1] && good; i++) {
+        good = note(me, &s->ends[i], 0.0, text) == STATUS_OK;
+    }
+    return good ? STATUS_OK : STATUS_ERROR;
 }

@@ -1,5 +1,7 @@
 """Arrays in systems: as a whole and by elements, between components and as the system's own."""
 
+import zipfile
+
 import numpy as np
 import pytest
 import values_tools
@@ -9,6 +11,7 @@ from gymnasium import spaces
 from scipy.linalg import expm
 from system_tools import by_each_master, closing_pools, in_each_engine, play  # noqa: F401
 
+import fmugym
 from fmugym import (
     Component,
     ConfigError,
@@ -20,6 +23,7 @@ from fmugym import (
     bundled_fmu,
 )
 from fmugym.fmi.status import Status
+from fmugym.tools import cli
 
 PLANT = {
     "A": np.array([[0.0, 1.0], [-4.0, -0.4]]),
@@ -110,7 +114,10 @@ class TestConnections:
         slaves = {n: slave(path, tmp_path / n, v) for n, v in parts().items()}
         rows = []
         for count in range(11):
-            told = {name: one.getFloat64([10], nValues=len(v["C"])) for name, one, v in slaves_of(slaves)}
+            told = {
+                name: one.getFloat64([10], nValues=len(v["C"]))
+                for name, one, v in slaves_of(slaves)
+            }
             rows.append(told["plant"])
             slaves["control"].setFloat64([9], told["plant"])
             first, second = told["control"]
@@ -166,7 +173,9 @@ class TestConnections:
 
     @in_each_engine
     def test_integers_of_sixteen_bits_pass_as_they_are(self, make, matrices, native):
-        system = FMUSystem({"a": matrices, "b": matrices}, ["a.w -> b.v", "b.w[2,1] -> b.Float64_in"])
+        system = FMUSystem(
+            {"a": matrices, "b": matrices}, ["a.w -> b.v", "b.w[2,1] -> b.Float64_in"]
+        )
         names = [f"a.v[{i},{j}]" for i in (1, 2) for j in (1, 2)]
         outputs = [f"b.w[{i},{j}]" for i in (1, 2) for j in (1, 2)] + ["b.Float64_out"]
         values = np.array([[1.0], [-2.0], [32767.0], [-32768.0]])
@@ -228,7 +237,7 @@ def slave(path, folder, values):
 class Plant(FMUEnv):
     """A plant whose matrix is drawn, pushed by an array."""
 
-    def __init__(self, fmu, **changes):
+    def __init__(self, fmu, backend=None, **changes):
         config = {
             "model_input_names": "push",
             "model_output_names": ["seen", "plant.x[2]"],
@@ -237,7 +246,7 @@ class Plant(FMUEnv):
             "bounds": {"push": (-1, 1)},
             "max_episode_steps": 5,
         }
-        super().__init__(fmu, config | changes)
+        super().__init__(fmu, config | changes, backend=backend)
 
     def _is_done(self):
         return False
@@ -290,11 +299,11 @@ class TestOwnArrays:
         envs.reset(seed=3)
         actions = np.full((2, 2), 0.5, np.float32)
         snapshot = envs.save_state()
-        planned = envs.rollout(np.stack([actions] * 3)[:, :, None])
+        planned = envs.rollout(None, np.stack([actions] * 3, axis=1))
         rows = [envs.step(actions)[0] for _ in range(3)]
         envs.restore_state(snapshot)
         assert np.array_equal(rows, [envs.step(actions)[0] for _ in range(3)])
-        assert np.allclose(planned.observations[:, :, 0], rows)
+        assert np.array_equal(planned.observations.swapaxes(0, 1), rows)
         envs.close()
 
     def test_an_element_is_an_input_by_itself(self, path):
@@ -338,7 +347,8 @@ class TestMistakes:
     def test_two_sources_of_one_element_are_named(self, path):
         with pytest.raises(ConfigError, match=r"b\.u\[2\].*push.*a\.y\[1\]"):
             FMUSystem(
-                {"a": part(path, PLANT), "b": part(path, PLANT)}, ["push -> b.u", "a.y[1] -> b.u[2]"]
+                {"a": part(path, PLANT), "b": part(path, PLANT)},
+                ["push -> b.u", "a.y[1] -> b.u[2]"],
             )
 
     def test_start_values_of_other_shapes(self, path):
@@ -356,9 +366,7 @@ class TestMistakes:
 
 
 def test_open_inputs_are_the_elements_that_nothing_drives(path):
-    system = FMUSystem(
-        {"a": part(path, PLANT), "b": part(path, PLANT)}, ["a.y[1] -> b.u[2]"]
-    )
+    system = FMUSystem({"a": part(path, PLANT), "b": part(path, PLANT)}, ["a.y[1] -> b.u[2]"])
     assert [port.name for port in system.open_inputs] == ["a.u", "b.u[1]"]
     description = system.as_fmu().description
     inputs = [v.name for v in description.scalars("b.u") if v.settable_in_step]
@@ -372,22 +380,86 @@ episode_length = "1s"
 reward = "-abs(y1)"
 
 [system]
-connections = ["control.y -> plant.u", {{ source = "plant.y", target = "control.u", gain = 0.5 }}]
+connections = [
+  "control.y -> plant.u",
+  {{ source = "plant.x[1]", target = "control.u[1]", gain = 0.5 }},
+]
 
-[system.components]
-plant = {{ fmu = "{path}", start_values = {{ n = 2, m = 2, r = 3, A = [[0, 1], [-4, -0.4]],
-  B = [0, 0, 1, 0.5], C = [[1, 0], [0, 1], [1, 1]], D = 0, x_0 = [1, -0.5] }} }}
-control = {{ fmu = "{path}", start_values = {{ n = 1, m = 3, r = 2, A = -1, B = [0.5, 0, 0.25],
-  C = [-2, 1], D = [[-1, -0.3, 0], [0.2, 0, 0.1]], x_0 = 0.3 }}, feedthrough = false }}
+[system.components.plant]
+fmu = "{path}"
+
+[system.components.plant.start_values]
+n = 2
+m = 2
+r = 3
+A = [[0, 1], [-4, -0.4]]
+B = [0, 0, 1, 0.5]
+C = [[1, 0], [0, 1], [1, 1]]
+D = 0
+x_0 = [1, -0.5]
+
+[system.components.control]
+fmu = "{path}"
+feedthrough = false
+start_values = {{ n = 1, m = 2, r = 2, A = -1, B = [0.5, 0], C = [-2, 1], D = 0, x_0 = 0.3 }}
 
 [variables]
 y1 = {{ name = "plant.y[1]", min = -9, max = 9 }}
+u2 = {{ name = "control.u[2]" }}
 
 [agent]
-actions = []
+actions = ["u2"]
 observations = ["y1"]
 
 [parameters]
 "plant.C[3,1]" = 2.0
 "control.A" = [[-2.0]]
 """
+
+
+class TestFiles:
+    def test_an_archive_has_arrays_and_sizes(self, make, path, tmp_path):
+        """SSP 2.0 knows arrays; elements are connectors with names of their own."""
+        system = plant_and_control(path)
+        file = system.write(tmp_path / "s.ssp")
+        with zipfile.ZipFile(file) as archive:
+            text = archive.read("SystemStructure.ssd").decode()
+        assert 'version="2.0"' in text
+        assert '<ssc:Dimension size="3"/>' in text
+        again = FMUSystem.read(file)
+        assert again.links == system.links
+        assert again.plan.components[0].sizes == system.plan.components[0].sizes
+        rows = [play(make(one, (), STATES), 5) for one in (system, again)]
+        assert rows[0].tobytes() == rows[1].tobytes()
+
+    def test_an_archive_without_arrays_is_one_of_version_one(self, tmp_path):
+        house = bundled_fmu("House")
+        file = FMUSystem({"a": house, "b": house}, ["a.Q_em -> b.Q_int"]).write(tmp_path / "s.ssp")
+        with zipfile.ZipFile(file) as archive:
+            assert b'version="2.0"' not in archive.read("SystemStructure.ssd")
+
+    def test_own_arrays_come_back(self, path, tmp_path):
+        system = own_arrays(path)
+        again = FMUSystem.read(system.write(tmp_path / "s.ssp"))
+        assert again.connectors == system.connectors
+
+    def test_a_task_file_has_arrays(self, path, tmp_path):
+        task = tmp_path / "task.toml"
+        task.write_text(TASK.format(path=path))
+        env = fmugym.load(task)
+        env.reset()
+        assert env.parameters["plant.C[3,1]"] == 2.0
+        assert env.out["plant.y[1]"] == 1.0
+        env.step(np.ones(1, np.float32))
+        assert env.out["plant.y[1]"] != 1.0
+        env.close()
+
+    def test_info_and_new_tell_of_them(self, path, tmp_path, capsys):
+        file = plant_and_control(path).write(tmp_path / "s.ssp")
+        assert cli.main(["info", str(file)]) == 0
+        text = capsys.readouterr().out
+        assert "plant.y -> control.u" in text
+        assert "control.y[2] -> plant.u[2] (* 0.5 + 0.25)" in text
+        own = own_arrays(path).write(tmp_path / "own.ssp")
+        assert cli.main(["new", str(own), "--output", str(tmp_path / "own.toml")]) == 0
+        assert "push[2]" in (tmp_path / "own.toml").read_text()

@@ -44,10 +44,12 @@ SLOW_MODULES = {
     "test_start_times",
     "test_value_types",
     "test_systems",
+    "test_systems_arrays",
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",
     "test_systems_ssp",
+    "test_systems_strings",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""

@@ -279,7 +279,8 @@ class SystemInstance(Instance):
     def set_string(self, variable: Variable, value: str) -> None:
         """See ``Instance.set_string``."""
         assert self._pending is not None
-        self._pending.append((self._description.ends[variable.value_reference][0], value))
+        ends = self._description.ends[variable.value_reference]
+        self._pending += [(end, value) for end in ends]
 
     # Initialization: the components are initialized one inside of the other.
 

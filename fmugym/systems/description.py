@@ -47,8 +47,8 @@ class SystemDescription(ModelDescription):
     """The description of a system.
 
     Variables are called ``component.variable``, and connectors have names of their own. The value
-    reference of a scalar, or of an element of an array, is its index in ``ends``. All capabilities are those that all
-    components have.
+    reference of a scalar, or of an element of an array, is its index in ``ends``. All capabilities
+    are those that all components have.
 
     Attributes:
         plan: The system.
