@@ -11,6 +11,7 @@ Status part_judge(Composite *me, size_t index, Status status) {
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         me->blamed = me->blamed == NULL ? me->system->parts[index].label : me->blamed;
         me->parts.dead[index] |= status == STATUS_FATAL;
+        me->parts.failed[index] |= status == STATUS_ERROR;
     }
     return status;
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,12 +16,15 @@ from fmugym.pool.settings import (
     manner_of,
     solving_settings,
 )
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.systems.description import PartVariable, SystemDescription
 from fmugym.systems.layout import Layout, PartLayout, array_key
 from fmugym.systems.plan import Loop
 
 __all__ = ["system_settings"]
+
+_RUNGS: Final = tuple(ResetMethod)
+"""In the order of ``Rung`` of ``native/system.h``."""
 
 
 def system_settings(
@@ -37,8 +40,12 @@ def system_settings(
     if not isinstance(description, SystemDescription):
         return None
     layout = Layout(description, spec.inputs, spec.outputs)
+    rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     return (
-        tuple(_part(part, spec, folder / str(i)) for i, part in enumerate(layout.parts)),
+        tuple(
+            _part(part, spec, rung, folder / str(i))
+            for i, (part, rung) in enumerate(zip(layout.parts, rungs, strict=True))
+        ),
         _routes(layout),
         (*_arrays(layout), *_variables(layout)),
         _groups(layout),
@@ -47,7 +54,7 @@ def system_settings(
     )
 
 
-def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
+def _part(part: PartLayout, spec: PoolSpec, rung: ResetMethod, folder: Path) -> tuple[Any, ...]:
     description = part.description
     version = description.fmi_major_version
     known = library_settings(description, spec, PlaceOfFMU.here(folder, (), version))
@@ -60,7 +67,7 @@ def _part(part: PartLayout, spec: PoolSpec, folder: Path) -> tuple[Any, ...]:
             label.encode(),
             f"{label}, whose outputs are not finite".encode(),
         ),
-        (version, manner_of(description, spec), part.has_mode),
+        (version, manner_of(description, spec), part.has_mode, _RUNGS.index(rung)),
         (known["model"], known["token"], known["resources"]),
         known["categories"],
         part.component.steps,

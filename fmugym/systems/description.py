@@ -66,6 +66,11 @@ class SystemDescription(ModelDescription):
         """Whether all components have a function for resets."""
         return all(part.has_reset for part in self.parts)
 
+    @property
+    def components(self) -> tuple[ModelDescription, ...]:
+        """See ``ModelDescription.components``."""
+        return self.parts
+
     def resized(self, sizes: Mapping[str, int]) -> ModelDescription:
         """Refuse sizes: the connections of the system fit the arrays as they are.
 

@@ -488,6 +488,7 @@ class _Notes:
             complete=bool(answer.get("complete")),
             deterministic=bool(answer.get("deterministic", True)),
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
+            components=tuple(map(ResetMethod, answer.get("components", ()))),
             neighbours=None if neighbours is None else Neighbours(neighbours),
             instances=int(answer.get("instances", 1)),
             initializations=self._initializations,
