@@ -19,8 +19,9 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.trial import opening
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.rungs import find_rungs
-from fmugym.trial.trial import Candidate, examine
+from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade
 
 LOG = logging.getLogger("fmugym.test")

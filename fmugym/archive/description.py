@@ -78,7 +78,8 @@ class Variable:
         start: The start value as the XML has it.
         minimum, maximum: Infinite where neither the variable nor its declared type gives a number.
         nominal: None where neither the variable nor its declared type gives a finite number.
-        items: Names and values of an enumeration.
+        items: Names and values of an enumeration. Of a String, the texts that it may get and their
+            numbers; see ``fmugym.archive.texts``.
         shape: The shape of an array (FMI 3.0); () for a scalar.
         dimensions: Of an array, for each dimension the structural parameter that gives its length;
             "" for a fixed length.
@@ -429,6 +430,11 @@ class ModelDescription:
     def fmi_major_version(self) -> int:
         """1, 2 or 3."""
         return int(self.fmi_version.split(".")[0])
+
+    @cached_property
+    def strings(self) -> frozenset[str]:
+        """The names of the variables that are Strings."""
+        return frozenset(v.name for v in self.variables.values() if v.kind == "string")
 
     @cached_property
     def uses_event_mode(self) -> bool:

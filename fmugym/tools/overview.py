@@ -16,7 +16,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.archive.packages import missing_tool, source_of
 from fmugym.errors import FMULoadError, printable
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "overview", "plain", "start_value", "tables"]
 

@@ -31,13 +31,8 @@ from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
-from fmugym.trial.neighbours import disturb_in_turn
-from fmugym.trial.rehearsal import Starts
-from fmugym.trial.repetition import Repetition
-from fmugym.trial.resuming import method_that_works
-from fmugym.trial.trial import (
-    Candidate,
-    examine,
+from fmugym.trial.candidate import Candidate
+from fmugym.trial.known import (
     is_known_to_harm,
     known_resuming,
     locks_of,
@@ -46,6 +41,11 @@ from fmugym.trial.trial import (
     revise,
     state_files,
 )
+from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.rehearsal import Starts
+from fmugym.trial.repetition import Repetition
+from fmugym.trial.resuming import method_that_works
+from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 from fmugym.wine.prefix import Wine
 

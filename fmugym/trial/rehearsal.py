@@ -23,9 +23,9 @@ from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.pools import trial_pool
-from fmugym.trial.trial import Candidate
 from fmugym.trial.verdict import Grade
 
 __all__ = ["Rehearsal", "Sample", "Starts", "difference", "tolerance_of"]

@@ -22,8 +22,8 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.tape import Tape
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.rehearsal import difference, tolerance_of
-from fmugym.trial.trial import Candidate
 from fmugym.trial.verdict import Grade, Verdict
 
 __all__ = ["Repetition"]

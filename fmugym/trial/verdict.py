@@ -11,9 +11,14 @@ from typing import Any, Final
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.plan import SystemPlan
 
-__all__ = ["Grade", "Neighbours", "Verdict"]
+__all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
 
 _FORMAT: Final = 5
+
+FRUGAL: Final = (
+    "its initializations are slow or need licences, so no episode returned to earlier start values"
+)
+"""What a trial leaves out to need fewer initializations."""
 
 
 class Grade(StrEnum):

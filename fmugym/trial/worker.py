@@ -33,14 +33,14 @@ from fmugym.pool.process.output import print_line_by_line
 from fmugym.pool.process.windows import ProgramCoding
 from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.attempt import Request, Stage, patience
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
 from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
 from fmugym.trial.rungs import find_rungs, offers_of
-from fmugym.trial.trial import FRUGAL, Request, Stage, patience
-from fmugym.trial.verdict import Grade, Neighbours, Verdict
+from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 _NO_DIALOGUES: Final = 0x0003
 """``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""

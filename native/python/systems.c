@@ -55,21 +55,25 @@ static void *array_for(PyObject *tuple, size_t size, size_t *count) {
 
 /* Parts */
 
-/* The types, elements and other values of a list of variables. */
+/* What listing_take takes. */
 typedef struct {
-    Bytes types, elements, rest;
+    Bytes types, elements, rest, texts;
 } Variables;
 
 #define BYTES(bytes) &(bytes).data, &(bytes).size
 #define VARIABLES(variables)                                                                       \
-    BYTES((variables).types), BYTES((variables).elements), BYTES((variables).rest)
+    BYTES((variables).types), BYTES((variables).elements), BYTES((variables).rest),                \
+        BYTES((variables).texts)
+
+static Block block_of(Bytes bytes) {
+    return (Block){bytes.data, (size_t)bytes.size};
+}
 
 /* Each variable has a value. */
 static bool open_access(Access *access, const Component *part, Variables v, Bytes values) {
     Listing listing;
-    const char *fault =
-        listing_take(&listing, v.types.data, (size_t)v.types.size, v.elements.data,
-                     (size_t)v.elements.size, v.rest.data, (size_t)v.rest.size);
+    const char *fault = listing_take(&listing, block_of(v.types), block_of(v.elements),
+                                     block_of(v.rest), block_of(v.texts));
 
     if (fault != NULL || (values.data != NULL && count_of(values, 8) != listing.count)) {
         return refuse("variables");
@@ -102,9 +106,10 @@ static bool take_part(PyObject *tuple, Component *part) {
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#)y#(y#y#y#)(y#y#y#)y#O!(y#y#)", &part->name,
+            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#y#)y#(y#y#y#y#)(y#y#y#y#)y#O!(y#y#)", &part->name,
             &part->label, &part->not_finite, &version, &manner, &has_mode, &rung, &part->model,
-            &part->token, &part->resources, &PyTuple_Type, &categories, &steps, &solving, VARIABLES(inputs),
+            &part->token, &part->resources, &PyTuple_Type, &categories, &steps, &solving,
+            VARIABLES(inputs),
             BYTES(input_starts), VARIABLES(outputs), VARIABLES(starts), BYTES(start_values),
             &PyTuple_Type, &strings, BYTES(structural_references), BYTES(structural_values))) {
         return refuse("parts");

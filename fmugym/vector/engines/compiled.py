@@ -270,7 +270,7 @@ class CompiledEngine(BatchEngine):
             ),
         }
 
-    def set_parameter(self, name: str, values: FloatArray) -> None:
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         super().set_parameter(name, values)
         self._prepare(self._task)
@@ -687,4 +687,4 @@ def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[
 
 
 def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(plan.named(drawn), mask)
+    return coded(plan.shown(drawn), mask)
