@@ -90,6 +90,7 @@ EVERY_IN_CI = {
     "test_systems": 5,
     "test_systems_resets": 5,
     "test_value_types": 3,
+    "test_vector_readings": 4,
     "test_words": 5,
     "test_zoo": 5,
 }
