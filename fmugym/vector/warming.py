@@ -199,6 +199,7 @@ class CompiledWarmUp:
                     "input_starts": ((-1, 0.0),) * len(pool.inputs),
                     "drawn_variables": (),
                     "variable_starts": (),
+                    "results": None,
                 },
             )
         finally:
