@@ -237,10 +237,8 @@ class CompiledEngine(BatchEngine):
 
     @staticmethod
     def _needs_outputs(task: TracedTask) -> bool:
-        """Whether the outputs before a step are needed after it."""
-        judgement = task.judgement
-        needs = not judgement.is_always_finite or bool(task.left) or bool(task.seen)
-        return needs or judgement.loads("kept")
+        """Whether hooks read the outputs before a step; for faults, the pool keeps them, too."""
+        return bool(task.left) or task.judgement.loads("kept")
 
     def _surroundings(self, task: TracedTask) -> dict[str, Any]:
         """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
