@@ -58,6 +58,11 @@ WIDE static void transpose(const double *restrict from, size_t from_step, size_t
                            size_t columns, double *restrict to, size_t to_step) {
     size_t column = 0;
 
+    if (rows == 1) { /* a single environment, whose step takes little more than its calls */
+        for (; column < columns; column++) {
+            to[column * to_step] = from[column];
+        }
+    }
     for (; column + 4 <= columns; column += 4, to += 4 * to_step) {
         const double *next = from + column;
         size_t row = 0;
@@ -399,18 +404,17 @@ static void keep_columns(const Pool *pool, size_t begin, size_t count, const dou
 }
 
 /* The programs read the outputs where they are in the cache. Their rows keep the old ones for so
- * long: the owner needs them if there is trouble. */
+ * long, and these are kept just before the new ones replace them, unless a program reads them. */
 size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
     const Pool *pool = task->pool;
     const Turn *turn = task->call->turn;
-    const size_t before = run.verdict->troubled;
     Fresh fresh = {scratch.columns, scratch.outputs, pool->settings.outputs->count, true};
 
     play_prepare(turn, run.begin, run.count, run.registers);
     const size_t troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
     make_columns(pool, run.count, scratch);
     play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
-    if (!turn->play->keeps_always && (troubled > 0 || run.verdict->troubled > before)) {
+    if (!turn->play->reads_kept) {
         play_keep_outputs(turn->play, run.begin, run.count);
     }
     keep_columns(pool, run.begin, run.count, scratch.columns);

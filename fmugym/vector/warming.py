@@ -166,7 +166,8 @@ class CompiledWarmUp:
             for name, dtype in tracer.variables.items()
         }
         self._before = {name: rows.copy() for name, rows in self._now.items()}
-        self._parameters = {name: np.zeros(n) for name in env._interface.parameters}
+        numbers = env._interface.parameters.keys() - env.fmu.description.strings
+        self._parameters = {name: np.zeros(n) for name in numbers}
         self._kept, self._state = np.zeros_like(pool.outputs), np.zeros((len(warm_up.starts), n))
         width = int(np.prod(space.shape or ()))
         self._actions = {
@@ -194,7 +195,7 @@ class CompiledWarmUp:
                 (self._counts, self._ended, sys.maxsize),
                 {
                     "kept": self._kept,
-                    "keeps_always": True,
+                    "reads_kept": True,
                     "copies": tuple(pairs),
                     "input_starts": ((-1, 0.0),) * len(pool.inputs),
                     "drawn_variables": (),

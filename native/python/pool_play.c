@@ -360,20 +360,20 @@ static bool is_sound(const PyPool *self, const Play *play) {
 typedef struct {
     PyObject *start, *start_values, *inputs, *judgement, *actions, *draws, *states, *episodes;
     PyObject *kept, *copies, *variable_starts, *drawn_variables, *input_starts, *results;
-    int keeps_always;
+    int reads_kept;
 } Parts;
 
 static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
     static char *names[] = {"start",         "start_values", "inputs",
                             "judgement",     "actions",      "draws",
                             "states",        "episodes",     "kept",
-                            "keeps_always",  "copies",       "variable_starts",
+                            "reads_kept",  "copies",       "variable_starts",
                             "drawn_variables", "input_starts", "results", NULL};
 
     return PyArg_ParseTupleAndKeywords(
         args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!O:prepare_play", names, &p->start, &p->start_values,
         &PyTuple_Type, &p->inputs, &PyTuple_Type, &p->judgement, &PyDict_Type, &p->actions,
-        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->keeps_always,
+        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->reads_kept,
         &PyTuple_Type, &p->copies, &PyTuple_Type, &p->variable_starts, &PyTuple_Type,
         &p->drawn_variables, &PyTuple_Type, &p->input_starts, &p->results);
 }
@@ -423,7 +423,7 @@ static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
 
 /* What comes later refers to what comes first. */
 static bool take_parts(PyPool *self, Playing *playing, const Parts *p) {
-    playing->play.keeps_always = p->keeps_always != 0;
+    playing->play.reads_kept = p->reads_kept != 0;
     return take_starts(self, playing, p->start, p->start_values) &&
            take_actions(self, playing, p->actions) && take_programs(self, playing, p) &&
            take_draws(self, playing, p->draws, p->states) &&

@@ -11,6 +11,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "../platform.h"
+
 /* The codes are those of fmugym/pool/process/channel.py. */
 enum {
     CODE_STEP = 's',
@@ -27,6 +29,10 @@ enum {
 
 /* Keeps the standard streams for messages; what the FMU prints goes to the standard error. */
 bool frames_open(void);
+
+/* A count in shared memory that the other end raises after each message. From now on receive_code
+ * watches it for a short time before it goes to sleep. */
+void frames_watch(const Atomic *bell);
 
 /* Return whether it worked; the other end may be gone. */
 bool receive_code(char *code);

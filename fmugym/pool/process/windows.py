@@ -54,6 +54,7 @@ REQUESTS: Final = (
     "failure",
     "read",
     "replace_record",
+    "differentiate",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
@@ -212,7 +213,8 @@ class ProgramCoding:
         failure = Failure(
             doing, in_warm_up, status, time, string, said, values if has_values else None
         )
-        return describe_failure(failure, self._setup.spec, self._name(index))
+        setup = self._setup
+        return describe_failure(failure, setup.description, setup.spec, self._name(index))
 
     # The first request, which has no number
 
@@ -318,7 +320,8 @@ class ProgramCoding:
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
 
     def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
-        variables = start_variables(self._setup.description.variable, record.names)
+        find = self._setup.description.variable
+        variables = start_variables(find, record.names, record.texts)
         writer.integers(index, len(record.inputs))
         writer.access(variables, self._version)
         for values in (record.starts, record.inputs):
@@ -337,6 +340,27 @@ class ProgramCoding:
         block = self._setup.block
         shape = len(variables), block.stop - block.start
         return np.frombuffer(reader.rest(), np.float64).reshape(shape)
+
+    @property
+    def _is_adjoint(self) -> bool:
+        """Whether the FMU differentiates unknowns by all knowns, not all unknowns by a known."""
+        return not self._setup.description.capabilities.provides_directional_derivatives
+
+    def _ask_differentiate(
+        self, writer: _Writer, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> None:
+        writer.flags(self._is_adjoint)
+        for some in (unknowns, knowns) if self._is_adjoint else (knowns, unknowns):
+            writer.access(some, self._version)
+
+    def _answer_differentiate(
+        self, reader: _Reader, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        seeded, others = (unknowns, knowns) if self._is_adjoint else (knowns, unknowns)
+        block = self._setup.block
+        shape = len(seeded), len(others), block.stop - block.start
+        found = np.frombuffer(reader.rest(), np.float64).reshape(shape)
+        return found if self._is_adjoint else found.swapaxes(0, 1)
 
 
 def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) -> None:
@@ -380,8 +404,5 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
 
 
 def _write_variables(writer: _Writer, variables: Mapping[str, Any]) -> None:
-    writer.integers(variables["num_observed"], len(variables["strings"]))
-    for reference, text in variables["strings"]:
-        writer.integers(reference)
-        writer.text(text)
+    writer.integers(variables["num_observed"])
     writer.block(variables["sampling"])
