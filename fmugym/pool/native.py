@@ -507,12 +507,12 @@ class NativePool(SavingPool):
             surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
                 the second program reads them; ``copies``, pairs of rows: episode variables and what
                 they were before the step; ``drawn_variables``, rows and the numbers of their draws;
-                ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for each input the number
-                of a start value, or -1 and a constant. ``results``, None if only rollouts follow,
-                or a tuple of ``numpy.empty``; the class of a step's result, a tuple; what the
-                observations are, an array (None), a dict (its keys) or a tuple (an empty one); and
-                the shape and type of each array: float32 observations, or those that the second
-                program stores, then rewards, terminated and truncated.
+                ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
+                each input the number of a start value, or -1 and a constant. ``results``, None if
+                only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
+                tuple; what the observations are, an array (None), a dict (its keys) or a tuple (an
+                empty one); and the shape and type of each array: float32 observations, or those
+                that the second program stores, then rewards, terminated and truncated.
 
         Returns:
             A function of actions, drawn values (draws, N), last observations and started
