@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "log.h"
+#include "remote.h"
 #include "system.h"
 
 /* What takes the place of a table of functions. */
@@ -17,13 +18,16 @@ static Loaded *loaded(const Library *library) {
     return library->functions;
 }
 
-static bool load_part(Library *library, const Component *part, const char *path, char *error,
-                      size_t size) {
-    char reason[512];
+static bool load_part(Library *library, const System *system, size_t index, const char *path,
+                      char *error, size_t size) {
+    const Component *part = &system->parts[index];
+    char reason[1200];
 
     library->identifier = part->model;
-    const bool good = library_open(library, path, reason, sizeof reason) &&
-                      part->fmi->bind(library, reason, sizeof reason);
+    const bool good = part->remote != NULL
+                          ? remote_open(library, part, system->count, reason, sizeof reason)
+                          : library_open(library, path, reason, sizeof reason) &&
+                                part->fmi->bind(library, reason, sizeof reason);
     if (!good) {
         snprintf(error, size, "%s: %s", part->label, reason);
     }
@@ -39,7 +43,7 @@ bool system_load(Library *library, const System *system, const char *const *path
     }
     loaded(library)->system = system;
     for (size_t i = 0; i < system->count; i++) {
-        if (!load_part(&loaded(library)->parts[i], &system->parts[i], paths[i], error, size)) {
+        if (!load_part(&loaded(library)->parts[i], system, i, paths[i], error, size)) {
             system_unload(library);
             return false;
         }
@@ -49,6 +53,9 @@ bool system_load(Library *library, const System *system, const char *const *path
 
 void system_unload(Library *library) {
     for (size_t i = 0; library->functions != NULL && i < loaded(library)->system->count; i++) {
+        if (loaded(library)->system->parts[i].remote != NULL) {
+            remote_close(&loaded(library)->parts[i]);
+        }
         library_close(&loaded(library)->parts[i]);
     }
     library_close(library);
@@ -141,15 +148,18 @@ static void free_part(Composite *me, size_t index) {
     floats_restore_if_seen(me->floats);
 }
 
-/* FMI forbids every call after a fatal error, so the memory of such a part is lost. */
+/* FMI forbids every call after a fatal error, so the FMU's memory of such a part is lost. */
 void system_free(const Library *library, void *component) {
     Composite *me = component;
     const bool complete = me->parts.dead != NULL && me->parts.before != NULL;
 
     (void)library;
     for (size_t i = 0; complete && i < me->system->count; i++) {
+        const Fmi *fmi = me->system->parts[i].fmi;
         if (me->components[i] != NULL && !me->parts.dead[i]) {
             free_part(me, i);
+        } else if (me->components[i] != NULL && fmi->drop != NULL) {
+            fmi->drop(&me->libraries[i], me->components[i]);
         }
     }
     free_arrays(me);

@@ -44,6 +44,7 @@ SLOW_MODULES = {
     "test_start_times",
     "test_value_types",
     "test_systems",
+    "test_systems_apart",
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",

@@ -57,6 +57,7 @@ class Component:
         starts: Values set before initialization, by the names of the component's variables.
             Those that an environment sets win.
         limits, preload: See ``fmugym.FMU``.
+        isolate: Whether it runs in a process of its own.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Component:
     starts: tuple[tuple[str, float | str], ...] = ()
     limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
+    isolate: bool = False
 
 
 @dataclass(frozen=True)

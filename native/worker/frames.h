@@ -28,6 +28,10 @@ enum {
 /* Keeps the standard streams for messages; what the FMU prints goes to the standard error. */
 bool frames_open(void);
 
+/* The streams themselves. */
+void *frames_input(void);
+void *frames_output(void);
+
 /* Return whether it worked; the other end may be gone. */
 bool receive_code(char *code);
 bool receive_content(char **bytes, size_t *size); /* the caller frees the bytes */
