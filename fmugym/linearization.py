@@ -7,18 +7,22 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import FMU, StandsForFMU
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.log import fmu_calls
+from fmugym.fmi.status import Status
+from fmugym.pool.spec import PoolSpec
 from fmugym.task.interface import checked_value, start_variable
+from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import meet
 
 __all__ = ["LinearModel", "linearize"]
@@ -93,10 +97,13 @@ def linearize(
     u = _chosen(description, "continuous input", inputs, _inputs(description))
     start = _start_values(description, at or {})
     meet(fmu)
+    if fmu.in_wine:
+        with closing(_InstanceInWine(fmu, start)) as worker:
+            return _linear_model(worker, description, x, u)
     with fmu_calls, closing(Library(fmu, logger)) as library:
         instance = library.instantiate()
         _initialize(instance, description, start)
-        return _linear_model(instance, description, x, u)
+        return _linear_model(_InstanceHere(instance), description, x, u)
 
 
 def _require_derivatives(description: ModelDescription) -> None:
@@ -167,27 +174,63 @@ def _initialize(
     instance.initialize(description.start_time, None, None, set_start_values)
 
 
+class _Differentiable(Protocol):
+    """An instance after its initialization."""
+
+    def jacobian(self, unknowns: Variables, knowns: Variables) -> FloatArray: ...
+
+    def read(self, variables: Variables) -> FloatArray: ...
+
+
+class _InstanceHere:
+    """One in this process."""
+
+    def __init__(self, instance: Instance) -> None:
+        self._instance = instance
+        self.jacobian = instance.jacobian
+
+    def read(self, variables: Variables) -> FloatArray:
+        access = Access(self._instance, variables)
+        self._instance.check("reading variables", access.get())
+        return access.values
+
+
+class _InstanceInWine:
+    """One in a worker, if this process cannot load the library."""
+
+    def __init__(self, fmu: FMU, start: Mapping[Variable, float | str]) -> None:
+        strings = tuple((v, value) for v, value in start.items() if isinstance(value, str))
+        numbers = {v: value for v, value in start.items() if not isinstance(value, str)}
+        spec = PoolSpec((), (), 1.0, start_time=fmu.description.start_time, strings=strings)
+        self._pool = trial_pool(fmu, spec, 1, logger)
+        self.close = self._pool.close
+        self._pool.reset(tuple(numbers), np.array([list(numbers.values())], float).T)
+        if self._pool.statuses[0] > Status.WARNING:
+            with closing(self):
+                raise SimulationError(self._pool.failure(0))
+
+    def jacobian(self, unknowns: Variables, knowns: Variables) -> FloatArray:
+        return self._pool.differentiate(unknowns, knowns)[:, :, 0]
+
+    def read(self, variables: Variables) -> FloatArray:
+        return self._pool.read(variables)[:, 0]
+
+
 def _linear_model(
-    instance: Instance, description: ModelDescription, x: Variables, u: Variables
+    instance: _Differentiable, description: ModelDescription, x: Variables, u: Variables
 ) -> LinearModel:
     x_dot = tuple(description.variable(description.state_derivatives[v.name]) for v in x)
     return LinearModel(
         A=instance.jacobian(x_dot, x),
         B=instance.jacobian(x_dot, u),
-        f=_read(instance, x_dot),
-        x0=_read(instance, x),
-        u0=_read(instance, u),
+        f=instance.read(x_dot),
+        x0=instance.read(x),
+        u0=instance.read(u),
         states=_names(x),
         inputs=_names(u),
         derivatives=_names(x_dot),
         units={v.name: v.unit for v in (*x, *u, *x_dot)},
     )
-
-
-def _read(instance: Instance, variables: Variables) -> FloatArray:
-    access = Access(instance, variables)
-    instance.check("reading variables", access.get())
-    return access.values
 
 
 def _names(variables: Variables) -> tuple[str, ...]:

@@ -17,7 +17,6 @@ static const Binding bindings[] = {
     {"NewDiscreteStates", offsetof(Functions, update), true},
     {"EnterContinuousTimeMode", offsetof(Functions, equations.enter_continuous), true},
     {"CompletedIntegratorStep", offsetof(Functions, complete), true},
-    {"GetDirectionalDerivative", offsetof(Functions, differentiate), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -62,6 +61,7 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
+    .derive = derive,
     SHARED_FUNCTIONS,
     SHARED_STATES,
 };

@@ -15,7 +15,6 @@ static const Binding bindings[] = {
     {"GetNominalsOfContinuousStates", offsetof(Functions, equations.get_nominals), true},
     {"EnterContinuousTimeMode", offsetof(Functions, equations.enter_continuous), true},
     {"CompletedIntegratorStep", offsetof(Functions, complete), true},
-    {"GetDirectionalDerivative", offsetof(Functions, differentiate), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -45,6 +44,7 @@ static const Fmi fmu = {
     .get = get3,
     .set = set3,
     .set_string = set_string3,
+    .derive = derive,
     SHARED_FUNCTIONS,
     SHARED_STATES,
 };

@@ -48,6 +48,8 @@ Status far_ask(Far *me, char code);
 /* Begins, sends and ends a request without arguments. */
 Status far_ask_simply(Far *me, char code);
 Status far_take_status(Far *me);
+/* Whether its worker is still there. The caller is within a request. */
+bool far_is_alive(const Far *me);
 
 /* In bytes. */
 size_t far_size_of_group(const Access *access, size_t index);

@@ -99,6 +99,16 @@ typedef struct {
     Outcome *outcomes;
 } Exchange;
 
+/* A directional derivative: that of all unknowns along a direction of the knowns. An adjoint one of
+ * FMI 3.0: that of a weighted sum of the unknowns by all knowns. */
+typedef struct {
+    bool adjoint;
+    const uint32_t *unknowns, *knowns;
+    size_t number_of_unknowns, number_of_knowns;
+    const double *seed; /* the direction, or the weights */
+    size_t size_of_seed, size_of_values;
+} Derivation;
+
 /* One FMI version. A Status that a function returns is one of FMI's own codes. PENDING and
  * unknown codes become ERROR, and so does a call of a function that the FMU does not export. */
 typedef struct Fmi {
@@ -131,6 +141,9 @@ typedef struct Fmi {
     Status (*reset)(const Library *library, void *component);
     Status (*terminate)(const Library *library, void *component);
     void (*free_instance)(const Library *library, void *component);
+    /* NULL in FMI 1.0 and for systems. */
+    Status (*derive)(const Library *library, void *component, const Derivation *derivation,
+                     double *values);
 
     /* FMU states; NULL in FMI 1.0. */
     Status (*get_state)(const Library *library, void *component, void **state);

@@ -74,7 +74,8 @@ typedef struct {
     {"FreeFMUstate", offsetof(Functions, older.common.free_state), false},                         \
     {"SerializedFMUstateSize", offsetof(Functions, older.common.state_size), false},               \
     {"SerializeFMUstate", offsetof(Functions, older.common.serialize), false},                     \
-    {"DeSerializeFMUstate", offsetof(Functions, older.common.deserialize), false}
+    {"DeSerializeFMUstate", offsetof(Functions, older.common.deserialize), false},                 \
+    {"GetDirectionalDerivative", offsetof(Functions, differentiate), false}
 
 /* FMUs keep the pointer, so it must stay valid as long as any instance exists. */
 static const Callbacks callbacks = {log_message_fmi2, calloc, free, NULL, NULL};
@@ -120,6 +121,15 @@ static inline Status initialize(const Library *library, void *component,
         status = sane(f->exit_initialization(component));
     }
     return status;
+}
+
+static inline Status derive(const Library *library, void *component, const Derivation *d,
+                            double *values) {
+    const Functions *f = functions_of(library);
+    return f->differentiate == NULL || d->adjoint
+               ? STATUS_ERROR
+               : sane(f->differentiate(component, d->unknowns, d->number_of_unknowns, d->knowns,
+                                       d->number_of_knowns, d->seed, values));
 }
 
 #endif

@@ -13,6 +13,9 @@
 
 typedef int Get3(void *instance, const uint32_t *references, size_t number_of_references,
                  void *values, size_t number_of_values);
+typedef int Derive3(void *instance, const uint32_t *unknowns, size_t number_of_unknowns,
+                    const uint32_t *knowns, size_t number_of_knowns, const double *seed,
+                    size_t size_of_seed, double *values, size_t size_of_values);
 typedef int Set3(void *instance, const uint32_t *references, size_t number_of_references,
                  const void *values, size_t number_of_values);
 
@@ -53,10 +56,7 @@ typedef struct {
                   bool *states_changed, bool *has_next_time, double *next_time);
     int (*complete)(void *instance, bool no_set_state, bool *event, bool *terminate);
     ClockFunctions clocks;
-    int (*differentiate)(void *instance, const uint32_t *unknowns, size_t number_of_unknowns,
-                         const uint32_t *knowns, size_t number_of_knowns, const double *seed,
-                         size_t number_of_seeds, double *sensitivity,
-                         size_t number_of_sensitivities);
+    Derive3 *differentiate, *differentiate_adjoint;
 } Functions;
 
 #define VALUES(name, type)                                                                         \
@@ -99,7 +99,9 @@ typedef struct {
     {"FreeFMUState", offsetof(Functions, common.free_state), false},                               \
     {"SerializedFMUStateSize", offsetof(Functions, common.state_size), false},                     \
     {"SerializeFMUState", offsetof(Functions, common.serialize), false},                           \
-    {"DeserializeFMUState", offsetof(Functions, common.deserialize), false}
+    {"DeserializeFMUState", offsetof(Functions, common.deserialize), false},                       \
+    {"GetDirectionalDerivative", offsetof(Functions, differentiate), false},                       \
+    {"GetAdjointDerivative", offsetof(Functions, differentiate_adjoint), false}
 
 static inline const Functions *functions_of(const Library *library) {
     return library->functions;
@@ -224,6 +226,17 @@ static inline Status set_string3(const Library *library, void *instance, uint32_
         return STATUS_ERROR;
     }
     return sane(f->set_string(instance, &reference, 1, &text, 1));
+}
+
+static inline Status derive(const Library *library, void *instance, const Derivation *d,
+                            double *values) {
+    const Functions *f = functions_of(library);
+    Derive3 *function = d->adjoint ? f->differentiate_adjoint : f->differentiate;
+    return function == NULL
+               ? STATUS_ERROR
+               : sane(function(instance, d->unknowns, d->number_of_unknowns, d->knowns,
+                               d->number_of_knowns, d->seed, d->size_of_seed, values,
+                               d->size_of_values));
 }
 
 #endif

@@ -7,8 +7,6 @@
 #include "instances.h"
 #include "records.h"
 
-static const size_t STATES_LIMIT = (size_t)256 << 20; /* total bytes of one pool's initial states */
-
 /* Initialization */
 
 typedef struct {

@@ -46,6 +46,8 @@ typedef struct {
     bool restores; /* whether an episode with the last start values begins with a restored state */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
+    bool renews;   /* whether resets make parts of a system anew, so that no state outlives one */
+    bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
     Pace pace;
@@ -93,6 +95,9 @@ typedef enum {
     PHASE_ENDED, /* after a step that failed: reading and a reset are legal */
     PHASE_FAILED /* after Error: a reset is legal */
 } Phase;
+
+/* Total bytes of the initial states that one pool keeps. */
+enum { STATES_LIMIT = 256 << 20 };
 
 /* Why the last status was worse than a warning. */
 typedef struct {

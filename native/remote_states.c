@@ -23,11 +23,11 @@ static FarState *new_state(const Far *me, int64_t number) {
     return state;
 }
 
-/* Begins a request about a state of this process. */
+/* Begins a request about a state. Returns whether the worker still has it. */
 static bool begin_with(Far *me, const FarState *state) {
     far_begin(me);
     packet_put_size(&me->host->out, (size_t)state->number);
-    return state->generation == me->generation;
+    return state->generation == me->generation && far_is_alive(me);
 }
 
 /* If the FMU makes a new state instead of overwriting the old one, so does this function, and the

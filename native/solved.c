@@ -276,6 +276,15 @@ Status solved_set_string(const Library *library, void *component, uint32_t refer
     return fmi_of(me)->set_string(library, me->component, reference, text);
 }
 
+Status solved_derive(const Library *library, void *component, const Derivation *derivation,
+                     double *values) {
+    const Solver *me = component;
+    const Fmi *fmi = fmi_of(me);
+
+    return fmi->derive == NULL ? STATUS_ERROR
+                               : fmi->derive(library, me->component, derivation, values);
+}
+
 Status solved_reset(const Library *library, void *component) {
     const Solver *me = component;
 

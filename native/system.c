@@ -168,6 +168,7 @@ Status system_do_step(const Library *library, void *component, double time, doub
     (void)library;
     me->blamed = NULL;
     me->terminated = false;
+    me->kept.stepped = true;
     Status status = me->is_fresh ? STATUS_OK : system_refresh(me);
     me->is_fresh = false;
     if (goes_on(status) && s->jacobi) {

@@ -17,6 +17,15 @@ typedef struct {
     const char *text;
 } PartString;
 
+/* How a part begins an episode, from the fastest way to the surest. fmugym/pool/systems.py has the
+ * same numbers. */
+typedef enum {
+    RUNG_RESTORE, /* returns to its state after the initialization, if the start values are the same */
+    RUNG_RESET,
+    RUNG_INSTANCE, /* is made anew */
+    RUNG_LIBRARY   /* and its private library is loaded anew */
+} Rung;
+
 /* An FMU of the system. */
 typedef struct Component {
     const char *name;
@@ -29,6 +38,7 @@ typedef struct Component {
     const char **categories;
     size_t number_of_categories;
     bool has_mode; /* whether its FMI version has an Initialization Mode */
+    Rung rung;
     int64_t steps; /* in one of the system */
     Solving solving;
     Access inputs, outputs; /* what a step sets and gets, in the order of the slots */
@@ -99,6 +109,10 @@ typedef struct System {
     const uint32_t *first_ends; /* of each variable; one more */
     size_t number_of_variables;
     bool jacobi;
+    bool restores; /* whether a part begins by RUNG_RESTORE */
+    bool renews;   /* whether a part is made anew */
+    bool private_libraries; /* whether each instance has its own libraries */
+    size_t largest_state; /* of a part that is kept, in bytes */
     size_t memory; /* doubles that the largest loop needs */
     size_t scratch; /* doubles that the longest list of variables of a part needs */
 } System;
@@ -114,14 +128,27 @@ typedef struct {
 typedef struct {
     bool *dead;    /* the parts for which no call is legal */
     bool *started; /* the parts that have left instantiation */
+    bool *failed;  /* the parts for which only a reset is legal */
     void **before; /* states at the begin of a step */
     char *names; /* of LOG_NAME bytes each */
 } PartPlaces;
 
+/* The start that parts return to; see system_reset.c. */
+typedef struct {
+    void **states;      /* of the parts that restore; of others NULL */
+    double *slots;      /* the inputs and outputs */
+    char *key, *wanted; /* what was set before the last initialization, and before this one */
+    size_t size, size_wanted;
+    bool known;   /* whether the states are there */
+    bool stepped; /* whether there were steps since the last initialization */
+    bool *useless; /* the parts for which restoring did not work */
+} KeptStart;
+
 /* One instance. A step uses only one block of memory: this, the components and the slots. */
 typedef struct {
     const System *system;
-    const Library *libraries; /* of the parts */
+    Library *libraries; /* of the parts */
+    const char *const *paths; /* of these */
     const Floats *floats;
     const char *blamed; /* who failed last, or NULL */
     void **components;
@@ -130,6 +157,10 @@ typedef struct {
     bool is_collecting;       /* whether values to be set are pending */
     bool terminated;          /* whether a part has asked to stop in this step */
     PartPlaces parts;
+    KeptStart kept;
+    uint64_t environment; /* of the first part */
+    bool logging;
+    bool hears, has_chosen; /* whether the parts are asked for messages, if they were told */
     double *loop, *typed; /* scratch memory */
     Pending *pending;
     size_t number_pending, room;
@@ -168,6 +199,34 @@ Status system_serialize(const Library *library, void *component, void *state, ch
                         size_t size);
 Status system_deserialize(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
+
+/* What system_library.c and system_reset.c share: making a part, and freeing it with its states. */
+bool part_instantiate(Composite *me, size_t index);
+void part_free(Composite *me, size_t index);
+void part_free_state(Composite *me, size_t index, void **state); /* if there is one */
+Status part_choose_messages(Composite *me, size_t index);
+/* Loads the library of a part anew, which must be private. */
+bool part_reload(Composite *me, size_t index);
+
+/* The start that parts return to. */
+bool start_allocate(Composite *me);
+void start_free(Composite *me);
+/* Notes what is set before the initialization that comes. */
+bool start_note(Composite *me, double start_time);
+/* Whether this initialization can return to the last one. */
+bool start_is_kept(const Composite *me);
+/* Resets the parts that could have been restored. */
+Status start_reset_restoring(Composite *me);
+/* Restores the states and slots. */
+Status start_restore(Composite *me);
+/* Whether the outputs are those of the kept start. */
+bool start_is_the_same(const Composite *me);
+/* Keeps the states of the parts that restore, if the same values were set before. */
+Status start_keep(Composite *me);
+/* Lets the parts that restored something else be restored no more, or all if none is to blame. */
+void start_blame(Composite *me);
+/* Returns all parts that do not restore to where they were made. */
+Status start_give_up(Composite *me);
 
 /* Notes a status of a part, and restores the floating-point environment. Returns the status. */
 Status part_judge(Composite *me, size_t index, Status status);

@@ -64,16 +64,23 @@ static Status begin_next(void *context) {
     return begin_from(place->beginning, place->index + 1);
 }
 
-static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
+static Status initialize_part(const Beginning *b, size_t index, StartValues values) {
     Composite *me = b->me;
+
+    me->parts.started[index] = true;
+    const Status status = part_judge(me, index, me->system->parts[index].fmi->initialize(
+                                                    &me->libraries[index], me->components[index],
+                                                    b->experiment, values, b->doing));
+    me->parts.failed[index] |= status > STATUS_WARNING;
+    return status;
+}
+
+static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
     Place place = {b, index};
     const StartValues values = {
         .set = set_starts, .context = &place, .exchange = goes_on ? begin_next : NULL};
 
-    me->parts.started[index] = true;
-    return part_judge(me, index, me->system->parts[index].fmi->initialize(
-                                     &me->libraries[index], me->components[index],
-                                     b->experiment, values, b->doing));
+    return initialize_part(b, index, values);
 }
 
 /* Exchanging values */
@@ -203,6 +210,88 @@ static Status collect(Composite *me, StartValues start_values) {
     return status;
 }
 
+/* Begins with all parts. */
+static Status begin_all(const Beginning *b) {
+    Status status = start_reset_restoring(b->me);
+
+    if (status <= STATUS_WARNING) {
+        status = begin_from(b, 0);
+    }
+    if (status <= STATUS_WARNING) {
+        *b->doing = "reading the outputs";
+        status = system_refresh(b->me);
+    }
+    return status;
+}
+
+/* Lets some parts return to the kept start, and initializes the others with their inputs of then. */
+
+static Status set_links(void *context) {
+    const Place *place = context;
+    Composite *me = place->beginning->me;
+    const Component *part = &me->system->parts[place->index];
+    Status status = STATUS_OK;
+
+    for (size_t i = part->first_route; i < part->end_route && status <= STATUS_WARNING; i++) {
+        const Route *route = &me->system->routes[i];
+        status = write_target(place->beginning, route, me->inputs[route->target]);
+    }
+    return status;
+}
+
+static Status begin_with_links(const Beginning *b, size_t index) {
+    Place place = {b, index};
+    const StartValues values = {.set = set_starts, .context = &place, .exchange = set_links};
+
+    return initialize_part(b, index, values);
+}
+
+static Status begin_again(const Beginning *b) {
+    Composite *me = b->me;
+    Status status = start_restore(me);
+
+    for (size_t i = 0; i < me->system->count && status <= STATUS_WARNING; i++) {
+        if (!me->parts.started[i]) {
+            status = begin_with_links(b, i);
+        }
+    }
+    return status <= STATUS_WARNING ? system_refresh(me) : status;
+}
+
+static Status begin_or_return(const Beginning *b, StartValues start_values) {
+    Composite *me = b->me;
+
+    if (start_is_kept(me)) {
+        const bool begun = begin_again(b) <= STATUS_WARNING;
+        if (begun && start_is_the_same(me)) {
+            return STATUS_OK;
+        }
+        if (begun) {
+            start_blame(me);
+        }
+        me->blamed = NULL;
+        const Status status = start_give_up(me);
+        if (status > STATUS_WARNING || collect(me, start_values) > STATUS_WARNING) {
+            return STATUS_ERROR;
+        }
+    }
+    return begin_all(b);
+}
+
+static Status keep(const Beginning *b, StartValues start_values) {
+    Composite *me = b->me;
+
+    if (start_keep(me) <= STATUS_WARNING) {
+        return STATUS_OK;
+    }
+    me->blamed = NULL; /* what refuses to save its state may have failed by that */
+    const Status status = start_give_up(me);
+    if (status > STATUS_WARNING || collect(me, start_values) > STATUS_WARNING) {
+        return STATUS_ERROR;
+    }
+    return begin_all(b);
+}
+
 Status system_initialize(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing) {
     Composite *me = component;
@@ -211,13 +300,14 @@ Status system_initialize(const Library *library, void *component, const Experime
     (void)library;
     *doing = "setting the start values";
     Status status = collect(me, start_values);
+    if (status <= STATUS_WARNING && me->system->restores &&
+        !start_note(me, experiment->start_time)) {
+        status = STATUS_ERROR;
+    }
     if (status <= STATUS_WARNING) {
         *doing = "initialization";
-        status = begin_from(&beginning, 0);
+        status = begin_or_return(&beginning, start_values);
     }
-    if (status <= STATUS_WARNING) {
-        *doing = "reading the outputs";
-        status = system_refresh(me);
-    }
-    return status;
+    return status <= STATUS_WARNING && me->system->restores ? keep(&beginning, start_values)
+                                                            : status;
 }

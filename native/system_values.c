@@ -18,6 +18,7 @@ Status part_judge(Composite *me, size_t index, Status status) {
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
         me->blamed = me->blamed == NULL ? label_of(me, index) : me->blamed;
         me->parts.dead[index] |= status == STATUS_FATAL;
+        me->parts.failed[index] |= status == STATUS_ERROR;
     }
     return status;
 }

@@ -13,6 +13,7 @@ import pytest
 import fmugym
 from fmugym import __main__ as program
 from fmugym.series import TimeSeries
+from fmugym.tools import speed
 from fmugym.tools.cli import _parsed, _parser, main
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
@@ -289,6 +290,14 @@ class TestInterruption:
         code, out, _ = run(capsys, "evaluate", CART_POLE, "--episodes", "9", "--json")
         (score,) = json.loads(out)["scores"]
         assert (code, len(score["rewards"])) == (130, 2)
+
+    def test_of_bench(self, monkeypatch, capsys):
+        def interrupted(*_):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(speed, "_of_vector", interrupted)
+        code, out, _ = run(capsys, "bench", CART_POLE, "--seconds", "0.01", "--json")
+        assert (code, [one["envs"] for one in json.loads(out)["speeds"]]) == (130, [0])
 
     def test_while_modules_are_loaded(self, monkeypatch):
         def interrupted(*_, **__):

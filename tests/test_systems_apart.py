@@ -470,7 +470,7 @@ class TestInWine:
         rows = play(make(plan, MASSES))
         mixed = masses([path, fmus[3]])
         assert SystemFMU(mixed).whereabouts_by_name == {"first": "wine", "second": "here"}
-        np.testing.assert_allclose(play(make(mixed, MASSES)), rows, rtol=1e-13, atol=1e-15)
+        assert play(make(mixed, MASSES)).tobytes() == rows.tobytes()
 
     def test_a_pendulum_beside_a_native_one(self, tmp_path):
         """The libraries differ in their sine and cosine by rounding."""

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import os
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -22,7 +23,9 @@ from wine_tools import exchange_fmu, for_windows
 
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
+from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.shared_memory import Memory, make_bell, size_for
 from fmugym.pool.process.windows import REQUESTS
 from fmugym.pool.process.worker import BlockWorker
 from fmugym.pool.spec import PoolSpec
@@ -124,11 +127,7 @@ class TestPaths:
 class TestProgram:
     def test_it_answers_what_a_worker_of_python_answers(self):
         methods = {name for name in vars(BlockWorker) if not name.startswith("_")}
-        assert set(REQUESTS) == methods - {
-            "open",
-            "serve",
-            "differentiate",
-        }  # FMPy does
+        assert set(REQUESTS) == methods - {"open", "serve"}
 
     def test_its_sources_fit_the_native_pool(self, tmp_path):
         """Without Wine, too: what they use of the native pool is there."""
@@ -158,6 +157,51 @@ class TestProgram:
         with pytest.raises(FMULoadError, match="nonsense"):
             program.worker_program()
         assert not list(tmp_path.glob("wine/*.exe"))
+
+
+class TestBell:
+    """What lets a worker that waits notice a message without going to sleep."""
+
+    class Ends:
+        """The ends of a channel; notes how many bells have rung when something is sent."""
+
+        def __init__(self):
+            self.rung = np.zeros(1, np.uint64).data
+            self.end, self.other = socket.socketpair()
+            self.rung_before = []
+
+        def fileno(self):
+            return self.end.fileno()
+
+        def recv(self, *arguments):
+            return self.end.recv(*arguments)
+
+        def send(self, *arguments):
+            self.rung_before.append(self.rung[0])
+            return self.end.send(*arguments)
+
+        def close(self):
+            self.end.close()
+            self.other.close()
+
+    def test_it_rings_once_after_each_message(self, opened):
+        ends = opened(self.Ends())
+        channel = Channel(ends, bell=ends.rung)
+        channel.send_code(Code.STEP)
+        channel.send_object(Code.REQUEST, ("read", ()))
+        channel.send_code(Code.STEP)
+        assert ends.rung_before == [0, 1, 2]
+        assert ends.rung[0] == 3
+
+    def test_workers_have_bells_of_their_own(self, cart_pole, opened):
+        fmu = FMU(cart_pole)
+        spec = PoolSpec((), tuple(map(fmu.variable, ("x", "theta"))), time_step=0.05)
+        memory = opened(Memory(size_for(spec, 5, 3)))
+        for number in range(3):
+            make_bell(memory, spec, 5, number)[0] += number + 1
+        everything = np.frombuffer(memory.map, np.uint64)
+        assert sorted(everything[everything > 0]) == [1, 2, 3]
+        fmu.close()
 
 
 @pytest.fixture(name="faulty", scope="module")
@@ -230,6 +274,21 @@ class TestInWine:
         after = pool.processes()
         assert before[0] != after[0]
         assert before[1] == after[1]
+
+    def test_steps_in_a_row_do_not_put_the_worker_to_sleep(self, cart_pole, opened):
+        """On two processors each sleep takes longer than the step."""
+        pool = opened(open_pool(cart_pole, workers=1))
+        pool.reset((), np.zeros((0, 1)))
+        status = Path(f"/proc/{pool.processes()[0]}/status")
+
+        def sleeps():
+            lines = status.read_text().splitlines()
+            return next(int(r.split()[1]) for r in lines if r.startswith("voluntary"))
+
+        before = sleeps()
+        for _ in range(1000):
+            pool.step_own()
+        assert sleeps() - before < 500
 
     def test_a_snapshot_is_lost_with_its_process(self, cart_pole, opened):
         pool = opened(open_pool(cart_pole, 2, workers=1))

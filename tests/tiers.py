@@ -48,6 +48,7 @@ SLOW_MODULES = {
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",
+    "test_systems_resets",
     "test_systems_ssp",
     "test_without_native",
 }
@@ -84,6 +85,7 @@ EVERY_IN_CI = {
     "test_snapshot_machine": 4,
     "test_start_times": 5,
     "test_systems": 5,
+    "test_systems_resets": 5,
     "test_value_types": 3,
     "test_words": 5,
     "test_zoo": 5,
@@ -221,9 +223,8 @@ EXHAUSTIVE_TESTS = (
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
     return (
-        node_id.startswith("test_windows_fmus.py::TestInWine")
-        or "wine" in node_id.partition("[")[2]
-    )
+        node_id.startswith(("test_windows_", "test_systems_")) and "::TestInWine" in node_id
+    ) or "wine" in node_id.partition("[")[2]
 
 
 def is_slow(node_id, number):

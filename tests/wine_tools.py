@@ -57,14 +57,14 @@ def windows_library(*sources, flags=(), stubs=""):
         return target.read_bytes()
 
 
-def exchange_fmu(path, model, version):
-    """Write an FMU for model exchange with a library for Windows only."""
+def exchange_fmu(path, model, version, interfaces=("ModelExchange",), flags=""):
+    """Write an FMU as ``exchange_tools`` does, with a library for Windows only."""
     shim = f"exchange/fmi{version}.c"
     stubs = fmu_tools.stubs(version, PREFIXES[version], building.HERE / shim)
     sources = [*(f"exchange/{name}.c" for name in ("core", "usual", model)), shim]
     data = windows_library(*sources, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
     files = {
-        "modelDescription.xml": exchange_tools.describe(model, version),
+        "modelDescription.xml": exchange_tools.describe(model, version, interfaces, flags),
         f"binaries/{FOLDERS[version]}/Model.dll": data,
     }
     return fmu_tools.write_fmu(Path(path), files)

@@ -424,6 +424,11 @@ class ModelDescription:
         return self.fmi_major_version > 1 or self.model_exchange is None
 
     @property
+    def components(self) -> tuple[ModelDescription, ...]:
+        """The descriptions of the FMUs of a system; an FMU has none."""
+        return ()
+
+    @property
     def platform(self) -> str:
         """The folder under ``binaries/`` for this machine; FMI 3.0 has other names for them."""
         return str(fmpy.platform_tuple if self.fmi_major_version == 3 else fmpy.platform)

@@ -5,11 +5,13 @@ This does what ``native/system.c`` and its siblings do, operation by operation.
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import struct
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -21,6 +23,7 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.kept import KeptStart
 from fmugym.fmi.library import Library
 from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
@@ -69,6 +72,12 @@ class _Part:
         self.outputs = Access(instance, layout.outputs)
         self.started = False
         self.forget()
+
+    def renew(self, instance: Instance) -> None:
+        """Go on with another instance."""
+        self.instance, self.started = instance, False
+        self.inputs = Access(instance, self.layout.inputs, self.inputs.values)
+        self.outputs = Access(instance, self.layout.outputs, self.outputs.values)
 
     def forget(self) -> None:
         """Return the slots to the start values."""
@@ -129,13 +138,23 @@ class SystemInstance(Instance):
         layout: The slots and routes.
         instances: Those of the components, in their order.
         target: The logger for the system's own messages.
+        resets: How each component begins an episode: ``"restore"``, ``"reset"``, or anything else
+            for a new instance.
+        renew: Makes the instance of a component anew, given its number and the old one.
     """
 
     dtypes: ClassVar[dict[str, Any]] = {"Float64": np.float64}
 
     def __init__(
-        self, layout: Layout, instances: Iterable[Instance], target: logging.Logger
+        self,
+        layout: Layout,
+        instances: Iterable[Instance],
+        target: logging.Logger,
+        resets: Sequence[str],
+        renew: Callable[[int, Instance], Instance],
     ) -> None:
+        self._resets, self._renew = resets, renew
+        self._kept, self._life = KeptStart(), object()
         self._layout = layout
         self._description: SystemDescription = layout.description
         pairs = zip(layout.parts, instances, strict=True)
@@ -183,6 +202,11 @@ class SystemInstance(Instance):
         """Forget the messages of the episode before."""
         for part in self._parts:
             part.instance.begin_episode()
+
+    @property
+    def life(self) -> object:
+        """See ``Instance.life``; it ends when a component is made anew."""
+        return self._life
 
     def c_type(self, variable: Variable) -> str:
         """The values of a system are all of one type."""
@@ -295,17 +319,115 @@ class SystemInstance(Instance):
             self.phase = Phase.FAILED
 
     def _initialize_parts(self, span: Span, set_start_values: Callable[[], None]) -> None:
+        values = self._collected(set_start_values)
+        key = KeptStart.key_of(span.start_time, values)
+        if self._kept.known and key == self._kept.key:
+            if self._has_begun_again(span, values):
+                return
+            self._give_up()
+            values = self._collected(set_start_values)
+        self._begin_all(span, values)
+        if self._kept.next(key) and not self._has_kept_states():
+            self._give_up()
+            self._begin_all(span, self._collected(set_start_values))
+
+    def _collected(self, set_start_values: Callable[[], None]) -> list[Any]:
         for part in self._parts:
             part.forget()
         self._fresh = False
         self._pending = []
         try:
             set_start_values()
-            values, self._pending = self._pending, None
+            return self._pending
         finally:
             self._pending = None
+
+    def _begin_all(self, span: Span, values: list[Any]) -> None:
+        self._kept.forget()
+        for index in self._restoring:
+            with self._restoring_part(index):
+                self._reset_part(index)
         self._begin_from(0, span, values)
         self._refresh()
+
+    # Some components return to the kept start, the others begin with their inputs of then.
+
+    @property
+    def _restoring(self) -> list[int]:
+        pairs = enumerate(self._resets)
+        return [i for i, method in pairs if method == "restore" and i not in self._kept.useless]
+
+    @property
+    def _others(self) -> list[int]:
+        restoring = self._restoring
+        return [index for index in range(len(self._parts)) if index not in restoring]
+
+    def _has_begun_again(self, span: Span, values: list[Any]) -> bool:
+        others = self._others
+        try:
+            self._restore_start()
+            self._begin_others(others, span, values)
+        except (_FailedError, SimulationError):
+            return False
+        return not self._blamed()
+
+    def _blamed(self) -> bool:
+        """Restore those no more whose outputs are others than then; returns whether any are."""
+        now, then = (np.frombuffer(slots) for slots in (self._slots()[1], self._kept.slots[1]))
+        if now.tobytes() == then.tobytes():
+            return False
+        found = []
+        for index in self._restoring:
+            part = self._parts[index].layout
+            place = slice(part.first_output, part.first_output + len(part.outputs))
+            if now[place].tobytes() != then[place].tobytes():
+                found.append(index)
+        self._kept.useless.update(found or range(len(self._parts)))
+        return True
+
+    def _restore_start(self) -> None:
+        for index in self._restoring:
+            with self._restoring_part(index):
+                self._restore_part(index, self._kept.states[index])
+        self._kept.stepped = False
+        self._put_inputs(self._kept.slots[0])
+
+    @contextmanager
+    def _restoring_part(self, index: int) -> Iterator[None]:
+        """Restore a component no more that fails in this."""
+        try:
+            yield
+        except BaseException:
+            self._kept.useless.add(index)
+            raise
+
+    def _begin_others(self, indices: Iterable[int], span: Span, values: list[Any]) -> None:
+        for index in indices:
+            self._begin(index, span, values, functools.partial(self._set_links, index))
+        self._refresh()
+
+    def _set_links(self, index: int) -> None:
+        part = self._parts[index]
+        for route in self._layout.routes:
+            if route.target_part == index:
+                place = route.target - part.layout.first_input
+                self._write_target(route, float(part.inputs.values[place]))
+
+    def _has_kept_states(self) -> bool:
+        try:
+            for index in self._restoring:
+                with self._restoring_part(index):
+                    self._kept.states[index] = self._save_part(index)
+        except _FailedError:
+            return False
+        self._kept.slots, self._kept.known = self._slots(), True
+        return True
+
+    def _give_up(self) -> None:
+        """Return all that do not restore to where they were made."""
+        self._kept.forget()
+        for index in self._others:
+            self._reset_part(index)
 
     def _begin_from(self, index: int, span: Span, values: list[Any]) -> None:
         """Begin with this part and all that follow, then exchange values."""
@@ -414,6 +536,7 @@ class SystemInstance(Instance):
         return status
 
     def _step_all(self, time: float, step_size: float) -> None:
+        self._kept.stepped = True
         if not self._fresh:
             self._refresh()
         self._fresh = False
@@ -516,11 +639,24 @@ class SystemInstance(Instance):
             raise SimulationError(
                 f"{self._log.instance_name}: no reset is legal after a fatal error"
             )
-        for part in self._parts:
-            if part.started:
-                part.instance.reset()
-                part.started = False
+        for index in self._others:
+            self._reset_part(index)
         self.phase = Phase.INSTANTIATED
+
+    def _reset_part(self, index: int) -> None:
+        part = self._parts[index]
+        if not part.started:
+            return
+        if self._resets[index] in ("restore", "reset"):
+            part.instance.reset()
+            part.started = False
+            return
+        self._life = object()
+        try:
+            part.renew(self._renew(index, part.instance))
+        except FMULoadError as error:
+            self.phase = Phase.DEAD
+            raise SimulationError(f"{part.label}: {error}") from None
 
     def save_state(self) -> SavedState:
         """See ``Instance.save_state``."""
@@ -554,12 +690,18 @@ class SystemInstance(Instance):
         self.phase = Phase.STEPPING
 
     def _put_slots(self, memory: _Memory) -> None:
-        inputs, outputs = np.frombuffer(memory.inputs), np.frombuffer(memory.outputs)
+        self._put_inputs(memory.inputs)
+        outputs = np.frombuffer(memory.outputs)
         for part in self._parts:
-            first, last = part.layout.first_input, part.layout.first_output
-            part.inputs.values[:] = inputs[first : first + len(part.layout.inputs)]
-            part.outputs.values[:] = outputs[last : last + len(part.layout.outputs)]
+            first = part.layout.first_output
+            part.outputs.values[:] = outputs[first : first + len(part.layout.outputs)]
         self._fresh = memory.fresh
+
+    def _put_inputs(self, data: bytes) -> None:
+        inputs = np.frombuffer(data)
+        for part in self._parts:
+            first = part.layout.first_input
+            part.inputs.values[:] = inputs[first : first + len(part.layout.inputs)]
 
     def serialize(self, state: SavedState) -> bytes:
         """See ``Instance.serialize``; the native pool writes the same."""
@@ -612,14 +754,21 @@ class SystemLibrary(Library):
         layout: The slots and routes.
         target: The logger for the messages of all instances.
         solving: See ``Library``.
+        resets: See ``SystemInstance``; empty if all components are reset.
 
     Raises:
         FMULoadError: If a library cannot be loaded.
     """
 
     def __init__(
-        self, fmu: LoadableFMU, layout: Layout, target: logging.Logger, solving: Solving | None
+        self,
+        fmu: LoadableFMU,
+        layout: Layout,
+        target: logging.Logger,
+        solving: Solving | None,
+        resets: Sequence[str] = (),
     ) -> None:
+        self._resets = resets or ("reset",) * len(layout.parts)
         self.close: Any
         self._system, self._layout, self._target = fmu, layout, target
         self._libraries: list[Library] = []
@@ -645,9 +794,15 @@ class SystemLibrary(Library):
             for instance in made:
                 instance.free()
             raise
-        instance = SystemInstance(self._layout, made, self._target)
+        renew = functools.partial(self._renewed, hear_all=hear_all)
+        instance = SystemInstance(self._layout, made, self._target, self._resets, renew)
         self._instances.append(instance)
         return instance
+
+    def _renewed(self, index: int, old: Instance, *, hear_all: bool) -> Instance:
+        library, label = self._libraries[index], self._layout.parts[index].label
+        library.discard(old)
+        return _instantiate(library, label, hear_all)
 
     def discard(self, instance: Instance) -> None:
         """See ``Library.discard``."""
@@ -691,6 +846,7 @@ def open_library(
     solving: Solving | None,
     inputs: Sequence[Variable],
     outputs: Sequence[Variable],
+    resets: Sequence[str] = (),
 ) -> Library:
     """Load an FMU or a system.
 
@@ -700,6 +856,7 @@ def open_library(
         solving: See ``Library``.
         inputs: The variables that each step sets.
         outputs: The variables that are read after each step.
+        resets: See ``SystemLibrary``.
 
     Raises:
         FMULoadError: As ``Library``.
@@ -707,4 +864,4 @@ def open_library(
     description = fmu.description
     if not isinstance(description, SystemDescription):
         return Library(fmu, target, solving)
-    return SystemLibrary(fmu, Layout(description, inputs, outputs), target, solving)
+    return SystemLibrary(fmu, Layout(description, inputs, outputs), target, solving, resets)

@@ -17,7 +17,6 @@ import logging
 import shutil
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
@@ -357,7 +356,7 @@ class NativePool(SavingPool):
         self._open_pool().begin_by(False, method == ResetMethod.INSTANCE)
         self._pool.keep_records()
         self._mistrust_states()
-        self._spec = replace(self._spec, reset_method=method)
+        self._spec = self._spec.beginning_by(method)
         return True
 
     def recycle(self) -> None:

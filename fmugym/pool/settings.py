@@ -130,7 +130,7 @@ def _structural_settings(description: ModelDescription) -> dict[str, bytes]:
 
 def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
     """How instances are initialized and stepped, and how episodes begin."""
-    method = spec.reset_method
+    method = spec.whole_reset_method
     return {
         "start_time": spec.start_time,
         "stop_time": spec.stop_time,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, SimulationError, printable
 from fmugym.fmi.access import Access
-from fmugym.fmi.instance import Instance, SavedState
+from fmugym.fmi.instance import SavedState
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.attendant import InitialState
@@ -20,7 +20,7 @@ from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.samples import Samples
-from fmugym.pool.spec import ResetMethod, is_start_time
+from fmugym.pool.spec import REUSING, ResetMethod, is_start_time
 
 __all__ = ["Slot", "Snapshot"]
 
@@ -30,19 +30,18 @@ class Snapshot:
     """A saved state of one instance.
 
     Attributes:
-        instance: The only instance that can restore the state.
+        life: The only life of an instance that can restore the state.
         state: The FMU state.
         count: The number of communication steps before the state.
         start_time: The first communication point of its episode.
     """
 
-    instance: Instance
+    life: object
     state: SavedState
     count: int
     start_time: float
 
 
-_REUSING = (ResetMethod.RESTORE, ResetMethod.RESET)
 _STEPPING = Phase.STEPPING
 _WARNING = int(Status.WARNING)
 _STATUSES = {Phase.FAILED: Status.ERROR, Phase.DEAD: Status.FATAL}
@@ -118,7 +117,7 @@ class Slot:
 
     def begin_by(self, method: ResetMethod) -> None:
         """Let later episodes begin in another way, without saved states."""
-        self._spec = replace(self._spec, reset_method=method)
+        self._spec = self._spec.beginning_by(method)
         self._restores, self._saved = False, None
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
@@ -175,7 +174,7 @@ class Slot:
             self._replace()
         elif unexplained and not self._has_snapshots and self._instance.can_say_more:
             self._rebuild(hear_all=True)
-        elif self._spec.reset_method not in _REUSING or self._instance.hears_more_than_wanted:
+        elif self._spec.whole_reset_method not in REUSING or self._instance.hears_more_than_wanted:
             self._rebuild()
 
     @property
@@ -429,11 +428,11 @@ class Slot:
     def save(self) -> Snapshot:
         """Copy the FMU state and the time."""
         state = self._instance.save_state()
-        return Snapshot(self._instance, state, self._count, self.start_time)
+        return Snapshot(self._instance.life, state, self._count, self.start_time)
 
     def require_own(self, snapshot: Snapshot) -> None:
         """Refuse a state of another instance, because FMUs accept it silently."""
-        if snapshot.instance is not self._instance:
+        if snapshot.life is not self._instance.life:
             raise SimulationError("the snapshot is of another instance than this one")
 
     def restore(self, snapshot: Snapshot) -> int:

@@ -19,6 +19,7 @@ __all__ = [
     "FIXED_STEP_SOLVERS",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
+    "REUSING",
     "SAMPLINGS",
     "SOLVERS",
     "START_TIME",
@@ -97,6 +98,10 @@ class ResetMethod(StrEnum):
     """Start a new worker process."""
 
 
+REUSING: Final = (ResetMethod.RESTORE, ResetMethod.RESET)
+"""The methods that keep the instance."""
+
+
 @dataclass(frozen=True)
 class PoolSpec:
     """What a pool does at each reset and step.
@@ -120,6 +125,8 @@ class PoolSpec:
             8 ... smaller ones, from the FMU state before it.
         leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
         reset_method: How instances start a new episode.
+        component_resets: For each component of a system, how it starts a new episode; empty if all
+            do by ``reset_method``.
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
         one_initialization: Whether only one instance in a process may be made, initialized, reset
             or freed at a time. Steps run in parallel all the same.
@@ -157,6 +164,7 @@ class PoolSpec:
     fault_retries: int = 0
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET
+    component_resets: tuple[ResetMethod, ...] = ()
     input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
     initialization_interval: float = 0.0
@@ -189,13 +197,31 @@ class PoolSpec:
         return tuple(variable.start_number for variable in self.outputs)
 
     def fitting(self, description: ModelDescription) -> PoolSpec:
-        """The spec for this FMU: one that has no function for resets is instantiated anew."""
-        if description.has_reset or self.reset_method not in (
-            ResetMethod.RESTORE,
-            ResetMethod.RESET,
-        ):
+        """The spec for this FMU: one that has no function for resets is instantiated anew.
+
+        Of a system, only the components without this function are.
+        """
+        if description.has_reset or self.component_resets or self.reset_method not in REUSING:
             return self
-        return replace(self, reset_method=ResetMethod.INSTANCE)
+        methods = tuple(
+            ResetMethod.RESET if part.has_reset else ResetMethod.INSTANCE
+            for part in description.components
+        )
+        return replace(self, reset_method=ResetMethod.INSTANCE, component_resets=methods)
+
+    def beginning_by(self, method: ResetMethod) -> PoolSpec:
+        """The spec with another reset method for the whole FMU or system."""
+        return replace(self, reset_method=method, component_resets=())
+
+    @property
+    def whole_reset_method(self) -> ResetMethod:
+        """How a pool treats the FMU as a whole: components with methods of their own are reset."""
+        return ResetMethod.RESET if self.component_resets else self.reset_method
+
+    @property
+    def reloads(self) -> bool:
+        """Whether anything is loaded anew, which must be a private copy then."""
+        return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)
 
     @property
     def solving(self) -> Solving:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,12 +16,15 @@ from fmugym.pool.settings import (
     manner_of,
     solving_settings,
 )
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.systems.description import PartVariable, SystemDescription
 from fmugym.systems.layout import Layout, PartLayout
 from fmugym.systems.plan import Loop
 
 __all__ = ["system_settings"]
+
+_RUNGS: Final = tuple(ResetMethod)
+"""In the order of ``Rung`` of ``native/system.h``."""
 
 
 def system_settings(
@@ -42,10 +45,11 @@ def system_settings(
     if not isinstance(description, SystemDescription):
         return None
     layout = Layout(description, spec.inputs, spec.outputs)
+    rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     return (
         tuple(
-            _part(part, one, spec, folder / str(i), hosts)
-            for i, (part, one) in enumerate(zip(layout.parts, fmu.parts, strict=True))
+            _part(part, one, spec, rung, folder / str(i), hosts)
+            for i, (part, one, rung) in enumerate(zip(layout.parts, fmu.parts, rungs, strict=True))
         ),
         _routes(layout),
         _variables(layout),
@@ -56,7 +60,12 @@ def system_settings(
 
 
 def _part(
-    part: PartLayout, fmu: LoadableFMU, spec: PoolSpec, folder: Path, hosts: Hosts
+    part: PartLayout,
+    fmu: LoadableFMU,
+    spec: PoolSpec,
+    rung: ResetMethod,
+    folder: Path,
+    hosts: Hosts,
 ) -> tuple[Any, ...]:
     description = part.description
     version = description.fmi_major_version
@@ -70,7 +79,7 @@ def _part(
             label.encode(),
             f"{label}, whose outputs are not finite".encode(),
         ),
-        (version, manner_of(description, spec), part.has_mode),
+        (version, manner_of(description, spec), part.has_mode, _RUNGS.index(rung)),
         (known["model"], known["token"], known["resources"]),
         known["categories"],
         part.component.steps,

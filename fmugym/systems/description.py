@@ -58,6 +58,11 @@ class SystemDescription(ModelDescription):
         """Whether all components have a function for resets."""
         return all(part.has_reset for part in self.parts)
 
+    @property
+    def components(self) -> tuple[ModelDescription, ...]:
+        """See ``ModelDescription.components``."""
+        return self.parts
+
 
 def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> SystemDescription:
     """Describe a system.

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-from fmugym.trial.trial import Candidate, content_of
+from fmugym.trial.candidate import Candidate, content_of
 
 if TYPE_CHECKING:
     from fmugym.task.construction import Constructed

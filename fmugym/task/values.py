@@ -50,6 +50,11 @@ class NamedValues(Mapping[str, Any]):
         self._get_values = get_values
         self._found_arrays: dict[str, list[int]] | None = None
 
+    def share_names(self, other: NamedValues) -> None:
+        """Look the names up in the table of another mapping, if it has the same ones."""
+        if list(self._index) == list(other._index):
+            self._index = other._index
+
     @property
     def _arrays(self) -> dict[str, list[int]]:
         """The places of the elements of arrays, found when first asked for."""

@@ -30,7 +30,7 @@ from fmugym.tools.overview import plain
 from fmugym.tools.progress import progress
 from fmugym.tools.records import Recording, require_format, title_of
 from fmugym.tools.simulation import Policy, Summary, simulate
-from fmugym.tools.speed import bench, speed_table
+from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
 __all__ = ["add_bench", "add_evaluate", "add_record", "add_simulate"]
@@ -214,7 +214,16 @@ def add_bench(commands: Commands) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    report = bench(maker_of(arguments.task), arguments.envs or [8, 64, 1024], arguments.seconds)
+    report: Report | None = None
+    with shown_in_any_case(lambda: _show_speeds(report, arguments)):
+        make, sizes = maker_of(arguments.task), arguments.envs or [8, 64, 1024]
+        for report in bench(make, sizes, arguments.seconds):  # noqa: B007 - shown at the end
+            pass  # each has the speeds of the one before, so that Ctrl-C leaves the last
+
+
+def _show_speeds(report: Report | None, arguments: argparse.Namespace) -> None:
+    if report is None:
+        return
     if arguments.json:
         say_json({"task": arguments.task, **report.as_dict()})
     else:

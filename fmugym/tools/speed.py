@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any, Final
 
@@ -67,13 +67,16 @@ class Report:
         return asdict(self)
 
 
-def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) -> Report:
+def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) -> Iterator[Report]:
     """Measure the speed of a task with random actions.
 
     Args:
         make_env: A function that makes the environment.
         sizes: The sizes of vector environments.
         seconds: Real time of each measurement.
+
+    Yields:
+        After each measurement a report with all speeds until then.
 
     Raises:
         ConfigError: If ``seconds`` is not positive.
@@ -85,11 +88,13 @@ def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) 
     env = make_env()
     try:
         time_step = env._spec.time_step
-        speeds = [_of_single(env, seconds)]
+        report = Report((_of_single(env, seconds),), time_step, _processors(), load)
     finally:
         env.close()
-    speeds += [_of_vector(make_env, size, seconds) for size in sizes]
-    return Report(tuple(speeds), time_step, _processors(), load)
+    yield report
+    for size in sizes:
+        report = replace(report, speeds=(*report.speeds, _of_vector(make_env, size, seconds)))
+        yield report
 
 
 def _processors() -> int:

@@ -22,7 +22,7 @@ from fmugym.systems.fmu import SystemFMU
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, advise, lines_of
 from fmugym.tools.overview import plain
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["Finding", "Report", "validate"]

@@ -217,10 +217,11 @@ def _require_starts(env: FMUEnv, states: States, obstacle: str) -> None:
 def _by_directional_derivatives(
     envs: FMUVectorEnv, start: Snapshot, nominal: npt.NDArray[Any], states: States
 ) -> Matrices:
-    """Play the trajectory with an instance in Python, in this process or in a worker."""
+    """Play the trajectory with an instance in Python or Wine, in this process or in a worker."""
     env = envs._maker.make()
     try:
-        env._use(replace(env._opening, backend="python").open(1, rehearse=False))
+        opening = env._opening if env.fmu.in_wine else replace(env._opening, backend="python")
+        env._use(opening.open(1, rehearse=False))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)

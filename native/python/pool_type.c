@@ -454,6 +454,8 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->restores = s->can_save && a->restores;
     s->rebuilds = a->rebuilds;
     s->reloads = a->reloads;
+    s->renews = self->system != NULL && self->system->renews;
+    s->returns = self->system != NULL && self->system->restores;
     s->one_initialization = a->one_initialization;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
@@ -469,6 +471,10 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;
+    if (self->system != NULL) {
+        self->system->private_libraries = s->private_libraries;
+        self->system->largest_state = STATES_LIMIT / s->count;
+    }
     s->pace.interval = (uint64_t)(a->pace * 1e9);
     s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
     return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&

@@ -140,13 +140,13 @@ static bool take_part(PyObject *tuple, Component *part) {
     PyObject *categories, *solving, *strings, *remote;
     Variables inputs, outputs, starts;
     Bytes input_starts, start_values, none = {NULL, 0};
-    int version, manner, has_mode;
+    int version, manner, has_mode, rung;
     long long steps;
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(iip)(yyy)O!LO(y#y#y#)y#(y#y#y#)(y#y#y#)y#O!O", &part->name, &part->label,
-            &part->not_finite, &version, &manner, &has_mode, &part->model, &part->token,
+            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#)y#(y#y#y#)(y#y#y#)y#O!O", &part->name, &part->label,
+            &part->not_finite, &version, &manner, &has_mode, &rung, &part->model, &part->token,
             &part->resources, &PyTuple_Type, &categories, &steps, &solving, VARIABLES(inputs),
             BYTES(input_starts), VARIABLES(outputs), VARIABLES(starts), BYTES(start_values),
             &PyTuple_Type, &strings, &remote)) {
@@ -155,10 +155,11 @@ static bool take_part(PyObject *tuple, Component *part) {
     part->version = version;
     part->manner = manner;
     part->fmi = version == 0 ? NULL : fmi_of(version, manner);
-    if (part->fmi == NULL || steps < 1) {
+    if (part->fmi == NULL || steps < 1 || rung < RUNG_RESTORE || rung > RUNG_LIBRARY) {
         return refuse("parts");
     }
     part->has_mode = has_mode;
+    part->rung = (Rung)rung;
     part->steps = steps;
     part->input_starts = doubles_of(input_starts);
     part->start_values = doubles_of(start_values);
@@ -182,6 +183,8 @@ static void count_slots(System *s) {
         s->inputs += part->inputs.count;
         s->outputs += part->outputs.count;
         s->scratch = scratch > s->scratch ? scratch : s->scratch;
+        s->restores |= part->rung == RUNG_RESTORE;
+        s->renews |= part->rung >= RUNG_INSTANCE;
     }
 }
 

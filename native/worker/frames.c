@@ -10,7 +10,14 @@
 #include <string.h>
 #include <windows.h>
 
+enum {
+    LONGEST_WATCH = 40000, /* ns before this process goes to sleep; as in channel.py */
+    PAUSES = 16            /* looks before others may have the processor */
+};
+
 static HANDLE input, output;
+static const Atomic *watched; /* NULL before frames_watch */
+static uint64_t heard;        /* messages received, in the numbers of the watched count */
 
 static HANDLE copy_of(DWORD stream) {
     HANDLE copy = NULL;
@@ -67,7 +74,36 @@ static bool send(const char *bytes, size_t size) {
     return true;
 }
 
+void frames_watch(const Atomic *bell) {
+    watched = bell;
+    heard = atomic_get(bell);
+}
+
+static bool is_announced(void) {
+    for (int i = 0; i < PAUSES; i++) {
+        if (atomic_get(watched) > heard) {
+            return true;
+        }
+        spin_pause();
+    }
+    return false;
+}
+
+/* Waking a process on an idle processor takes tens of microseconds. A read from a stream cannot
+ * wait any other way, and asking Wine whether it would takes about as long. */
+static void wait_for_message(void) {
+    const uint64_t deadline = clock_now() + LONGEST_WATCH;
+
+    while (!is_announced() && clock_now() < deadline) {
+        SwitchToThread();
+    }
+}
+
 bool receive_code(char *code) {
+    if (watched != NULL) {
+        wait_for_message();
+    }
+    heard++;
     return receive(code, 1);
 }
 

@@ -11,6 +11,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "../platform.h"
+
 /* The codes are those of fmugym/pool/process/channel.py. */
 enum {
     CODE_STEP = 's',
@@ -31,6 +33,9 @@ bool frames_open(void);
 /* The streams themselves. */
 void *frames_input(void);
 void *frames_output(void);
+/* A count in shared memory that the other end raises after each message. From now on receive_code
+ * watches it for a short time before it goes to sleep. */
+void frames_watch(const Atomic *bell);
 
 /* Return whether it worked; the other end may be gone. */
 bool receive_code(char *code);

@@ -83,6 +83,7 @@ static bool open_shared(Worker *w, Reader *reader, size_t num_observed) {
     const size_t echo_size = (size_t)read_integer(reader);
     if (reader->sound) {
         log_echo_to(echo, echo_size);
+        frames_watch((const Atomic *)(echo + echo_size));
     }
     return reader->sound && share_pace(w, read_text(reader));
 }

@@ -5,6 +5,7 @@
 
 #include "../records.h"
 #include "answers.h"
+#include "derivatives.h"
 
 /* Windows' own header of this function needs another library. */
 typedef struct {
@@ -30,6 +31,7 @@ enum {
     REQUEST_FAILURE,
     REQUEST_READ,
     REQUEST_REPLACE_RECORD,
+    REQUEST_DIFFERENTIATE,
     REQUEST_CLOSE,
     REQUESTS
 };
@@ -205,6 +207,38 @@ static void answer_read(Worker *w, Reader *reader) {
     access_close(&access);
 }
 
+static void answer_question(Worker *w, const Question *question) {
+    const size_t size =
+        question->seeded->count * question->others->count * w->settings.count * sizeof(double);
+    double *derivatives = memory_for(NULL, size);
+
+    pool_enter(&w->pool);
+    const ptrdiff_t failed = worker_differentiate(w, question, derivatives);
+    pool_leave(&w->pool);
+    worker_report(w);
+    if (failed >= 0) {
+        send_failure(w, (size_t)failed);
+    } else {
+        send_content(CODE_RESULT, derivatives, size);
+    }
+    free(derivatives);
+}
+
+static void answer_differentiate(Worker *w, Reader *reader) {
+    const bool adjoint = read_flag(reader);
+    Access seeded = {.count = 0}, others = {.count = 0};
+
+    if (read_access(reader, w->settings.fmi, &seeded) &&
+        read_access(reader, w->settings.fmi, &others)) {
+        const Question question = {adjoint, &seeded, &others};
+        answer_question(w, &question);
+    } else {
+        send_error("a list of variables is damaged");
+    }
+    access_close(&seeded);
+    access_close(&others);
+}
+
 /* Questions */
 
 static void answer_count_steps(Worker *w, Reader *reader) {
@@ -250,6 +284,7 @@ bool worker_answer(Worker *w, Reader *reader) {
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_READ] = answer_read,
         [REQUEST_REPLACE_RECORD] = answer_replace_record,
+        [REQUEST_DIFFERENTIATE] = answer_differentiate,
         [REQUEST_CLOSE] = answer_close,
     };
     const uint8_t request = read_flag(reader);

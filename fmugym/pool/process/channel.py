@@ -98,6 +98,8 @@ class Channel:
             where there is none.
         output: What the other process prints; passed on while this one waits.
         coding: How objects are sent.
+        bell: The count of messages sent, in memory that the other process watches while it waits;
+            None if it does not.
 
     Attributes:
         end: The socket.
@@ -109,8 +111,10 @@ class Channel:
         sentinel: int | None = None,
         output: Output | None = None,
         coding: Coding | None = None,
+        bell: memoryview | None = None,
     ) -> None:
         self.end = end
+        self._bell = bell
         self._coding = Pickled() if coding is None else coding
         self._send, self._receive = end.send, end.recv
         self._descriptor, self._sentinel = end.fileno(), sentinel
@@ -124,6 +128,8 @@ class Channel:
         """Send a bare code."""
         with self._lock:
             self._send(code)
+            if self._bell is not None:  # not earlier, or else the other process would wait for it
+                self._bell[0] += 1
 
     def wait(self, seconds: float | None = None) -> bool:
         """Wait until there is something to receive or the other process has ended.
@@ -163,6 +169,8 @@ class Channel:
         data = self._coding.dumps(code, content)
         with self._lock:
             self._send_all(b"".join((code, _LENGTH.pack(len(data)), data)))
+            if self._bell is not None:
+                self._bell[0] += 1
 
     def _send_all(self, data: bytes) -> None:
         view = memoryview(data)

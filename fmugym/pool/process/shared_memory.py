@@ -20,7 +20,16 @@ import numpy.typing as npt
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import HEALTH_COUNTS, HealthArray
 
-__all__ = ["ECHO_SIZE", "Arrays", "Memory", "make_arrays", "make_echo", "offsets_of", "size_for"]
+__all__ = [
+    "ECHO_SIZE",
+    "Arrays",
+    "Memory",
+    "make_arrays",
+    "make_bell",
+    "make_echo",
+    "offsets_of",
+    "size_for",
+]
 
 _ALIGNMENT: Final = 64
 """The alignment of each array, in bytes: a cache line."""
@@ -28,6 +37,8 @@ _ALIGNMENT: Final = 64
 
 ECHO_SIZE: Final = 4096
 """Bytes for the last words of a worker's FMUs."""
+
+_BELL: Final = np.dtype(np.uint64)
 
 
 class Arrays(NamedTuple):
@@ -90,11 +101,14 @@ def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
 
 
 def offsets_of(spec: PoolSpec, count: int, worker: int = 0) -> list[int]:
-    """Where the arrays begin, in the order of ``Arrays``, and then the last words of a worker."""
+    """Where the arrays begin, in the order of ``Arrays``, and then what belongs to a worker.
+
+    That is ``ECHO_SIZE`` bytes for its last words, and its bell.
+    """
     offsets = [0]
     for row in _layout(spec, count):
         offsets.append(offsets[-1] + _padded_size(*row))
-    offsets[-1] += worker * ECHO_SIZE
+    offsets[-1] += worker * (ECHO_SIZE + _ALIGNMENT)
     return offsets
 
 
@@ -102,6 +116,12 @@ def make_echo(memory: Memory, spec: PoolSpec, count: int, worker: int) -> npt.ND
     """Return where a worker's FMUs leave their last words, a text that ends with a zero byte."""
     offset = offsets_of(spec, count, worker)[-1]
     return np.ndarray(ECHO_SIZE, np.uint8, memory.map, offset)
+
+
+def make_bell(memory: Memory, spec: PoolSpec, count: int, worker: int) -> memoryview:
+    """Return the count of the messages to a worker, as the only element of a view."""
+    offset = offsets_of(spec, count, worker)[-1] + ECHO_SIZE
+    return np.ndarray(1, _BELL, memory.map, offset).data
 
 
 class Memory:

@@ -136,7 +136,8 @@ class Supervisor:
             raise
         output.release_writing_ends()
         self._output = output
-        return process, Channel(end, process.sentinel, output, self._transport.coding())
+        coding, bell = self._transport.coding(), self._transport.bell()
+        return process, Channel(end, process.sentinel, output, coding, bell)
 
     def revive(self) -> None:
         """Start a process if there is none, with longer and longer pauses between deaths.
@@ -189,7 +190,7 @@ class Supervisor:
 
     def begin_by(self, method: ResetMethod) -> None:
         """Let the episodes of later processes begin in another way."""
-        spec = replace(self._setup.spec, reset_method=method)
+        spec = self._setup.spec.beginning_by(method)
         self._setup = replace(self._setup, spec=spec)
 
     def note_success(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from fmugym.pool.process.channel import Coding, Pickled
 from fmugym.pool.process.fork_server import Program
 from fmugym.pool.process.launcher import Process, launch, launch_program
-from fmugym.pool.process.shared_memory import Memory
+from fmugym.pool.process.shared_memory import Memory, make_bell
 from fmugym.pool.process.windows import ProgramCoding
 from fmugym.pool.process.worker import Setup
 from fmugym.wine.prefix import Wine
@@ -44,6 +44,10 @@ class Transport(ABC):
     def coding(self) -> Coding:
         """How to speak to a new process."""
 
+    def bell(self) -> memoryview | None:
+        """What to ring before each message, if the process watches it; see ``Channel``."""
+        return None
+
 
 class _PythonTransport(Transport):
     """A process of Python."""
@@ -70,6 +74,10 @@ class _WineTransport(Transport):
 
     def coding(self) -> Coding:
         return ProgramCoding(self._memory)
+
+    def bell(self) -> memoryview:
+        setup = self._setup
+        return make_bell(self._memory, setup.spec, setup.num_instances, setup.number)
 
 
 def transport_for(setup: Setup, memory: Memory) -> Transport:

@@ -54,6 +54,7 @@ REQUESTS: Final = (
     "failure",
     "read",
     "replace_record",
+    "differentiate",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
@@ -337,6 +338,27 @@ class ProgramCoding:
         block = self._setup.block
         shape = len(variables), block.stop - block.start
         return np.frombuffer(reader.rest(), np.float64).reshape(shape)
+
+    @property
+    def _is_adjoint(self) -> bool:
+        """Whether the FMU differentiates unknowns by all knowns, not all unknowns by a known."""
+        return not self._setup.description.capabilities.provides_directional_derivatives
+
+    def _ask_differentiate(
+        self, writer: _Writer, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> None:
+        writer.flags(self._is_adjoint)
+        for some in (unknowns, knowns) if self._is_adjoint else (knowns, unknowns):
+            writer.access(some, self._version)
+
+    def _answer_differentiate(
+        self, reader: _Reader, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
+    ) -> FloatArray:
+        seeded, others = (unknowns, knowns) if self._is_adjoint else (knowns, unknowns)
+        block = self._setup.block
+        shape = len(seeded), len(others), block.stop - block.start
+        found = np.frombuffer(reader.rest(), np.float64).reshape(shape)
+        return found if self._is_adjoint else found.swapaxes(0, 1)
 
 
 def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) -> None:

@@ -21,6 +21,7 @@ from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
@@ -508,15 +509,15 @@ class BatchEngine(Engine):
         """See ``Form.rewards``."""
         return results.rewards(value, self._n)
 
-    def update(self) -> None:
+    def update(self, env: Hooks) -> None:
         """Call the hook, but keep the variables of environments that did not step.
 
         Values that it assigns are copied, because the next step may overwrite their array.
         """
-        variables = self.env.variables
+        variables = env.variables
         before = {name: self._row(name) for name in variables}
         self._variables_before = {name: row.copy() for name, row in before.items()}
-        self.env._update()
+        env._update()
         for name, row in before.items():
             if variables[name] is not row:
                 variables[name] = results.variable(name, variables[name], self._n)
