@@ -19,11 +19,6 @@
 #include "play.h"
 #include "tape.h"
 
-typedef struct {
-    uint32_t reference;
-    const char *text;
-} StringValue;
-
 /* What a step gives of the values that an output has after each of its substeps.
  * fmugym/pool/spec.py lists their names in this order. */
 typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX } Sampling;
@@ -56,8 +51,6 @@ typedef struct {
     double time_step;
     int64_t substeps;
     int64_t warm_up_steps;
-    const StringValue *strings;
-    size_t number_of_strings;
     const Access *inputs, *outputs;
     const unsigned char *sampling; /* one Sampling for each output, or NULL if all are the last */
     size_t num_observed;

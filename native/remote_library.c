@@ -55,6 +55,10 @@ static void put_opening(Packet *packet, const Component *part) {
     packet_put_text(packet, part->remote->path);
     put_texts(packet, part->categories, part->number_of_categories);
     put_solving(packet, &part->solving);
+    packet_put_block(packet, part->structural_references,
+                     part->number_of_structural * sizeof(uint32_t));
+    packet_put_block(packet, part->structural_values,
+                     part->number_of_structural * sizeof(uint64_t));
     put_groups(packet, &part->inputs);
     put_groups(packet, &part->outputs);
     put_texts(packet, part->remote->preload, part->remote->number_of_preloads);

@@ -168,7 +168,9 @@ static Status exchange_values(void *unused) {
 }
 
 static void answer_initialize(size_t number) {
-    Experiment experiment = {.structural_references = NULL};
+    Experiment experiment = {.number_of_structural = served.number_of_structural,
+                             .structural_references = served.structural_references,
+                             .structural_values = served.structural_values};
     bool exchanges;
     const char *doing = "initialization";
 

@@ -78,6 +78,7 @@ static bool load_before(char *error, size_t size) {
 
 static bool open_library(char *error, size_t size) {
     int64_t version, manner;
+    size_t size_of_references, size_of_values;
 
     TAKE(&served.in, version);
     TAKE(&served.in, manner);
@@ -88,6 +89,9 @@ static bool open_library(char *error, size_t size) {
     const char *path = serving_copy(packet_take_text(&served.in));
     served.categories = take_texts(&served.number_of_categories);
     take_solving(&served.solving);
+    served.structural_references = serving_take_copy(&size_of_references);
+    served.number_of_structural = size_of_references / sizeof(uint32_t);
+    served.structural_values = serving_take_copy(&size_of_values);
     if (!served.in.sound || served.fmi == NULL) {
         snprintf(error, size, "the first request is damaged");
         return false;

@@ -41,6 +41,8 @@ typedef struct {
     Floats floats;
     Solving solving;
     const char *token, *resources;
+    size_t number_of_structural; /* see Experiment */
+    const char *structural_references, *structural_values;
     const char **categories;
     size_t number_of_categories;
     Batches inputs, outputs;

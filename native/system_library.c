@@ -90,7 +90,8 @@ static bool allocate(Composite *me, const System *s) {
     me->parts.before = calloc(s->count, sizeof(void *));
     me->parts.names = calloc(s->count, LOG_NAME);
     me->loop = calloc(s->memory + 1, sizeof(double));
-    me->typed = calloc(s->scratch + 1, sizeof(double));
+    me->typed = calloc(2 * (s->scratch + 1), sizeof(double));
+    me->whole = me->typed == NULL ? NULL : me->typed + s->scratch + 1;
     return me->parts.dead != NULL && me->parts.started != NULL && me->parts.failed != NULL &&
            me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
            me->typed != NULL && start_allocate(me);

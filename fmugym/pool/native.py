@@ -264,7 +264,7 @@ class NativePool(SavingPool):
         if failure is None:
             return ""
         name = f"{self._fmu.description.model_identifier}_{self._first_index + index}"
-        return describe_failure(Failure(*failure), self._spec, name)
+        return describe_failure(Failure(*failure), self._fmu.description, self._spec, name)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
@@ -329,7 +329,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(start_variables(self._variable, record.names))
+        access = self._access(start_variables(self._variable, record.names, record.texts))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
@@ -649,9 +649,10 @@ class _Listener:
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
         references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
+        values = np.frombuffer(starts)
         return Tape(
-            variables_of(self._description, types, references, places),
-            np.frombuffer(starts),
+            variables_of(self._description, types, references, places, values.tolist()),
+            values,
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),
             np.frombuffer(outputs).reshape(count, width_out),

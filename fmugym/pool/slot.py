@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,7 +89,7 @@ class Slot:
     ) -> None:
         self.failure = ""
         self.is_due = self.keeps_record = False
-        self._played: tuple[tuple[str, ...], FloatArray, list[bytes]] | None = None
+        self._played: tuple[Record, list[bytes]] | None = None
         self._unexplained = False
         self._counts, self._pacer = counts, pacer
         self._count = self._counted = 0
@@ -134,7 +134,7 @@ class Slot:
         self._counts[Column.RETRIED] = 0
         self._played = None
         if self.keeps_record:
-            self._played = tuple(v.name for v in variables), np.array(values), []
+            self._played = Record.of(variables, np.array(values), np.zeros((0, 0))), []
         self.start_time = self._start_time_in(variables, values)
         try:
             self._make_anew_if_due()
@@ -273,8 +273,7 @@ class Slot:
 
     def _set_start_values(self) -> None:
         self._instance.check("setting the start values", self._start.set())
-        for variable, text in self._spec.strings:
-            self._instance.set_string(variable, text)
+        self._start.set_texts()
 
     def _warm_up(self) -> None:
         self._begin_counting_at(0)
@@ -292,7 +291,7 @@ class Slot:
         if not _all_finite(inputs):
             return self._not_finite("inputs", self._spec.inputs, inputs)
         if self._played is not None:
-            self._played[2].append(self._input_row.tobytes())
+            self._played[1].append(self._input_row.tobytes())
         if self._spec.fault_retries:
             self._counts[Column.RETRIED] = 0
         status = self._inputs.set()
@@ -519,16 +518,16 @@ class Slot:
 
     def replace_record(self, record: Record) -> None:
         """Let the episode count as the one of a record."""
-        self._played = record.names, record.starts, [row.tobytes() for row in record.inputs]
+        self._played = record, [row.tobytes() for row in record.inputs]
 
     @property
     def record(self) -> Record | None:
         """The episode until now; None if it is not known as a whole."""
         if self._played is None:
             return None
-        names, starts, rows = self._played
+        record, rows = self._played
         inputs = np.frombuffer(b"".join(rows)).reshape(len(rows), len(self._spec.inputs))
-        return Record(names, starts, inputs)
+        return replace(record, inputs=inputs)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""

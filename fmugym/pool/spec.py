@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.texts import with_texts
 from fmugym.fmi.methods import METHODS
 from fmugym.fmi.solver import Solving
 
@@ -73,14 +74,18 @@ def is_start_time(variable: Variable) -> bool:
     return variable.type == START_TIME.type
 
 
-def start_variables(find: Callable[[str], Variable], names: Iterable[str]) -> tuple[Variable, ...]:
+def start_variables(
+    find: Callable[[str], Variable], names: Iterable[str], texts: Sequence[str] = ()
+) -> tuple[Variable, ...]:
     """Find start variables by name, ``START_TIME`` included.
 
     Args:
         find: Finds a variable of the FMU.
         names: The names.
+        texts: Those that Strings among them may get.
     """
-    return tuple(START_TIME if n == START_TIME.name else find(n) for n in names)
+    found = (START_TIME if name == START_TIME.name else find(name) for name in names)
+    return tuple(with_texts(v, texts) if v.kind == "string" else v for v in found)
 
 
 class ResetMethod(StrEnum):
@@ -120,7 +125,6 @@ class PoolSpec:
         tolerance: Passed to the FMU unless it is None.
         warm_up_steps: Steps simulated at each reset, inputs at their start values, before the
             first output is read.
-        strings: String parameters and their values.
         fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
             8 ... smaller ones, from the FMU state before it.
         leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
@@ -160,7 +164,6 @@ class PoolSpec:
     stop_time: float | None = None
     tolerance: float | None = None
     warm_up_steps: int = 0
-    strings: tuple[tuple[Variable, str], ...] = ()
     fault_retries: int = 0
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET

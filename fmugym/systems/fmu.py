@@ -195,6 +195,7 @@ def _open(component: Component) -> FMU:
             limits=component.limits,
             preload=component.preload,
             interface=component.interface,
+            sizes=dict(component.sizes),
         )
     fmu.isolated = component.isolate
     return fmu

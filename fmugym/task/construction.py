@@ -267,7 +267,7 @@ class Constructed(Pictured):
         own = self._interface.start_values(given)
         parameters |= own
         return EpisodePlan(
-            tuple(map(self._interface.parameter, parameters)),
+            tuple(map(self._interface.parameter, parameters, parameters.values())),
             parameters,
             self.config.episode_variables,
             own.keys(),

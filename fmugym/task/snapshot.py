@@ -216,6 +216,8 @@ def _content(column: Any) -> Any:
     """What two equal columns have in common, whatever the type of their numbers is."""
     if isinstance(column, dict):
         return {name: _content(part) for name, part in column.items()}
+    if isinstance(column, np.ndarray) and column.dtype == object:
+        column = column.tolist()
     try:
         array = np.asarray(column)
     except ValueError:  # arrays of different shapes

@@ -6,12 +6,12 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import repeat
 from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium.vector.utils import iterate
 
 from fmugym.env import IN_POOL, FMUEnv
@@ -107,11 +107,10 @@ class PerEnvEngine(Engine):
         for index, value in values.items():
             setattr(self._envs[index], name, value)
 
-    def set_parameter(self, name: str, values: FloatArray) -> None:
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
-        for env, value in zip(self._envs, values.tolist(), strict=True):
-            parameters = {**env._interface.parameters, name: value}
-            env._interface = replace(env._interface, parameters=parameters)
+        for index, env in enumerate(self._envs):
+            env._interface = env._interface.with_parameter(name, values, index)
             env._plan = env._plan_episode({})
 
     def reset(
