@@ -75,6 +75,13 @@ def echo_to(memory: Array, /) -> None:
         memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
     """
 
+def serve_component() -> None:
+    """Be the worker of a component until the standard input is closed, which ends the process.
+
+    Raises:
+        OSError: If the standard input is no socket, or on Windows.
+    """
+
 def claim_initialization(last: Array, interval: float, /) -> float:
     """Take the next moment at which an instance may be made or initialized.
 

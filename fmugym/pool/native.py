@@ -43,6 +43,7 @@ from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
 from fmugym.pool.pacing import last_initialization
+from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, as_record, describe_failure, loading_failed
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.settings import (
@@ -161,7 +162,9 @@ class NativePool(SavingPool):
                         "logging": log.isEnabledFor(logging.INFO),
                         "mark": None if self._mark is None else self._mark.page,
                         "solving": solving_settings(description, spec),
-                        "system": system_settings(description, spec, folder),
+                        "system": system_settings(
+                            fmu, spec, folder, self._hosts(private_libraries)
+                        ),
                     },
                 ),
                 experiment=cast("_native.Experiment", experiment_settings(spec)),
@@ -185,6 +188,13 @@ class NativePool(SavingPool):
             )
         except OSError as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
+
+    def _hosts(self, private_libraries: bool) -> Hosts:
+        """The processes of components that have some: one for each thread or private library."""
+        if private_libraries:
+            return Hosts(call_timeout=self._spec.call_timeout)
+        workers = min(self.threads, self.num_instances)
+        return Hosts(workers, self.num_instances, self._spec.call_timeout)
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""
