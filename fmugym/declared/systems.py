@@ -26,7 +26,7 @@ _KEYS: Final = (
     *("loop_tolerance", "loop_iterations", "step_size", "tolerance"),
     *("error_tolerance", "min_step_size"),
 )
-_COMPONENT_KEYS: Final = ("fmu", "start_values", "interface", "steps", "feedthrough")
+_COMPONENT_KEYS: Final = ("fmu", "start_values", "interface", "steps", "feedthrough", "isolate")
 _CONNECTION_KEYS: Final = ("source", "target", "gain", "offset", "convert_units")
 _CHECKS: Final[dict[str, Callable[..., Any]]] = {
     "loop_tolerance": check_number,
@@ -37,6 +37,7 @@ _CHECKS: Final[dict[str, Callable[..., Any]]] = {
     "min_step_size": duration,
     "steps": check_count,
     "feedthrough": check_flag,
+    "isolate": check_flag,
     "gain": check_number,
     "offset": check_number,
     "convert_units": check_flag,
