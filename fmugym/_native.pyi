@@ -317,6 +317,42 @@ class Pool:
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
+    def play_before(
+        self,
+        actions: Array,
+        observations: Array | tuple[Array, ...],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        drawn: Array,
+        last_observations: None,
+        started: None,
+        /,
+    ) -> tuple[int, int, int]:
+        """Do what comes before the FMUs' part of ``play``, where they run in other processes.
+
+        Such a pool was made without paths of libraries. It draws the start values of the instances
+        to be reset. The arguments and errors are those of ``play``.
+        """
+
+    def play_after(
+        self,
+        actions: Array,
+        observations: Array | tuple[Array, ...],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        drawn: Array,
+        last_observations: None,
+        started: None,
+        /,
+    ) -> tuple[int, int, int]:
+        """Do what comes after the FMUs' part of ``play``.
+
+        The outputs and statuses are those that the pool's arrays have. The arguments, results and
+        errors are those of ``play``.
+        """
+
     def prepare_single(
         self,
         *,

@@ -595,6 +595,30 @@ static void do_play(PyPool *self, bool alone, void *context) {
     }
 }
 
+static void do_before(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+
+    t->call.alone = alone;
+    t->ends = (Ends){.ended = 0};
+    t->bad_action = play_has_bad_action(&t->turn);
+    if (!t->bad_action) {
+        t->troubled = pool_play_before(&self->pool, &t->call);
+    }
+}
+
+static void do_after(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+
+    t->call.alone = alone;
+    t->troubled = pool_play_after(&self->pool, &t->call, &t->ends);
+}
+
+/* A play, or one of its two parts. */
+typedef struct {
+    Work *work;
+    int operation;
+} PlayPart;
+
 static bool is_outside(const PyTurn *t) {
     if (t->ends.outside) {
         PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
@@ -602,8 +626,8 @@ static bool is_outside(const PyTurn *t) {
     return t->ends.outside;
 }
 
-static PyObject *play_turn(PyPool *self, PyTurn *t) {
-    if (!perform(self, PLAY, do_play, t)) {
+static PyObject *play_turn(PyPool *self, PlayPart part, PyTurn *t) {
+    if (!perform(self, part.operation, part.work, t)) {
         return NULL;
     }
     if (t->bad_action) {
@@ -639,7 +663,7 @@ static void release_turn(const Playing *playing, PyTurn *t) {
     }
 }
 
-static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+static PyObject *play_with(PyPool *self, PlayPart part, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     PyTurn t;
     PyObject *result = NULL;
@@ -647,7 +671,7 @@ static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *arg
     clear_turn(playing, &t);
     if (take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
-        result = play_turn(self, &t);
+        result = play_turn(self, part, &t);
     }
     release_turn(playing, &t);
     return result;
@@ -660,16 +684,28 @@ static bool is_prepared(const PyPool *self) {
     return self->playing != NULL;
 }
 
-PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+static PyObject *play_by(PyObject *object, PlayPart part, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
     if (!has_arguments(nargs, PLAY_ARGUMENTS) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = play_with(self, playing, args);
+    PyObject *result = play_with(self, part, playing, args);
     Py_DECREF(playing);
     return result;
+}
+
+PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return play_by(object, (PlayPart){do_play, PLAY}, args, nargs);
+}
+
+PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return play_by(object, (PlayPart){do_before, BEFORE}, args, nargs);
+}
+
+PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return play_by(object, (PlayPart){do_after, AFTER}, args, nargs);
 }
 
 /* Rollouts: each array has a row for each step. */

@@ -94,7 +94,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
 def _require_playable(env: FMUEnv) -> None:
     """Refuse environments that the native pool cannot play, whatever their hooks are."""
     if not env._open_pool("a vector environment").can_play:
-        raise UntraceableError("the pool is not the native one")
+        raise UntraceableError("the pool is not a native one")
 
 
 _STEPS_UNTIL_KEPT: Final = {"action": 1, "previous_action": 2, "previous_state": 1}
@@ -146,6 +146,7 @@ class CompiledEngine(BatchEngine):
         self._keeps_actions = self._is_read or reads_actions or is_typed or bool(task.left)
         self._keeps_outputs = self._is_read or self._needs_outputs(task)
         in_pass = not self._draws_ahead and self.env._warm_ups is None
+        in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
         self._make_rows(task)
         layout = _Layout(task, self.env)
@@ -160,8 +161,10 @@ class CompiledEngine(BatchEngine):
             self._surroundings(task),
         )
         self._play_with_resets = self._pool.watched(self._play)
-        self._start = self._pool.start_of_play()
         self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
+        self._resets_apart = self._resets_apart or not self._pool.plays_alone
+        if not self._resets_apart:
+            self._start = self._pool.start_of_play()
         self._prepared = True
 
     def _make_rows(self, task: TracedTask) -> None:
@@ -469,7 +472,7 @@ class CompiledEngine(BatchEngine):
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
-        if not self._prepared or self._left:
+        if not self._prepared or self._left or not self._pool.plays_alone:
             return None
         horizon = len(actions)
         shape = horizon, self._n
