@@ -31,6 +31,7 @@ TASKS = {
 }
 WAYS = ("auto", "array")
 SIZES = (1, 8, 64, 1024)
+PER_ENV_SIZES = (64, 512, 1024)
 
 
 def _readme(effort: Effort) -> list[Table]:
@@ -65,7 +66,7 @@ def _fastest(samples: list[Sample]) -> float:
 
 
 def _hooks(effort: Effort) -> list[Table]:
-    """The table of docs/hooks.md."""
+    """The tables of docs/hooks.md, and what hooks cost that are called one by one."""
     table = Table(
         "Processor time of a step of gymnasium.make in us, resets included",
         ["", "compiled", "in Python", "Gymnasium's own"],
@@ -77,7 +78,26 @@ def _hooks(effort: Effort) -> list[Table]:
         table.rows.append(
             [f"`{name}`", *(f"{_fastest(own) * 1e6:.1f}" for own in samples.values())]
         )
-    return [table]
+    return [table, _per_env(effort)]
+
+
+def _per_env(effort: Effort) -> Table:
+    """What hooks cost that are called one environment at a time."""
+    sizes = PER_ENV_SIZES[:1] if effort.quick else PER_ENV_SIZES
+    title = "Processor time of a step per environment in us, all / hooks and FMUs alone"
+    table = Table(title, ['hooks="per_env"', *map(str, sizes)])
+    known = {task.name: task for task in tasks.TASKS}
+    for title, name in TASKS.items():
+        cells = [_all_and_hooks(known[name], size, effort) for size in sizes]
+        table.rows.append([title, *cells])
+    return table
+
+
+def _all_and_hooks(task: tasks.Task, size: int, effort: Effort) -> str:
+    with ExitStack() as stack:
+        runs = tasks.per_env_runs(stack, task, size)
+        samples = by_turns(runs, effort)
+    return " / ".join(f"{_fastest(own) * 1e6 / size:.1f}" for own in samples.values())
 
 
 def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callable[[], Run]]:

@@ -31,7 +31,7 @@ import fmugym
 from fmugym.task.interface import resolve
 from fmugym.vector.hooks.program import OPERATIONS
 
-__all__ = ["TASKS", "Task", "fmugym_run", "tables"]
+__all__ = ["TASKS", "Task", "fmugym_run", "per_env_runs", "tables"]
 
 SIZES = (1, 8, 64, 1024, 4096)
 TITLE = (
@@ -190,6 +190,43 @@ def fmugym_run(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
             envs.step(action)
 
     return repeated(block, len(actions))
+
+
+def per_env_runs(stack: ExitStack, task: Task, size: int) -> dict[str, Run]:
+    """Count calls of ``step`` with ``hooks="per_env"``, and calls of the hooks and FMUs alone."""
+    envs = _fmugym(stack, task, size, "per_env")
+    actions = _actions(envs)
+    envs.reset(seed=0)
+    engine = envs._engine
+
+    def steps() -> None:
+        for action in actions:
+            envs.step(action)
+
+    def hooks() -> None:
+        for env in engine._envs:
+            env._get_inputs()
+        envs._pool.step(None, None, envs._pool.observations)
+        for env in engine._envs:
+            _call_hooks(env)
+
+    return {"steps": repeated(steps, len(actions)), "hooks": repeated(hooks, 1)}
+
+
+def _call_hooks(env: Any) -> None:
+    """Call the hooks of a step that follow the FMU's."""
+    own = env._own
+    if own.update:
+        env._update()
+    env._is_done()
+    if own.is_truncated:
+        env._is_truncated()
+    if env._pool_observes:
+        env._reward_policy()
+    else:
+        env._reward_and_observation()
+    if own.get_info:
+        env._get_info()
 
 
 def _by_hand(stack: ExitStack, task: Task, size: int) -> by_hand.ByHand:

@@ -97,6 +97,8 @@ class Access:
             bytes of native 32-bit integers.
         rest: The values of the last of them, which are no part of the list but needed to set whole
             arrays, as bytes of float64.
+        texts: The texts that Strings may get, each with its number, a float64, before and a zero
+            after it, by ascending numbers.
         manner: How the FMU is run; see ``fmi.h``.
     """
 
@@ -106,6 +108,7 @@ class Access:
         types: bytes,
         elements: bytes,
         rest: bytes,
+        texts: bytes,
         manner: int = 0,
         /,
     ) -> Access: ...
@@ -191,12 +194,11 @@ class Experiment(TypedDict):
     start_outputs: bytes | None
 
 class Variables(TypedDict):
-    """What is set and read in each step, and the Strings that are set before initialization."""
+    """What is set and read in each step."""
 
     inputs: Access
     outputs: Access
     num_observed: int
-    strings: tuple[tuple[int, bytes], ...]
     sampling: bytes
 
 class Arrays(TypedDict):

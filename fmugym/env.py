@@ -49,6 +49,9 @@ _ARGUMENTS: Final = (
     *("fmu_path", "config", "log_level", "render_mode", "backend", "isolation", "hooks"),
 )
 
+IN_POOL: Final = object()
+"""Stands for the default observation of a step, which the pool has; see ``FMUEnv._conclude``."""
+
 _WAYS: Final = ("auto", "compiled", "python")
 
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
@@ -375,22 +378,31 @@ class FMUEnv(Constructed):
         if elements is None or type(action) not in _INTEGERS or action not in elements:
             self._require_usable(action)
         self._take_usable(action)
+        self._input_writer.write(self.inputs, self._input_row)
 
-    def _take_usable(self, action: Any) -> None:
-        """Write the inputs for an action that was checked already."""
-        before = self.previous_action, self.previous_state
+    def _take_usable(self, action: Any) -> tuple[Any, Any, Any]:
+        """Make the inputs for an action that was checked already.
+
+        Returns:
+            What ``_give_up`` needs.
+        """
+        before = self.previous_action, self.previous_state, self.inputs
         self.previous_action, self.previous_state, self.action = self.action, self.state, action
         try:
-            values, row = self._get_inputs(), self._input_row
-            self.inputs = self._input_writer.write(values, action, row)
+            self.inputs = self._input_writer.checked(self._get_inputs(), action)
         except BaseException as error:  # the FMU was not touched: a better action may follow
-            self.action = self.previous_action
-            self.previous_action, self.previous_state = before
+            self._give_up(before)
             if self._blames_action(action, error):
                 raise ConfigError(
                     f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
                 ) from error
             raise
+        return before
+
+    def _give_up(self, before: tuple[Any, Any, Any]) -> None:
+        """Return to before an action was taken, if the FMU has not stepped."""
+        self.action = self.previous_action
+        self.previous_action, self.previous_state, self.inputs = before
 
     def _require_usable(self, action: Any) -> None:
         elements = self._elements
@@ -417,7 +429,8 @@ class FMUEnv(Constructed):
             pool: The FMU.
             status: That of the step.
             values: The outputs; None for those that the pool has.
-            observed: The default observation; None for a copy of the pool's.
+            observed: The default observation; None for a copy of the pool's. ``IN_POOL`` is
+                returned as it is unless the step fails.
         """
         stopped = False
         if status:
@@ -437,8 +450,11 @@ class FMUEnv(Constructed):
         observation, reward, terminated, truncated = result
         # One call for all numbers, which is enough for nearly all steps.
         is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
-        if not (is_small or (isfinite(reward) and self._is_finite(observation))):
-            return self._fault_of_hooks(reward, observation, (before, variables))
+        if not is_small:
+            if observation is IN_POOL:
+                observation = self._observation_row.copy()
+            if not (isfinite(reward) and self._is_finite(observation)):
+                return self._fault_of_hooks(reward, observation, (before, variables))
         info = self._info() if self._has_info else {}
         if stopped:
             info["fmu_terminated"] = True

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import FMU, StandsForFMU
+from fmugym.archive.texts import with_texts
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
@@ -149,27 +150,25 @@ def _chosen(
 
 def _start_values(
     description: ModelDescription, values: Mapping[str, float | str]
-) -> dict[Variable, float | str]:
-    """Check the values; values of Strings stay texts."""
-    checked: dict[Variable, float | str] = {}
+) -> dict[Variable, float]:
+    """Check the values; a String gets the number of its text."""
+    checked: dict[Variable, float] = {}
     for name, value in values.items():
         variable = start_variable(description, name, value)
-        is_text = variable.kind == "string"
-        checked[variable] = value if is_text else checked_value(variable, value)
+        if isinstance(value, str) and variable.kind == "string":
+            variable = with_texts(variable, [value])
+        checked[variable] = checked_value(variable, value)
     return checked
 
 
 def _initialize(
-    instance: Instance, description: ModelDescription, start: Mapping[Variable, float | str]
+    instance: Instance, description: ModelDescription, start: Mapping[Variable, float]
 ) -> None:
-    numbers = {v: value for v, value in start.items() if not isinstance(value, str)}
-    access = Access(instance, tuple(numbers), np.array(list(numbers.values()), float))
+    access = Access(instance, tuple(start), np.array(list(start.values()), float))
 
     def set_start_values() -> None:
         instance.check("setting the start values", access.set())
-        for variable, value in start.items():
-            if isinstance(value, str):
-                instance.set_string(variable, value)
+        access.set_texts()
 
     instance.initialize(description.start_time, None, None, set_start_values)
 
@@ -198,13 +197,11 @@ class _InstanceHere:
 class _InstanceInWine:
     """One in a worker, if this process cannot load the library."""
 
-    def __init__(self, fmu: FMU, start: Mapping[Variable, float | str]) -> None:
-        strings = tuple((v, value) for v, value in start.items() if isinstance(value, str))
-        numbers = {v: value for v, value in start.items() if not isinstance(value, str)}
-        spec = PoolSpec((), (), 1.0, start_time=fmu.description.start_time, strings=strings)
+    def __init__(self, fmu: FMU, start: Mapping[Variable, float]) -> None:
+        spec = PoolSpec((), (), 1.0, start_time=fmu.description.start_time)
         self._pool = trial_pool(fmu, spec, 1, logger)
         self.close = self._pool.close
-        self._pool.reset(tuple(numbers), np.array([list(numbers.values())], float).T)
+        self._pool.reset(tuple(start), np.array([list(start.values())], float).T)
         if self._pool.statuses[0] > Status.WARNING:
             with closing(self):
                 raise SimulationError(self._pool.failure(0))

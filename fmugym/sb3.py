@@ -239,8 +239,9 @@ class FMUVecEnv(VecEnv):
         env = self.vector_env._prototype
         if name in env._plan.drawn_names:
             raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
-        start = env.fmu.variable(name).start_number
-        return [env._plan.constant_parameters.get(name, start)] * self.num_envs
+        variable = env.fmu.variable(name)
+        start = variable.start or "" if variable.kind == "string" else variable.start_number
+        return [env._plan.constants_shown.get(name, start)] * self.num_envs
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any

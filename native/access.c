@@ -21,17 +21,46 @@ static bool are_sound(const char *types, const char *elements, size_t count) {
     return true;
 }
 
-const char *listing_take(Listing *listing, const char *types, size_t count, const char *elements,
-                         size_t size, const char *rest, size_t size_of_rest) {
-    const size_t number_of_rest = size_of_rest / sizeof(double);
+/* The first byte after a text, or NULL if the text does not end. */
+static const char *end_of_text(const char *entry, size_t left) {
+    const char *end = left < sizeof(double) ? NULL
+                                            : memchr(entry + sizeof(double), 0, left - sizeof(double));
+    return end == NULL ? NULL : end + 1;
+}
 
-    if (size != count * sizeof(Element) || size_of_rest % sizeof(double) != 0 ||
+static bool texts_are_sound(Block texts) {
+    const char *end = texts.bytes + texts.size;
+    double last = -1.0, number;
+
+    for (const char *entry = texts.bytes; entry != end; last = number) {
+        const char *next = end_of_text(entry, (size_t)(end - entry));
+        if (next == NULL) {
+            return false;
+        }
+        memcpy(&number, entry, sizeof number);
+        if (!(number > last)) {
+            return false;
+        }
+        entry = next;
+    }
+    return true;
+}
+
+const char *listing_take(Listing *listing, Block types, Block elements, Block rest, Block texts) {
+    const size_t count = types.size, number_of_rest = rest.size / sizeof(double);
+
+    if (elements.size != count * sizeof(Element) || rest.size % sizeof(double) != 0 ||
         number_of_rest > count) {
         return "the parts of a list of variables differ in length";
     }
-    *listing = (Listing){(const uint8_t *)types, elements, count - number_of_rest, rest,
-                         number_of_rest};
-    return are_sound(types, elements, count) ? NULL : "unknown C type, or a place outside an array";
+    *listing = (Listing){(const uint8_t *)types.bytes, elements.bytes, count - number_of_rest,
+                         rest.bytes, number_of_rest, texts.bytes, texts.size};
+    if (!texts_are_sound(texts)) {
+        return "the texts of a list of variables have no order, or do not end";
+    }
+    return are_sound(types.bytes, elements.bytes, count)
+               ? NULL
+               : "unknown C type, or a place outside an array";
 }
 
 static Group *group_of(Access *access, Type type) {
@@ -52,8 +81,11 @@ static bool allocate(Access *access, const Listing *listing) {
     access->types = malloc(all + 1);
     access->rest = malloc((listing->number_of_rest + 1) * sizeof *access->rest);
     access->memory = malloc((4 * all + 1) * sizeof *access->memory);
+    access->letters = malloc(listing->size_of_texts + 1);
+    access->texts = malloc((listing->size_of_texts / (sizeof(double) + 1) + 1) *
+                           sizeof *access->texts);
     if (access->variables == NULL || access->types == NULL || access->rest == NULL ||
-        access->memory == NULL) {
+        access->memory == NULL || access->letters == NULL || access->texts == NULL) {
         access_close(access);
         return false;
     }
@@ -61,6 +93,18 @@ static bool allocate(Access *access, const Listing *listing) {
     memcpy(access->types, listing->types, all);
     memcpy(access->rest, listing->rest, listing->number_of_rest * sizeof *access->rest);
     return true;
+}
+
+static void take_texts(Access *access, const Listing *listing) {
+    memcpy(access->letters, listing->texts, listing->size_of_texts);
+    const char *end = access->letters + listing->size_of_texts;
+
+    for (const char *entry = access->letters; entry != end;) {
+        Text *text = &access->texts[access->number_of_texts++];
+        memcpy(&text->number, entry, sizeof text->number);
+        text->text = entry + sizeof text->number;
+        entry = end_of_text(entry, (size_t)(end - entry));
+    }
 }
 
 /* Each group gets the memory for as many value references as it has variables. */
@@ -136,6 +180,7 @@ bool access_open(Access *access, const Fmi *fmi, const Listing *listing) {
     if (!allocate(access, listing)) {
         return false;
     }
+    take_texts(access, listing);
     share_memory(access, all);
     for (size_t i = 0; i < listing->count; i++) {
         if (access->types[i] == START_TIME) {
@@ -161,6 +206,10 @@ void access_close(Access *access) {
     free(access->types);
     free(access->rest);
     free(access->memory);
+    free(access->texts);
+    free(access->letters);
+    access->texts = NULL;
+    access->letters = NULL;
     access->variables = NULL;
     access->types = NULL;
     access->rest = NULL;
@@ -240,12 +289,12 @@ static void store(const Part *part, Type type, const double *values, void *typed
 }
 
 /* A Boolean is a char in FMI 1.0, an int in FMI 2.0, a C bool in FMI 3.0. */
-static Type stored_type(const Access *access, const Group *group) {
-    const Type boolean = access->fmi->boolean_size == 1 ? TYPE_UINT8 : TYPE_INT32;
-    if (group->type == TYPE_CLOCK) {
+static Type stored_type(const Fmi *fmi, Type type) {
+    const Type boolean = fmi->boolean_size == 1 ? TYPE_UINT8 : TYPE_INT32;
+    if (type == TYPE_CLOCK) {
         return TYPE_UINT8;
     }
-    return group->type == TYPE_BOOLEAN ? boolean : group->type;
+    return type == TYPE_BOOLEAN ? boolean : type;
 }
 
 Status access_get(const Access *access, const Library *library, void *component, double *values,
@@ -265,7 +314,7 @@ Status access_get(const Access *access, const Library *library, void *component,
                                        group->count, typed, group->size);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
-        load(&group->listed, stored_type(access, group), typed, values);
+        load(&group->listed, stored_type(access->fmi, group->type), typed, values);
     }
     return worst;
 }
@@ -283,12 +332,81 @@ Status access_set(const Access *access, const Library *library, void *component,
         return worst;
     }
     for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
-        store(&group->listed, stored_type(access, group), values, typed);
-        store(&group->rest, stored_type(access, group), access->rest, typed);
+        if (group->type == TYPE_STRING) {
+            continue;
+        }
+        store(&group->listed, stored_type(access->fmi, group->type), values, typed);
+        store(&group->rest, stored_type(access->fmi, group->type), access->rest, typed);
         const Status status = fmi->set(library, component, group->type, group->references,
                                        group->count, typed, group->size);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
+    }
+    return worst;
+}
+
+/* One element after the other is the whole of an array. */
+static void move(Type type, size_t size, double *values, void *typed, bool loads) {
+    for (uint32_t i = 0; i < size; i++) {
+        const Part one = {1, &i, &i};
+        if (loads) {
+            load(&one, type, typed, values);
+        } else {
+            store(&one, type, values, typed);
+        }
+    }
+}
+
+Status variable_get(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, double *values, void *typed, const Floats *floats) {
+    const bool direct = type == TYPE_FLOAT64;
+    const Status status = fmi->get(library, component, type, &variable->reference, 1,
+                                   direct ? values : typed, variable->size);
+
+    floats_restore_if_seen(floats);
+    if (!direct) {
+        move(stored_type(fmi, type), variable->size, values, typed, true);
+    }
+    return status;
+}
+
+Status variable_set(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, const double *values, void *typed,
+                    const Floats *floats) {
+    const bool direct = type == TYPE_FLOAT64;
+
+    if (!direct) {
+        move(stored_type(fmi, type), variable->size, (double *)values, typed, false);
+    }
+    const Status status = fmi->set(library, component, type, &variable->reference, 1,
+                                   direct ? values : typed, variable->size);
+    floats_restore_if_seen(floats);
+    return status;
+}
+
+static int compare_numbers(const void *number, const void *text) {
+    const double wanted = *(const double *)number, found = ((const Text *)text)->number;
+    return (wanted > found) - (wanted < found);
+}
+
+Status access_set_texts(const Access *access, const Library *library, void *component,
+                        const double *values, const Floats *floats, uint32_t *refused) {
+    Status worst = STATUS_OK;
+
+    for (size_t i = 0; i < access->count && worst <= STATUS_WARNING; i++) {
+        if (access->types[i] != TYPE_STRING) {
+            continue;
+        }
+        const Text *text = bsearch(&values[i], access->texts, access->number_of_texts,
+                                   sizeof *text, compare_numbers);
+        const Status status = text == NULL
+                                  ? STATUS_ERROR
+                                  : access->fmi->set_string(library, component,
+                                                            access->variables[i].reference,
+                                                            text->text);
+        worst = status > worst ? status : worst;
+        floats_restore_if_seen(floats);
+        *refused = status > STATUS_WARNING ? access->variables[i].reference : *refused;
     }
     return worst;
 }

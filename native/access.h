@@ -23,6 +23,12 @@ typedef struct {
     uint32_t *places;    /* in the FMU's memory */
 } Part;
 
+/* A text, and the number that stands for it in a list; see fmugym/archive/texts.py. */
+typedef struct {
+    double number;
+    const char *text;
+} Text;
+
 /* The variables of one C type. An array is moved as a whole, so there is one value reference for
  * all of its elements. */
 typedef struct {
@@ -43,6 +49,9 @@ typedef struct {
     Element *variables; /* in the order of the list */
     uint8_t *types;
     double *rest;     /* the values of the elements that are not listed */
+    Text *texts;      /* those that Strings may get, by ascending number */
+    size_t number_of_texts;
+    char *letters;    /* of the texts */
     uint32_t *memory; /* of all groups */
     Group groups[NUMBER_OF_TYPES];
 } Access;
@@ -55,6 +64,8 @@ typedef struct {
     size_t count;         /* of the list */
     const char *rest;     /* the values of the other elements: doubles, not aligned */
     size_t number_of_rest;
+    const char *texts;    /* numbers, doubles that ascend, each followed by its text and a NUL */
+    size_t size_of_texts;
 } Listing;
 
 /* Whether a byte is a Type or START_TIME. */
@@ -64,8 +75,12 @@ static inline bool is_type(uint8_t type) {
 
 /* Checks blocks of bytes and takes a listing from them, which refers to them. Returns what is wrong
  * with them, or NULL. */
-const char *listing_take(Listing *listing, const char *types, size_t count, const char *elements,
-                         size_t size, const char *rest, size_t size_of_rest);
+typedef struct {
+    const char *bytes;
+    size_t size;
+} Block;
+
+const char *listing_take(Listing *listing, Block types, Block elements, Block rest, Block texts);
 
 /* Groups the variables by type, in the order in which the types first appear. The start time belongs
  * to no group. Returns whether there was enough memory. */
@@ -77,12 +92,23 @@ static inline bool access_is_plain(const Access *access) {
     return access->direct && access->groups[0].count == access->groups[0].size;
 }
 
+/* A scalar or an array as a whole. Both functions are those below for one variable. */
+Status variable_get(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, double *values, void *typed, const Floats *floats);
+Status variable_set(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, const double *values, void *typed,
+                    const Floats *floats);
+
 /* Both functions use typed as scratch memory for width doubles and return the worst
  * status. They stop after the first type whose status is worse than a warning. They restore the
- * floating-point environment after each call into the FMU. */
+ * floating-point environment after each call into the FMU. access_set leaves Strings out. */
 Status access_get(const Access *access, const Library *library, void *component, double *values,
                   void *typed, const Floats *floats);
 Status access_set(const Access *access, const Library *library, void *component,
                   const double *values, void *typed, const Floats *floats);
+
+/* Sets the Strings. Of one that is refused, sets refused to the value reference. */
+Status access_set_texts(const Access *access, const Library *library, void *component,
+                        const double *values, const Floats *floats, uint32_t *refused);
 
 #endif

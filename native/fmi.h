@@ -21,8 +21,9 @@ typedef enum {
     STATUS_NOT_FINITE = 7  /* an output is NaN or infinite */
 } Status;
 
-/* The C types of values. fmugym/pool/native.py uses the same numbers. FMI 1.0 and 2.0 have only
- * FLOAT64 (Real), INT32 (Integer) and BOOLEAN. */
+/* The C types of values. fmugym/pool/settings.py uses the same numbers. FMI 1.0 and 2.0 have only
+ * FLOAT64 (Real), INT32 (Integer), BOOLEAN and STRING. The functions get and set of Fmi do not take
+ * STRING. */
 typedef enum {
     TYPE_FLOAT64,
     TYPE_FLOAT32,
@@ -36,6 +37,7 @@ typedef enum {
     TYPE_UINT64,
     TYPE_BOOLEAN,
     TYPE_CLOCK, /* whether it ticks; FMI 3.0 */
+    TYPE_STRING,
     NUMBER_OF_TYPES
 } Type;
 

@@ -7,8 +7,6 @@
 #include "instances.h"
 #include "records.h"
 
-static const size_t STATES_LIMIT = (size_t)256 << 20; /* total bytes of one pool's initial states */
-
 /* Initialization */
 
 typedef struct {
@@ -21,18 +19,16 @@ typedef struct {
 
 static Status set_start_values(void *context) {
     StartContext *c = context;
-    const Settings *s = &c->pool->settings;
-    Status status = access_set(c->start, c->me->library, c->me->component, c->scratch.values,
-                               c->scratch.typed, &c->pool->floats);
+    const Floats *floats = &c->pool->floats;
+    const Status status = access_set(c->start, c->me->library, c->me->component, c->scratch.values,
+                                     c->scratch.typed, floats);
 
-    for (size_t i = 0; i < s->number_of_strings && status <= STATUS_WARNING; i++) {
-        const StringValue *string = &s->strings[i];
-        status =
-            s->fmi->set_string(c->me->library, c->me->component, string->reference, string->text);
-        floats_restore_if_seen(&c->pool->floats);
-        c->refused = status > STATUS_WARNING ? string->reference : c->refused;
+    if (status > STATUS_WARNING) {
+        return status;
     }
-    return status;
+    const Status of_texts = access_set_texts(c->start, c->me->library, c->me->component,
+                                             c->scratch.values, floats, &c->refused);
+    return of_texts > status ? of_texts : status;
 }
 
 static Status fail_initialization(Pool *pool, Instance *me, const StartContext *context,

@@ -229,17 +229,36 @@ Status instance_renew_if_due(Pool *pool, Instance *me) {
     return loud || pool->settings.rebuilds ? rebuild(pool, me) : STATUS_OK;
 }
 
+/* If parts of a system are made anew, their states end, and nothing else is made meanwhile. */
+static Status reset(Pool *pool, Instance *me) {
+    const bool renews = pool->settings.renews;
+
+    if (renews) {
+        pace_wait(&pool->settings.pace);
+        free_states(pool, me);
+        me->generation++;
+        mutex_lock(pool->making);
+    } else {
+        instance_begin_turn(pool);
+    }
+    begin_call(CALL_RESET);
+    const Status status = pool->settings.fmi->reset(me->library, me->component);
+    end_call();
+    if (renews) {
+        mutex_unlock(pool->making);
+    } else {
+        instance_end_turn(pool);
+    }
+    floats_restore_if_seen(&pool->floats);
+    return status;
+}
+
 Status instance_return_to_start(Pool *pool, Instance *me) {
     if (me->phase == PHASE_INSTANTIATED) {
         return STATUS_OK;
     }
     if (me->phase != PHASE_DEAD) {
-        instance_begin_turn(pool);
-        begin_call(CALL_RESET);
-        const Status status = pool->settings.fmi->reset(me->library, me->component);
-        end_call();
-        instance_end_turn(pool);
-        floats_restore_if_seen(&pool->floats);
+        const Status status = reset(pool, me);
         if (status <= STATUS_WARNING) {
             me->phase = PHASE_INSTANTIATED;
             return STATUS_OK;

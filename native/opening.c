@@ -116,7 +116,7 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     pool->making = settings->one_initialization ? &shared_making : &pool->own_making;
     pool->settings = *settings;
     pool->step_size = settings->time_step / (double)settings->substeps;
-    pool->no_return = !settings->restores && settings->retries == 0;
+    pool->no_return = !settings->restores && !settings->returns && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 &&
                    settings->sampling == NULL && access_is_plain(settings->inputs) &&
                    access_is_plain(settings->outputs);

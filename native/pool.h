@@ -19,11 +19,6 @@
 #include "play.h"
 #include "tape.h"
 
-typedef struct {
-    uint32_t reference;
-    const char *text;
-} StringValue;
-
 /* What a step gives of the values that an output has after each of its substeps.
  * fmugym/pool/spec.py lists their names in this order. */
 typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX } Sampling;
@@ -48,6 +43,8 @@ typedef struct {
     bool restores; /* whether an episode with the last start values begins with a restored state */
     bool rebuilds; /* whether each episode begins with a new instance */
     bool reloads;  /* whether a new instance also reloads its private library */
+    bool renews;   /* whether resets make parts of a system anew, so that no state outlives one */
+    bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
     Pace pace;
@@ -56,8 +53,6 @@ typedef struct {
     double time_step;
     int64_t substeps;
     int64_t warm_up_steps;
-    const StringValue *strings;
-    size_t number_of_strings;
     const Access *inputs, *outputs;
     const unsigned char *sampling; /* one Sampling for each output, or NULL if all are the last */
     size_t num_observed;
@@ -95,6 +90,9 @@ typedef enum {
     PHASE_ENDED, /* after a step that failed: reading and a reset are legal */
     PHASE_FAILED /* after Error: a reset is legal */
 } Phase;
+
+/* Total bytes of the initial states that one pool keeps. */
+enum { STATES_LIMIT = 256 << 20 };
 
 /* Why the last status was worse than a warning. */
 typedef struct {

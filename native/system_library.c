@@ -1,4 +1,4 @@
-/* Loading the FMUs of a system; making, resetting and freeing its instances. */
+/* Loading the FMUs of a system; making and freeing its instances. */
 
 #include <stdio.h>
 #include <stdlib.h>
@@ -10,6 +10,7 @@
 /* What takes the place of a table of functions. */
 typedef struct {
     const System *system;
+    const char *const *paths;
     Library parts[];
 } Loaded;
 
@@ -38,6 +39,7 @@ bool system_load(Library *library, const System *system, const char *const *path
         return false;
     }
     loaded(library)->system = system;
+    loaded(library)->paths = paths;
     for (size_t i = 0; i < system->count; i++) {
         if (!load_part(&loaded(library)->parts[i], &system->parts[i], paths[i], error, size)) {
             system_unload(library);
@@ -59,8 +61,10 @@ void system_unload(Library *library) {
 static void free_arrays(Composite *me) {
     free(me->parts.dead);
     free(me->parts.started);
+    free(me->parts.failed);
     free((void *)me->parts.before);
     free(me->parts.names);
+    start_free(me);
     free(me->loop);
     free(me->typed);
     free(me->pending);
@@ -70,12 +74,15 @@ static void free_arrays(Composite *me) {
 static bool allocate(Composite *me, const System *s) {
     me->parts.dead = calloc(s->count, sizeof(bool));
     me->parts.started = calloc(s->count, sizeof(bool));
+    me->parts.failed = calloc(s->count, sizeof(bool));
     me->parts.before = calloc(s->count, sizeof(void *));
     me->parts.names = calloc(s->count, LOG_NAME);
     me->loop = calloc(s->memory + 1, sizeof(double));
-    me->typed = calloc(s->scratch + 1, sizeof(double));
-    return me->parts.dead != NULL && me->parts.started != NULL && me->parts.before != NULL &&
-           me->parts.names != NULL && me->loop != NULL && me->typed != NULL;
+    me->typed = calloc(2 * (s->scratch + 1), sizeof(double));
+    me->whole = me->typed == NULL ? NULL : me->typed + s->scratch + 1;
+    return me->parts.dead != NULL && me->parts.started != NULL && me->parts.failed != NULL &&
+           me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
+           me->typed != NULL && start_allocate(me);
 }
 
 /* The slots follow the instance, so that a step finds all of it in a few cache lines. */
@@ -92,19 +99,19 @@ static Composite *in_one_block(const System *s) {
     return me;
 }
 
-static bool instantiate_part(Composite *me, size_t index, const Identity *whole) {
+bool part_instantiate(Composite *me, size_t index) {
     const Component *part = &me->system->parts[index];
     char *name = me->parts.names + index * LOG_NAME;
 
-    log_name(name, part->name, whole->environment + index);
+    log_name(name, part->name, me->environment + index);
     const Identity identity = {
         .name = name,
         .token = part->token,
         .resources = part->resources,
-        .environment = whole->environment + index,
-        .logging = whole->logging,
+        .environment = me->environment + index,
+        .logging = me->logging,
         .solving = &part->solving,
-        .floats = whole->floats,
+        .floats = me->floats,
     };
     me->components[index] = part->fmi->instantiate(&me->libraries[index], &identity);
     floats_restore_if_seen(me->floats);
@@ -119,10 +126,13 @@ void *system_instantiate(const Library *library, const Identity *identity) {
         return NULL;
     }
     me->libraries = loaded(library)->parts;
+    me->paths = loaded(library)->paths;
     me->floats = identity->floats;
+    me->environment = identity->environment;
+    me->logging = identity->logging;
     bool good = allocate(me, system);
     for (size_t i = 0; i < system->count && good; i++) {
-        good = instantiate_part(me, i, identity);
+        good = part_instantiate(me, i);
     }
     if (!good) {
         system_free(library, me);
@@ -130,26 +140,44 @@ void *system_instantiate(const Library *library, const Identity *identity) {
     return good ? me : NULL;
 }
 
-static void free_part(Composite *me, size_t index) {
-    const Fmi *fmi = me->system->parts[index].fmi;
-    void *component = me->components[index];
-
-    if (me->parts.before[index] != NULL) {
-        fmi->free_state(&me->libraries[index], component, &me->parts.before[index]);
+void part_free_state(Composite *me, size_t index, void **state) {
+    if (*state != NULL) {
+        me->system->parts[index].fmi->free_state(&me->libraries[index], me->components[index],
+                                                 state);
     }
-    fmi->free_instance(&me->libraries[index], component);
+    *state = NULL;
+}
+
+void part_free(Composite *me, size_t index) {
+    part_free_state(me, index, &me->parts.before[index]);
+    part_free_state(me, index, &me->kept.states[index]);
+    me->system->parts[index].fmi->free_instance(&me->libraries[index], me->components[index]);
+    me->components[index] = NULL;
     floats_restore_if_seen(me->floats);
+}
+
+bool part_reload(Composite *me, size_t index) {
+    Library *library = &me->libraries[index];
+    char unused[256];
+
+    library_close(library);
+    memset(library, 0, sizeof *library);
+    const bool good = load_part(library, &me->system->parts[index], me->paths[index], unused,
+                                sizeof unused);
+    floats_restore_if_seen(me->floats);
+    return good;
 }
 
 /* FMI forbids every call after a fatal error, so the memory of such a part is lost. */
 void system_free(const Library *library, void *component) {
     Composite *me = component;
-    const bool complete = me->parts.dead != NULL && me->parts.before != NULL;
+    const bool complete =
+        me->parts.dead != NULL && me->parts.before != NULL && me->kept.states != NULL;
 
     (void)library;
     for (size_t i = 0; complete && i < me->system->count; i++) {
         if (me->components[i] != NULL && !me->parts.dead[i]) {
-            free_part(me, i);
+            part_free(me, i);
         }
     }
     free_arrays(me);
@@ -159,6 +187,17 @@ void system_drop(const Library *library, void *component) {
     system_free(library, component);
 }
 
+Status part_choose_messages(Composite *me, size_t index) {
+    const Component *part = &me->system->parts[index];
+
+    if (part->fmi->choose_messages == NULL || part->number_of_categories == 0) {
+        return STATUS_OK;
+    }
+    return part_judge(me, index, part->fmi->choose_messages(
+                                     &me->libraries[index], me->components[index],
+                                     part->categories, me->hears ? part->number_of_categories : 0));
+}
+
 Status system_choose_messages(const Library *library, void *component,
                               const char *const *categories, size_t count) {
     Composite *me = component;
@@ -166,41 +205,10 @@ Status system_choose_messages(const Library *library, void *component,
 
     (void)library;
     (void)categories; /* each part has its own */
+    me->has_chosen = true;
+    me->hears = count > 0;
     for (size_t i = 0; i < me->system->count; i++) {
-        const Component *part = &me->system->parts[i];
-        if (part->fmi->choose_messages != NULL && part->number_of_categories > 0) {
-            const Status status = part_judge(
-                me, i, part->fmi->choose_messages(&me->libraries[i], me->components[i],
-                                                  part->categories,
-                                                  count > 0 ? part->number_of_categories : 0));
-            worst = status > worst ? status : worst;
-        }
-    }
-    return worst;
-}
-
-static Status reset_part(Composite *me, size_t index) {
-    if (me->parts.dead[index]) {
-        return STATUS_ERROR;
-    }
-    if (!me->parts.started[index]) {
-        return STATUS_OK;
-    }
-    const Status status = part_judge(
-        me, index, me->system->parts[index].fmi->reset(&me->libraries[index],
-                                                       me->components[index]));
-    me->parts.started[index] = status > STATUS_WARNING;
-    return status;
-}
-
-Status system_reset(const Library *library, void *component) {
-    Composite *me = component;
-    Status worst = STATUS_OK;
-
-    (void)library;
-    me->blamed = NULL;
-    for (size_t i = 0; i < me->system->count; i++) {
-        const Status status = reset_part(me, i);
+        const Status status = part_choose_messages(me, i);
         worst = status > worst ? status : worst;
     }
     return worst;

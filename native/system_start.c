@@ -18,16 +18,44 @@ typedef struct {
     size_t index;
 } Place;
 
-static Status set_pending(Composite *me, size_t index, const Pending *pending) {
+/* Those of the pending values that belong to an array, or to a scalar. */
+typedef struct {
+    Pending *first, *end;
+} Awaiting;
+
+static bool is_of_same_array(const End *one, const End *other) {
+    return one->part == other->part && one->type == other->type &&
+           one->element.reference == other->element.reference;
+}
+
+static void put_pending(void *context, const End *end, double *values) {
+    const Awaiting *awaiting = context;
+
+    for (Pending *p = awaiting->first; p < awaiting->end; p++) {
+        if (p == awaiting->first || (p->text == NULL && is_of_same_array(p->end, end))) {
+            values[p->end->element.place] = p->value;
+            p->done = true;
+        }
+    }
+}
+
+/* FMI sets whole arrays: all pending elements of an array are set with the first one, and the
+ * others start with what the system says. */
+static Status set_pending(Composite *me, size_t index, Pending *pending) {
     const End *end = pending->end;
     const Component *part = &me->system->parts[index];
+    Awaiting awaiting = {pending, end->starts == NULL ? pending + 1
+                                                      : me->pending + me->number_pending};
 
     if (pending->text == NULL) {
-        return part_set(me, index, end->type, &end->reference, pending->value);
+        const double *slots = end->starts == NULL || end->input < 0
+                                  ? end->starts
+                                  : me->inputs + end->input - end->element.place;
+        return end_set(me, end, slots, (Change){put_pending, &awaiting});
     }
     return part_judge(me, index, part->fmi->set_string(&me->libraries[index],
                                                        me->components[index],
-                                                       end->reference, pending->text));
+                                                       end->element.reference, pending->text));
 }
 
 /* What is set for this simulation wins over what the system says. */
@@ -47,7 +75,7 @@ static Status set_starts(void *context) {
                                                              string->text));
     }
     for (size_t i = 0; i < me->number_pending && status <= STATUS_WARNING; i++) {
-        if (me->pending[i].end->part == index) {
+        if (me->pending[i].end->part == index && !me->pending[i].done) {
             status = set_pending(me, index, &me->pending[i]);
         }
     }
@@ -64,16 +92,28 @@ static Status begin_next(void *context) {
     return begin_from(place->beginning, place->index + 1);
 }
 
-static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
+static Status initialize_part(const Beginning *b, size_t index, StartValues values) {
     Composite *me = b->me;
+    const Component *part = &me->system->parts[index];
+    Experiment experiment = *b->experiment;
+
+    experiment.number_of_structural = part->number_of_structural;
+    experiment.structural_references = part->structural_references;
+    experiment.structural_values = part->structural_values;
+    me->parts.started[index] = true;
+    const Status status =
+        part_judge(me, index, part->fmi->initialize(&me->libraries[index], me->components[index],
+                                                    &experiment, values, b->doing));
+    me->parts.failed[index] |= status > STATUS_WARNING;
+    return status;
+}
+
+static Status begin_part(const Beginning *b, size_t index, bool goes_on) {
     Place place = {b, index};
     const StartValues values = {
         .set = set_starts, .context = &place, .exchange = goes_on ? begin_next : NULL};
 
-    me->parts.started[index] = true;
-    return part_judge(me, index, me->system->parts[index].fmi->initialize(
-                                     &me->libraries[index], me->components[index],
-                                     b->experiment, values, b->doing));
+    return initialize_part(b, index, values);
 }
 
 /* Exchanging values */
@@ -84,28 +124,33 @@ static Status begin_if_old(const Beginning *b, size_t index) {
     return waits ? begin_part(b, index, false) : STATUS_OK;
 }
 
-static Status read_source(const Beginning *b, const Route *route, double *value) {
-    const Component *part = &b->me->system->parts[route->source_part];
+static Status read_source(const Beginning *b, const Route *route, double *values) {
+    Composite *me = b->me;
+    const Component *part = &me->system->parts[route->source_part];
     const size_t place = route->source - part->first_output;
+    const Element *element = &part->outputs.variables[place];
     Status status = begin_if_old(b, route->source_part);
 
     if (status <= STATUS_WARNING) {
-        status = part_get(b->me, route->source_part, (Type)part->outputs.types[place],
-                          &part->outputs.variables[place].reference, value);
+        status = part_get(me, route->source_part, (Type)part->outputs.types[place], element,
+                          me->whole);
     }
-    return status > STATUS_WARNING ? status : route_carry(b->me, route, *value, value);
+    return status > STATUS_WARNING ? status
+                                   : route_carry(me, route, me->whole + element->place, values);
 }
 
-/* An FMU of FMI 1.0 that waits gets the value when it begins. */
-static Status write_target(const Beginning *b, const Route *route, double value) {
+/* An FMU of FMI 1.0 that waits gets the values when it begins. An element of an array is set with
+ * the others, which stay as they are. */
+static Status write_target(const Beginning *b, const Route *route, const double *values) {
     Composite *me = b->me;
     const Component *part = &me->system->parts[route->target_part];
     const size_t place = route->target - part->first_input;
+    const Element *element = &part->inputs.variables[place];
 
-    me->inputs[route->target] = value;
+    memmove(&me->inputs[route->target], values, route->count * sizeof *values);
     return me->parts.started[route->target_part]
-               ? part_set(me, route->target_part, (Type)part->inputs.types[place],
-                          &part->inputs.variables[place].reference, value)
+               ? part_set(me, route->target_part, (Type)part->inputs.types[place], element,
+                          &me->inputs[route->target] - element->place)
                : STATUS_OK;
 }
 
@@ -114,30 +159,37 @@ typedef struct {
     const Transfer *transfer;
 } LoopOfLinks;
 
+static Status read_all(const Beginning *b, const Transfer *transfer, double *values) {
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
+        const Route *route = &b->me->system->routes[transfer->routes[i]];
+        status = read_source(b, route, values);
+        values += route->count;
+    }
+    return status;
+}
+
 static Status evaluate(void *context, const double *x, double *y) {
     const LoopOfLinks *loop = context;
     const Route *routes = loop->beginning->me->system->routes;
     Status status = STATUS_OK;
 
     for (size_t i = 0; i < loop->transfer->count && status <= STATUS_WARNING; i++) {
-        status = write_target(loop->beginning, &routes[loop->transfer->routes[i]], x[i]);
+        const Route *route = &routes[loop->transfer->routes[i]];
+        status = write_target(loop->beginning, route, x);
+        x += route->count;
     }
-    for (size_t i = 0; i < loop->transfer->count && status <= STATUS_WARNING; i++) {
-        status = read_source(loop->beginning, &routes[loop->transfer->routes[i]], &y[i]);
-    }
-    return status;
+    return status > STATUS_WARNING ? status : read_all(loop->beginning, loop->transfer, y);
 }
 
 static Status solve(const Beginning *b, const Transfer *transfer) {
     Composite *me = b->me;
     LoopOfLinks context = {b, transfer};
-    Status status = STATUS_OK;
+    Status status = read_all(b, transfer, me->loop);
 
-    for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
-        status = read_source(b, &me->system->routes[transfer->routes[i]], &me->loop[i]);
-    }
     if (status <= STATUS_WARNING) {
-        status = loop_solve(&transfer->loop, transfer->count, me->loop, evaluate, &context);
+        status = loop_solve(&transfer->loop, transfer->unknowns, me->loop, evaluate, &context);
     }
     if (status > STATUS_WARNING && me->blamed == NULL) {
         me->blamed = transfer->label;
@@ -150,10 +202,10 @@ static Status carry(const Beginning *b, const Transfer *transfer) {
 
     for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
         const Route *route = &b->me->system->routes[transfer->routes[i]];
-        double value;
-        status = read_source(b, route, &value);
+        double *values = &b->me->inputs[route->target];
+        status = read_source(b, route, values);
         if (status <= STATUS_WARNING) {
-            status = write_target(b, route, value);
+            status = write_target(b, route, values);
         }
     }
     return status;
@@ -203,6 +255,88 @@ static Status collect(Composite *me, StartValues start_values) {
     return status;
 }
 
+/* Begins with all parts. */
+static Status begin_all(const Beginning *b) {
+    Status status = start_reset_restoring(b->me);
+
+    if (status <= STATUS_WARNING) {
+        status = begin_from(b, 0);
+    }
+    if (status <= STATUS_WARNING) {
+        *b->doing = "reading the outputs";
+        status = system_refresh(b->me);
+    }
+    return status;
+}
+
+/* Lets some parts return to the kept start, and initializes the others with their inputs of then. */
+
+static Status set_links(void *context) {
+    const Place *place = context;
+    Composite *me = place->beginning->me;
+    const Component *part = &me->system->parts[place->index];
+    Status status = STATUS_OK;
+
+    for (size_t i = part->first_route; i < part->end_route && status <= STATUS_WARNING; i++) {
+        const Route *route = &me->system->routes[i];
+        status = write_target(place->beginning, route, &me->inputs[route->target]);
+    }
+    return status;
+}
+
+static Status begin_with_links(const Beginning *b, size_t index) {
+    Place place = {b, index};
+    const StartValues values = {.set = set_starts, .context = &place, .exchange = set_links};
+
+    return initialize_part(b, index, values);
+}
+
+static Status begin_again(const Beginning *b) {
+    Composite *me = b->me;
+    Status status = start_restore(me);
+
+    for (size_t i = 0; i < me->system->count && status <= STATUS_WARNING; i++) {
+        if (!me->parts.started[i]) {
+            status = begin_with_links(b, i);
+        }
+    }
+    return status <= STATUS_WARNING ? system_refresh(me) : status;
+}
+
+static Status begin_or_return(const Beginning *b, StartValues start_values) {
+    Composite *me = b->me;
+
+    if (start_is_kept(me)) {
+        const bool begun = begin_again(b) <= STATUS_WARNING;
+        if (begun && start_is_the_same(me)) {
+            return STATUS_OK;
+        }
+        if (begun) {
+            start_blame(me);
+        }
+        me->blamed = NULL;
+        const Status status = start_give_up(me);
+        if (status > STATUS_WARNING || collect(me, start_values) > STATUS_WARNING) {
+            return STATUS_ERROR;
+        }
+    }
+    return begin_all(b);
+}
+
+static Status keep(const Beginning *b, StartValues start_values) {
+    Composite *me = b->me;
+
+    if (start_keep(me) <= STATUS_WARNING) {
+        return STATUS_OK;
+    }
+    me->blamed = NULL; /* what refuses to save its state may have failed by that */
+    const Status status = start_give_up(me);
+    if (status > STATUS_WARNING || collect(me, start_values) > STATUS_WARNING) {
+        return STATUS_ERROR;
+    }
+    return begin_all(b);
+}
+
 Status system_initialize(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing) {
     Composite *me = component;
@@ -211,13 +345,14 @@ Status system_initialize(const Library *library, void *component, const Experime
     (void)library;
     *doing = "setting the start values";
     Status status = collect(me, start_values);
+    if (status <= STATUS_WARNING && me->system->restores &&
+        !start_note(me, experiment->start_time)) {
+        status = STATUS_ERROR;
+    }
     if (status <= STATUS_WARNING) {
         *doing = "initialization";
-        status = begin_from(&beginning, 0);
+        status = begin_or_return(&beginning, start_values);
     }
-    if (status <= STATUS_WARNING) {
-        *doing = "reading the outputs";
-        status = system_refresh(me);
-    }
-    return status;
+    return status <= STATUS_WARNING && me->system->restores ? keep(&beginning, start_values)
+                                                            : status;
 }

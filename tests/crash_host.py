@@ -21,7 +21,7 @@ import numpy as np
 import zoo_tools
 
 import fmugym
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 
 
 def say(line):

@@ -14,7 +14,7 @@ from fmugym.pool import states
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.states import StateFiles
 from fmugym.tools.overview import as_text, overview
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 from fmugym.trial.verdict import Grade
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")

@@ -17,8 +17,9 @@ from fmugym.errors import LicenceError
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.tools.cli import main
 from fmugym.trial import rehearsal
+from fmugym.trial.candidate import Candidate
+from fmugym.trial.known import known_verdict
 from fmugym.trial.neighbours import default_spec
-from fmugym.trial.trial import Candidate, known_verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 

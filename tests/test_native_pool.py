@@ -21,8 +21,8 @@ from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec, PythonPool
 from fmugym.trial import opening
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.neighbours import disturb_in_turn
-from fmugym.trial.trial import Candidate
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():

@@ -12,8 +12,9 @@ import fmugym
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools.cli import main
+from fmugym.trial.candidate import Candidate
+from fmugym.trial.known import known_verdict
 from fmugym.trial.neighbours import disturb_in_threads
-from fmugym.trial.trial import Candidate, known_verdict
 from fmugym.trial.verdict import Neighbours
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")

@@ -12,6 +12,7 @@ from wine_tools import for_windows
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym import pool as pools
 from fmugym.archive.bundled import BUNDLED, MODELS, is_bundled
+from fmugym.archive.texts import number_of, with_texts
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.systems.fmu import SystemFMU
@@ -54,7 +55,7 @@ def make_pool(request, tmp_path):
         monkeypatch.setattr("fmugym.archive.fmu.is_bundled", is_bundled_or_copy)
     made = []
 
-    def make(path, inputs, outputs, num_instances=1, time_step=0.1, strings=None, **spec):
+    def make(path, inputs, outputs, num_instances=1, time_step=0.1, **spec):
         fmu = FMU(for_windows(path, tmp_path) if in_wine else path)
         if "system" in request.param:
             fmu = system_of(path)
@@ -62,7 +63,6 @@ def make_pool(request, tmp_path):
             inputs=tuple(map(fmu.variable, inputs)),
             outputs=tuple(map(fmu.variable, outputs)),
             time_step=time_step,
-            strings=tuple((fmu.variable(n), v) for n, v in (strings or {}).items()),
             **spec,
         )
         options = OPTIONS[request.param]
@@ -576,12 +576,16 @@ class TestStartValues:
 
     @all_versions
     def test_strings_and_integers(self, make_pool, probe, version, caplog):
-        pool = make_pool(probe(version), ["a"], ["steps"], 2, strings={"label": "here"})
+        pool = make_pool(probe(version), ["a"], ["steps"], 2)
+        label = with_texts(pool.variable("label"), ["here", "there", "nowhere"])
         for _ in range(4):
-            set_up(pool, log_status=[-1, 1])
+            variables = pool.variable("log_status"), label
+            texts = [number_of("here"), number_of("there")]
+            pool.reset(variables, np.array([[1.0, 1.0], texts]))
             caplog.clear()
             step(pool)
-            assert caplog.text.count("step 1 of here is 100%") == 1
+            for text in ("here", "there"):
+                assert caplog.text.count(f"step 1 of {text} is 100%") == 1
 
     @with_state
     def test_saved_states_do_not_pile_up(self, make_pool, probe, version):

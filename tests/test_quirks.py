@@ -25,8 +25,9 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
-from fmugym.trial.trial import Candidate, examine
+from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")

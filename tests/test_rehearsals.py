@@ -11,7 +11,7 @@ import pytest
 import fmugym
 from fmugym.pool import tape
 from fmugym.pool.tape import Rehearsals
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 

@@ -11,7 +11,7 @@ from demanding_tools import DemandingEnv, expected_outputs, make_fmu
 
 import fmugym
 from fmugym.pool import progress
-from fmugym.trial import trial
+from fmugym.trial import attempt, known, trial
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -43,7 +43,7 @@ class TestTime:
     def test_is_given_in_a_trial(self, folder):
         fmu = fmugym.FMU(make_fmu(folder, "slower"), probe_timeout=0.5)
         trial.meet(fmu)
-        assert trial.known_verdict(fmu).complete
+        assert known.known_verdict(fmu).complete
 
     def test_is_given_in_worker_processes(self, folder):
         config = {"isolation": "process", "call_timeout": 0.5, "probe_timeout": None}
@@ -95,7 +95,7 @@ class TestProgress:
     @pytest.fixture(autouse=True)
     def often(self, monkeypatch, caplog):
         monkeypatch.setattr(progress, "_EVERY", 0.1)
-        monkeypatch.setattr(trial, "_EVERY", 0.1)
+        monkeypatch.setattr(attempt, "_EVERY", 0.1)
         caplog.set_level(logging.INFO, "fmugym")
 
     @pytest.mark.parametrize(

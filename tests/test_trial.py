@@ -17,7 +17,7 @@ import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.process.last_words import OutputTail, describe_exit
-from fmugym.trial import trial
+from fmugym.trial import attempt, trial
 from fmugym.trial.cache import cache_folder
 from fmugym.trial.opening import make_pool
 
@@ -69,10 +69,10 @@ def started(monkeypatch):
     class Popen(subprocess.Popen):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            if trial._WORKER in self.args:  # a fixture may start a compiler
+            if attempt._WORKER in self.args:  # a fixture may start a compiler
                 workers.append(self)
 
-    monkeypatch.setattr(trial.subprocess, "Popen", Popen)
+    monkeypatch.setattr(attempt.subprocess, "Popen", Popen)
     return workers
 
 
@@ -239,7 +239,7 @@ class TestExemptions:
         assert "Mortal.fmu could not be tried before: it found no Python to start" in caplog.text
 
     def test_where_the_worker_fails_by_itself(self, make_fmu, monkeypatch, caplog):
-        monkeypatch.setattr(trial, "_WORKER", "fmugym.absent")
+        monkeypatch.setattr(attempt, "_WORKER", "fmugym.absent")
         assert step_once(make_fmu()) == [1.0]
         assert "No module named fmugym.absent" in caplog.text
 

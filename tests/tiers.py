@@ -42,12 +42,16 @@ SLOW_MODULES = {
     "test_stand_in",
     "test_pettingzoo",
     "test_start_times",
+    "test_strings",
     "test_value_types",
     "test_systems",
+    "test_systems_arrays",
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",
+    "test_systems_resets",
     "test_systems_ssp",
+    "test_systems_strings",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -82,8 +86,11 @@ EVERY_IN_CI = {
     "test_reference_models": 17,
     "test_snapshot_machine": 4,
     "test_start_times": 5,
+    "test_strings": 5,
     "test_systems": 5,
+    "test_systems_resets": 5,
     "test_value_types": 3,
+    "test_vector_readings": 4,
     "test_words": 5,
     "test_zoo": 5,
 }

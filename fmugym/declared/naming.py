@@ -293,6 +293,8 @@ class Naming:
         if name in declared.written:
             return converted(record.conversion, f"env.inputs[{declared.written.index(name)}]")
         if name in declared.parameters:
+            if record.variable is not None and record.variable.kind == "string":
+                raise record.entry.error(f"{name!r} is a String: expressions have numbers only")
             return converted(record.conversion, f"env.parameters[{record.fmu_name!r}]")
         place = self._places[name]
         return converted(record.conversion, f"env._values[{place}]")

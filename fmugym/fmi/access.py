@@ -9,29 +9,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
+from fmugym.archive.description import Variable, unlisted
+from fmugym.archive.texts import text_among
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status, sane
 
-__all__ = ["Access", "unlisted"]
+__all__ = ["Access"]
 
 _Group = tuple[list[int], list[int], npt.NDArray[Any], Any]
 """The places of variables in the list and in the FMU's memory, this memory, and the calls."""
 
 
-def unlisted(variables: Sequence[Variable]) -> list[Variable]:
-    """Find what is missing of arrays of which only some elements are listed.
-
-    FMI moves whole arrays only. Elements that are not listed keep their start values.
-    """
-    listed = {variable.name for variable in variables}
-    arrays = dict.fromkeys(v.array for v in variables if v.array is not None)
-    return [one for array in arrays for one in array.elements if one.name not in listed]
-
-
 def _by_type(instance: Instance, variables: Sequence[Variable]) -> dict[str, list[int]]:
     by_type: dict[str, list[int]] = {}
     for index, variable in enumerate(variables):
+        if variable.kind == "string":
+            continue
         by_type.setdefault(instance.c_type(variable), []).append(index)
     return by_type
 
@@ -58,7 +51,8 @@ class Access:
 
     Args:
         instance: The instance.
-        variables: The variables, all of them numeric.
+        variables: The variables: numeric ones, and Strings that ``set_texts`` sets; ``set`` leaves
+            these out.
         values: The memory to use, contiguous float64; by default new memory.
 
     Attributes:
@@ -73,6 +67,8 @@ class Access:
         values: npt.NDArray[np.float64] | None = None,
     ) -> None:
         self.values = np.zeros(len(variables)) if values is None else values
+        self._instance = instance
+        self._strings = [(i, v) for i, v in enumerate(variables) if v.kind == "string"]
         self._groups = [
             self._group(instance, c_type, indices, variables)
             for c_type, indices in _by_type(instance, variables).items()
@@ -126,3 +122,13 @@ class Access:
             if worst > Status.WARNING:
                 break
         return worst
+
+    def set_texts(self) -> None:
+        """Write the Strings to the FMU: for each the text that its value stands for.
+
+        Raises:
+            SimulationError: If the FMU refuses one.
+        """
+        for index, variable in self._strings:
+            text = text_among(variable, float(self.values[index]))
+            self._instance.set_string(variable, text)

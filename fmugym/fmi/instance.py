@@ -116,6 +116,11 @@ class Instance(ABC):
             return f" ({error})"
         return ""
 
+    @property
+    def life(self) -> object:
+        """Changes when the states that were saved before cannot be restored any more."""
+        return self
+
     # What the FMU is asked to log.
 
     @property

@@ -5,11 +5,13 @@ This does what ``native/system.c`` and its siblings do, operation by operation.
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import struct
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -21,13 +23,14 @@ from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.kept import KeptStart
 from fmugym.fmi.library import Library
 from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.solver import Solving
 from fmugym.fmi.status import Phase, Status, failed_call, sane
 from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.layout import Layout, PartLayout, Route
+from fmugym.systems.layout import Layout, PartLayout, Route, array_key
 from fmugym.systems.plan import Evaluation, Group
 
 __all__ = ["SystemInstance", "SystemLibrary", "open_library"]
@@ -47,11 +50,22 @@ def _scaled(gain: float, offset: float, value: float) -> float:
     return value if gain == 1.0 and offset == 0.0 else gain * value + offset
 
 
-def _carried(source: _Part, route: Route, value: float) -> float:
+def _carried(source: _Part, route: Route, values: Iterable[float]) -> list[float]:
     """What a route carries. Values that are not finite must not reach other FMUs."""
-    if not math.isfinite(value):
-        raise _FailedError(Status.NOT_FINITE, f"{source.label}, whose outputs are not finite")
-    return _scaled(route.gain, route.offset, value)
+    carried = []
+    for value in values:
+        if not math.isfinite(value):
+            raise _FailedError(Status.NOT_FINITE, f"{source.label}, whose outputs are not finite")
+        carried.append(_scaled(route.gain, route.offset, value))
+    return carried
+
+
+def _shared_out(routes: Iterable[Route], values: Sequence[float]) -> Iterator[Any]:
+    """Each route with its part of the values of all."""
+    first = 0
+    for route in routes:
+        yield route, values[first : first + route.count]
+        first += route.count
 
 
 class _Part:
@@ -70,9 +84,15 @@ class _Part:
         self.started = False
         self.forget()
 
+    def renew(self, instance: Instance) -> None:
+        """Go on with another instance."""
+        self.instance, self.started = instance, False
+        self.inputs = Access(instance, self.layout.inputs, self.inputs.values)
+        self.outputs = Access(instance, self.layout.outputs, self.outputs.values)
+
     def forget(self) -> None:
         """Return the slots to the start values."""
-        self.inputs.values[:] = [v.start_number for v in self.layout.inputs]
+        self.inputs.values[:] = self.layout.starts_of(self.layout.inputs)
         self.outputs.values[:] = 0.0
 
     def judge(self, status: int) -> None:
@@ -85,15 +105,15 @@ class _Part:
         if status not in _GOOD:
             raise _FailedError(status, self.label)
 
-    def get(self, variable: Variable) -> float:
-        """Get one variable."""
-        access = Access(self.instance, (variable,))
+    def get(self, variables: Sequence[Variable]) -> list[float]:
+        """Get a scalar, or some elements of an array."""
+        access = Access(self.instance, variables)
         self.judge(access.get())
-        return float(access.values[0])
+        return list(map(float, access.values))
 
-    def set(self, variable: Variable, value: float) -> None:
-        """Set one variable."""
-        access = Access(self.instance, (variable,), np.array([value]))
+    def set(self, variables: Sequence[Variable], values: Iterable[float]) -> None:
+        """Set a scalar, or all elements of an array, or several of both."""
+        access = Access(self.instance, variables, np.array(list(values), float))
         self.judge(access.set())
 
     def read(self) -> None:
@@ -129,13 +149,23 @@ class SystemInstance(Instance):
         layout: The slots and routes.
         instances: Those of the components, in their order.
         target: The logger for the system's own messages.
+        resets: How each component begins an episode: ``"restore"``, ``"reset"``, or anything else
+            for a new instance.
+        renew: Makes the instance of a component anew, given its number and the old one.
     """
 
     dtypes: ClassVar[dict[str, Any]] = {"Float64": np.float64}
 
     def __init__(
-        self, layout: Layout, instances: Iterable[Instance], target: logging.Logger
+        self,
+        layout: Layout,
+        instances: Iterable[Instance],
+        target: logging.Logger,
+        resets: Sequence[str],
+        renew: Callable[[int, Instance], Instance],
     ) -> None:
+        self._resets, self._renew = resets, renew
+        self._kept, self._life = KeptStart(), object()
         self._layout = layout
         self._description: SystemDescription = layout.description
         pairs = zip(layout.parts, instances, strict=True)
@@ -183,6 +213,11 @@ class SystemInstance(Instance):
         """Forget the messages of the episode before."""
         for part in self._parts:
             part.instance.begin_episode()
+
+    @property
+    def life(self) -> object:
+        """See ``Instance.life``; it ends when a component is made anew."""
+        return self._life
 
     def c_type(self, variable: Variable) -> str:
         """The values of a system are all of one type."""
@@ -240,7 +275,7 @@ class SystemInstance(Instance):
             return float(part.outputs.values[output - part.layout.first_output])
         if given >= 0:
             return float(part.inputs.values[given - part.layout.first_input])
-        return part.get(end.variable)
+        return part.get((end.variable,))[0]
 
     def _set_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for behind, value in zip(ends, buffer.tolist(), strict=True):
@@ -256,12 +291,20 @@ class SystemInstance(Instance):
             self._pending.append((end, value))
         elif given < 0:
             self._fresh = False
-            part.set(end.variable, value)
+            self._set_alone(part, end.variable, value)
+
+    def _set_alone(self, part: _Part, variable: Variable, value: float) -> None:
+        """Set a scalar, or one element of an array, of which the others stay as they are."""
+        whole = (variable if variable.array is None else variable.array).elements
+        values = [value] if variable.array is None else part.get(whole)
+        values[variable.place] = value
+        part.set(whole, values)
 
     def set_string(self, variable: Variable, value: str) -> None:
         """See ``Instance.set_string``."""
         assert self._pending is not None
-        self._pending.append((self._description.ends[variable.value_reference][0], value))
+        ends = self._description.ends[variable.value_reference]
+        self._pending += [(end, value) for end in ends]
 
     # Initialization: the components are initialized one inside of the other.
 
@@ -295,17 +338,115 @@ class SystemInstance(Instance):
             self.phase = Phase.FAILED
 
     def _initialize_parts(self, span: Span, set_start_values: Callable[[], None]) -> None:
+        values = self._collected(set_start_values)
+        key = KeptStart.key_of(span.start_time, values)
+        if self._kept.known and key == self._kept.key:
+            if self._has_begun_again(span, values):
+                return
+            self._give_up()
+            values = self._collected(set_start_values)
+        self._begin_all(span, values)
+        if self._kept.next(key) and not self._has_kept_states():
+            self._give_up()
+            self._begin_all(span, self._collected(set_start_values))
+
+    def _collected(self, set_start_values: Callable[[], None]) -> list[Any]:
         for part in self._parts:
             part.forget()
         self._fresh = False
         self._pending = []
         try:
             set_start_values()
-            values, self._pending = self._pending, None
+            return self._pending
         finally:
             self._pending = None
+
+    def _begin_all(self, span: Span, values: list[Any]) -> None:
+        self._kept.forget()
+        for index in self._restoring:
+            with self._restoring_part(index):
+                self._reset_part(index)
         self._begin_from(0, span, values)
         self._refresh()
+
+    # Some components return to the kept start, the others begin with their inputs of then.
+
+    @property
+    def _restoring(self) -> list[int]:
+        pairs = enumerate(self._resets)
+        return [i for i, method in pairs if method == "restore" and i not in self._kept.useless]
+
+    @property
+    def _others(self) -> list[int]:
+        restoring = self._restoring
+        return [index for index in range(len(self._parts)) if index not in restoring]
+
+    def _has_begun_again(self, span: Span, values: list[Any]) -> bool:
+        others = self._others
+        try:
+            self._restore_start()
+            self._begin_others(others, span, values)
+        except (_FailedError, SimulationError):
+            return False
+        return not self._blamed()
+
+    def _blamed(self) -> bool:
+        """Restore those no more whose outputs are others than then; returns whether any are."""
+        now, then = (np.frombuffer(slots) for slots in (self._slots()[1], self._kept.slots[1]))
+        if now.tobytes() == then.tobytes():
+            return False
+        found = []
+        for index in self._restoring:
+            part = self._parts[index].layout
+            place = slice(part.first_output, part.first_output + len(part.outputs))
+            if now[place].tobytes() != then[place].tobytes():
+                found.append(index)
+        self._kept.useless.update(found or range(len(self._parts)))
+        return True
+
+    def _restore_start(self) -> None:
+        for index in self._restoring:
+            with self._restoring_part(index):
+                self._restore_part(index, self._kept.states[index])
+        self._kept.stepped = False
+        self._put_inputs(self._kept.slots[0])
+
+    @contextmanager
+    def _restoring_part(self, index: int) -> Iterator[None]:
+        """Restore a component no more that fails in this."""
+        try:
+            yield
+        except BaseException:
+            self._kept.useless.add(index)
+            raise
+
+    def _begin_others(self, indices: Iterable[int], span: Span, values: list[Any]) -> None:
+        for index in indices:
+            self._begin(index, span, values, functools.partial(self._set_links, index))
+        self._refresh()
+
+    def _set_links(self, index: int) -> None:
+        part = self._parts[index]
+        for route in self._layout.routes:
+            if route.target_part == index:
+                first = route.target - part.layout.first_input
+                self._write_target(route, part.inputs.values[first : first + route.count].tolist())
+
+    def _has_kept_states(self) -> bool:
+        try:
+            for index in self._restoring:
+                with self._restoring_part(index):
+                    self._kept.states[index] = self._save_part(index)
+        except _FailedError:
+            return False
+        self._kept.slots, self._kept.known = self._slots(), True
+        return True
+
+    def _give_up(self) -> None:
+        """Return all that do not restore to where they were made."""
+        self._kept.forget()
+        for index in self._others:
+            self._reset_part(index)
 
     def _begin_from(self, index: int, span: Span, values: list[Any]) -> None:
         """Begin with this part and all that follow, then exchange values."""
@@ -334,19 +475,41 @@ class SystemInstance(Instance):
         """What is set for this simulation wins over what the system says."""
         part = self._parts[index]
         starts = part.layout.starts
+        numbers = [(v, value) for v, value in starts if not isinstance(value, str)]
+        part.set([v for v, _ in numbers], [value for _, value in numbers])
         for variable, value in starts:
-            self._set_start(part, variable, value)
-        for end, value in values:
-            if end.part == index:
-                self._set_start(part, end.variable, value)
+            if isinstance(value, str):
+                part.instance.set_string(variable, value)
+        self._set_pending(part, [(end, value) for end, value in values if end.part == index])
         if not part.layout.has_mode:
             part.judge(part.inputs.set())
 
-    def _set_start(self, part: _Part, variable: Variable, value: float | str) -> None:
-        if isinstance(value, str):
-            part.instance.set_string(variable, value)
+    def _set_pending(self, part: _Part, values: list[tuple[PartVariable, Any]]) -> None:
+        arrays: dict[Any, list[tuple[int, float]]] = {}
+        for end, value in values:
+            if end.variable.array is not None:
+                arrays.setdefault(array_key(end), []).append((end.variable.place, value))
+        for end, value in values:
+            if isinstance(value, str):
+                part.instance.set_string(end.variable, value)
+            elif end.variable.array is None:
+                part.set((end.variable,), (value,))
+            elif array_key(end) in arrays:
+                self._set_array(part, end, arrays.pop(array_key(end)))
+
+    def _set_array(
+        self, part: _Part, end: PartVariable, elements: Iterable[tuple[int, float]]
+    ) -> None:
+        """Set some elements of an array; the others start with what the system says."""
+        whole = self._layout.arrays[array_key(end)][1].elements
+        given = self._layout.input_slot(end)
+        if given >= 0:
+            values = list(part.inputs.values[part.layout.span_of(given - part.layout.first_input)])
         else:
-            part.set(variable, float(value))
+            values = part.layout.starts_of(whole)
+        for place, value in elements:
+            values[place] = value
+        part.set(whole, values)
 
     def _exchange_all(self, span: Span, values: list[Any]) -> None:
         def begin_if_old(index: int) -> None:
@@ -366,30 +529,35 @@ class SystemInstance(Instance):
                 self._write_target(route, self._read_source(route, begin_if_old))
             return
 
-        def evaluate(x: list[float]) -> list[float]:
-            for route, value in zip(routes, x, strict=True):
-                self._write_target(route, value)
-            return [self._read_source(route, begin_if_old) for route in routes]
+        def read_all() -> list[float]:
+            return [x for route in routes for x in self._read_source(route, begin_if_old)]
 
-        x = [self._read_source(route, begin_if_old) for route in routes]
+        def evaluate(x: list[float]) -> list[float]:
+            for route, values in _shared_out(routes, x):
+                self._write_target(route, values)
+            return read_all()
+
+        x = read_all()
         try:
             solve_loop(evaluation.loop, x, evaluate)
         except NotSolvedError:
             label = self._layout.loop_label(route.source_part for route in routes)
             raise _FailedError(Status.DISCARD, label) from None
 
-    def _read_source(self, route: Route, begin_if_old: Callable[[int], None]) -> float:
+    def _read_source(self, route: Route, begin_if_old: Callable[[int], None]) -> list[float]:
         begin_if_old(route.source_part)
         part = self._parts[route.source_part]
-        value = part.get(part.layout.outputs[route.source - part.layout.first_output])
-        return _carried(part, route, value)
+        first = route.source - part.layout.first_output
+        values = part.get(part.layout.outputs[first : first + route.count])
+        return _carried(part, route, values)
 
-    def _write_target(self, route: Route, value: float) -> None:
+    def _write_target(self, route: Route, values: Sequence[float]) -> None:
+        """Set inputs. An element of an array is set with the others, which stay as they are."""
         part = self._parts[route.target_part]
-        place = route.target - part.layout.first_input
-        part.inputs.values[place] = value
+        self._take(route, values)
         if part.started:
-            part.set(part.layout.inputs[place], value)
+            span = part.layout.span_of(route.target - part.layout.first_input)
+            part.set(part.layout.inputs[span], part.inputs.values[span])
 
     def _refresh(self) -> None:
         for part in self._parts:
@@ -414,6 +582,7 @@ class SystemInstance(Instance):
         return status
 
     def _step_all(self, time: float, step_size: float) -> None:
+        self._kept.stepped = True
         if not self._fresh:
             self._refresh()
         self._fresh = False
@@ -424,14 +593,15 @@ class SystemInstance(Instance):
             self._step_group(group, time, step_size)
         self._fresh = True
 
-    def _carried(self, route: Route) -> float:
+    def _carried(self, route: Route) -> list[float]:
         part = self._parts[route.source_part]
-        value = float(part.outputs.values[route.source - part.layout.first_output])
-        return _carried(part, route, value)
+        first = route.source - part.layout.first_output
+        return _carried(part, route, part.outputs.values[first : first + route.count].tolist())
 
-    def _take(self, route: Route, value: float) -> None:
+    def _take(self, route: Route, values: Sequence[float]) -> None:
         part = self._parts[route.target_part]
-        part.inputs.values[route.target - part.layout.first_input] = value
+        first = route.target - part.layout.first_input
+        part.inputs.values[first : first + route.count] = values
 
     def _carry(self, route: Route) -> None:
         self._take(route, self._carried(route))
@@ -465,7 +635,7 @@ class SystemInstance(Instance):
         routes = [self._layout.routes[i] for i in self._layout.inner_routes(group)]
         for index in indices:
             self._carry_to(index)
-        x = [self._carried(route) for route in routes]
+        x = [value for route in routes for value in self._carried(route)]
         was_terminated = self._terminated
         before = [self._save_part(index) for index in indices]
         moved = False
@@ -476,11 +646,11 @@ class SystemInstance(Instance):
                 for index, state in zip(indices, before, strict=True):
                     self._restore_part(index, state)
             moved = True
-            for route, value in zip(routes, x, strict=True):
-                self._take(route, value)
+            for route, values in _shared_out(routes, x):
+                self._take(route, values)
             for index in indices:
                 self._step_part(index, time, step_size)
-            return [self._carried(route) for route in routes]
+            return [value for route in routes for value in self._carried(route)]
 
         try:
             solve_loop(group.loop, x, evaluate)
@@ -516,11 +686,24 @@ class SystemInstance(Instance):
             raise SimulationError(
                 f"{self._log.instance_name}: no reset is legal after a fatal error"
             )
-        for part in self._parts:
-            if part.started:
-                part.instance.reset()
-                part.started = False
+        for index in self._others:
+            self._reset_part(index)
         self.phase = Phase.INSTANTIATED
+
+    def _reset_part(self, index: int) -> None:
+        part = self._parts[index]
+        if not part.started:
+            return
+        if self._resets[index] in ("restore", "reset"):
+            part.instance.reset()
+            part.started = False
+            return
+        self._life = object()
+        try:
+            part.renew(self._renew(index, part.instance))
+        except FMULoadError as error:
+            self.phase = Phase.DEAD
+            raise SimulationError(f"{part.label}: {error}") from None
 
     def save_state(self) -> SavedState:
         """See ``Instance.save_state``."""
@@ -554,12 +737,18 @@ class SystemInstance(Instance):
         self.phase = Phase.STEPPING
 
     def _put_slots(self, memory: _Memory) -> None:
-        inputs, outputs = np.frombuffer(memory.inputs), np.frombuffer(memory.outputs)
+        self._put_inputs(memory.inputs)
+        outputs = np.frombuffer(memory.outputs)
         for part in self._parts:
-            first, last = part.layout.first_input, part.layout.first_output
-            part.inputs.values[:] = inputs[first : first + len(part.layout.inputs)]
-            part.outputs.values[:] = outputs[last : last + len(part.layout.outputs)]
+            first = part.layout.first_output
+            part.outputs.values[:] = outputs[first : first + len(part.layout.outputs)]
         self._fresh = memory.fresh
+
+    def _put_inputs(self, data: bytes) -> None:
+        inputs = np.frombuffer(data)
+        for part in self._parts:
+            first = part.layout.first_input
+            part.inputs.values[:] = inputs[first : first + len(part.layout.inputs)]
 
     def serialize(self, state: SavedState) -> bytes:
         """See ``Instance.serialize``; the native pool writes the same."""
@@ -612,14 +801,21 @@ class SystemLibrary(Library):
         layout: The slots and routes.
         target: The logger for the messages of all instances.
         solving: See ``Library``.
+        resets: See ``SystemInstance``; empty if all components are reset.
 
     Raises:
         FMULoadError: If a library cannot be loaded.
     """
 
     def __init__(
-        self, fmu: LoadableFMU, layout: Layout, target: logging.Logger, solving: Solving | None
+        self,
+        fmu: LoadableFMU,
+        layout: Layout,
+        target: logging.Logger,
+        solving: Solving | None,
+        resets: Sequence[str] = (),
     ) -> None:
+        self._resets = resets or ("reset",) * len(layout.parts)
         self.close: Any
         self._system, self._layout, self._target = fmu, layout, target
         self._libraries: list[Library] = []
@@ -645,9 +841,15 @@ class SystemLibrary(Library):
             for instance in made:
                 instance.free()
             raise
-        instance = SystemInstance(self._layout, made, self._target)
+        renew = functools.partial(self._renewed, hear_all=hear_all)
+        instance = SystemInstance(self._layout, made, self._target, self._resets, renew)
         self._instances.append(instance)
         return instance
+
+    def _renewed(self, index: int, old: Instance, *, hear_all: bool) -> Instance:
+        library, label = self._libraries[index], self._layout.parts[index].label
+        library.discard(old)
+        return _instantiate(library, label, hear_all)
 
     def discard(self, instance: Instance) -> None:
         """See ``Library.discard``."""
@@ -687,6 +889,7 @@ def open_library(
     solving: Solving | None,
     inputs: Sequence[Variable],
     outputs: Sequence[Variable],
+    resets: Sequence[str] = (),
 ) -> Library:
     """Load an FMU or a system.
 
@@ -696,6 +899,7 @@ def open_library(
         solving: See ``Library``.
         inputs: The variables that each step sets.
         outputs: The variables that are read after each step.
+        resets: See ``SystemLibrary``.
 
     Raises:
         FMULoadError: As ``Library``.
@@ -703,4 +907,4 @@ def open_library(
     description = fmu.description
     if not isinstance(description, SystemDescription):
         return Library(fmu, target, solving)
-    return SystemLibrary(fmu, Layout(description, inputs, outputs), target, solving)
+    return SystemLibrary(fmu, Layout(description, inputs, outputs), target, solving, resets)

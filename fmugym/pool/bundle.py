@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.description import Variable
+from fmugym.archive.texts import text_among
 from fmugym.pool.spec import START_TIME
 
 __all__ = ["Bundle", "Copies", "Record", "SaveMethod", "joined"]
@@ -40,11 +42,20 @@ class Record:
         names: The variables that were set before initialization.
         starts: Their values, shape (P,).
         inputs: The inputs of each step, shape (steps, k_in).
+        texts: Those of the Strings among the variables; ``starts`` has their numbers.
     """
 
     names: tuple[str, ...]
     starts: FloatArray
     inputs: FloatArray
+    texts: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, variables: Sequence[Variable], starts: FloatArray, inputs: FloatArray) -> Record:
+        """The record of an episode in which these variables were set; see the attributes."""
+        pairs = zip(variables, starts.tolist(), strict=True)
+        texts = tuple(text_among(v, value) for v, value in pairs if v.kind == "string")
+        return cls(tuple(v.name for v in variables), starts, inputs, texts)
 
     def start_time(self, default: float) -> float:
         """The first communication point, which is the default unless it is among the starts."""

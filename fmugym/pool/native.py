@@ -17,7 +17,6 @@ import logging
 import shutil
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
@@ -260,7 +259,7 @@ class NativePool(SavingPool):
         if failure is None:
             return ""
         name = f"{self._fmu.description.model_identifier}_{self._first_index + index}"
-        return describe_failure(Failure(*failure), self._spec, name)
+        return describe_failure(Failure(*failure), self._fmu.description, self._spec, name)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
@@ -325,7 +324,7 @@ class NativePool(SavingPool):
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
-        access = self._access(start_variables(self._variable, record.names))
+        access = self._access(start_variables(self._variable, record.names, record.texts))
         starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
         self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
 
@@ -352,7 +351,7 @@ class NativePool(SavingPool):
         self._open_pool().begin_by(False, method == ResetMethod.INSTANCE)
         self._pool.keep_records()
         self._mistrust_states()
-        self._spec = replace(self._spec, reset_method=method)
+        self._spec = self._spec.beginning_by(method)
         return True
 
     def recycle(self) -> None:
@@ -660,9 +659,10 @@ class _Listener:
     ) -> Tape:
         count, (width_in, width_out) = len(statuses), self._widths
         references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
+        values = np.frombuffer(starts)
         return Tape(
-            variables_of(self._description, types, references, places),
-            np.frombuffer(starts),
+            variables_of(self._description, types, references, places, values.tolist()),
+            values,
             np.frombuffer(first_outputs),
             np.frombuffer(inputs).reshape(count, width_in),
             np.frombuffer(outputs).reshape(count, width_out),

@@ -6,7 +6,6 @@ import functools
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -73,7 +72,9 @@ class PythonPool(SavingPool):
         self._mark = mark
         self._stepping, self._resetting = calling(mark, STEP), calling(mark, RESET)
         with self._resetting:
-            self._library = open_library(fmu, log, spec.solving, spec.inputs, spec.outputs)
+            self._library = open_library(
+                fmu, log, spec.solving, spec.inputs, spec.outputs, spec.component_resets
+            )
         pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:
@@ -271,7 +272,7 @@ class PythonPool(SavingPool):
         """See ``Pool.begin_by``; the library cannot be loaded anew."""
         if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
             return False
-        self._spec = replace(self._spec, reset_method=method)
+        self._spec = self._spec.beginning_by(method)
         for slot in self._slots:
             slot.begin_by(method)
         self._keep_records()

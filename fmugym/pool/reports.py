@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.description import ModelDescription, Variable
 from fmugym.errors import printable
 from fmugym.fmi.status import failed_call
 from fmugym.fmi.words import quoted, unpacked
@@ -41,28 +41,31 @@ class Failure(NamedTuple):
     part: str | None = None
 
 
-def describe_failure(failure: Failure, spec: PoolSpec, name: str) -> str:
+def describe_failure(
+    failure: Failure, description: ModelDescription, spec: PoolSpec, name: str
+) -> str:
     """Say in a sentence why an instance of this name failed."""
     if failure.values is not None:
         variables = spec.inputs if "inputs" in failure.doing else spec.outputs
         return f"{failure.doing}: {_not_finite(variables, failure.values)}"
-    text = _sentence(failure, spec, name) + quoted(unpacked(failure.said))
+    text = _sentence(failure, description, name) + quoted(unpacked(failure.said))
     return f"the warm-up failed: {text}" if failure.in_warm_up else text
 
 
-def _sentence(failure: Failure, spec: PoolSpec, name: str) -> str:
+def _sentence(failure: Failure, description: ModelDescription, name: str) -> str:
     doing = failure.doing
     if not math.isnan(failure.time):
         doing = f"the step at t = {failure.time:g} s"
     elif failure.string != _NO_STRING:
-        doing = f"setting {_string_name(spec, failure.string)!r}"
+        doing = f"setting {_string_name(description, failure.string)!r}"
     if failure.status < 0:  # the call was refused, and the text is a whole sentence
         return doing
     return f"{name}: {failed_call(doing, failure.status, failure.part or '')}"
 
 
-def _string_name(spec: PoolSpec, reference: int) -> str:
-    return next(v.name for v, _ in spec.strings if v.value_reference == reference)
+def _string_name(description: ModelDescription, reference: int) -> str:
+    strings = (v for v in description.variables.values() if v.kind == "string")
+    return next(v.name for v in strings if v.value_reference == reference)
 
 
 def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:

@@ -198,11 +198,12 @@ class SavingPool(AttendedPool):
         for record, index in records:
             by_names.setdefault(record.names, []).append((record, index))
         for names, group in by_names.items():
+            texts = [text for record, _ in group for text in record.texts]
             values = np.zeros((len(names), self.num_instances))
             mask = np.zeros(self.num_instances, np.bool_)
             for record, index in group:
                 values[:, index], mask[index] = record.starts, True
-            self.reset(start_variables(self._variable, names), values, mask)
+            self.reset(start_variables(self._variable, names, texts), values, mask)
 
     def _step_again(self, records: Sequence[tuple[Record, int]]) -> None:
         inputs, skip = self.inputs.copy(), np.ones(self.num_instances, np.bool_)

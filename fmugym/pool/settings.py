@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription, Variable
-from fmugym.fmi.access import unlisted
+from fmugym.archive.description import ModelDescription, Variable, unlisted
+from fmugym.archive.texts import number_of, text_of, with_texts
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.systems.description import SystemDescription
@@ -49,6 +49,7 @@ _TYPES: Final = (
     "UInt64",
     "Boolean",
     "Clock",
+    "String",
 )
 """The C types in the order of ``enum Type`` of ``native/fmi.h``."""
 
@@ -57,6 +58,7 @@ _START_TIME: Final = 255
 
 _CLOCK: Final = struct.Struct("=IIdd")
 _CLOCKED: Final = struct.Struct("=II")
+_NUMBER: Final = struct.Struct("=d")
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
@@ -130,7 +132,7 @@ def _structural_settings(description: ModelDescription) -> dict[str, bytes]:
 
 def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
     """How instances are initialized and stepped, and how episodes begin."""
-    method = spec.reset_method
+    method = spec.whole_reset_method
     return {
         "start_time": spec.start_time,
         "stop_time": spec.stop_time,
@@ -152,7 +154,6 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
     """What is to be known of variables besides the lists of inputs and outputs."""
     return {
         "num_observed": spec.num_observed,
-        "strings": tuple((v.value_reference, text.encode()) for v, text in spec.strings),
         "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
     }
 
@@ -215,7 +216,7 @@ def table_of(description: ModelDescription) -> int:
     return 0 if is_system else description.fmi_major_version
 
 
-def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, bytes]:
+def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, bytes, bytes]:
     """What ``listing_take`` of ``native/access.h`` takes.
 
     Args:
@@ -224,19 +225,31 @@ def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, 
 
     Returns:
         The C types of the variables, a byte each; their value references, places in their arrays,
-        and the sizes of these, three times four bytes each; and the values of the elements that
-        FMI needs besides, float64. The others come first.
+        and the sizes of these, three times four bytes each; the values of the elements that FMI
+        needs besides, float64 (the others come first); and the texts that Strings may get, each
+        with its number before and a zero after it, by ascending numbers.
     """
     rest = unlisted(variables)
     both = [*variables, *rest]
     types = bytes(_type_number(variable, version) for variable in both)
     elements = np.array([(v.value_reference, v.place, v.size) for v in both], np.uint32)
-    return types, elements.tobytes(), np.array([v.start_number for v in rest]).tobytes()
+    values = np.array([v.start_number for v in rest]).tobytes()
+    return types, elements.tobytes(), values, _texts(variables)
+
+
+def _texts(variables: Sequence[Variable]) -> bytes:
+    texts = {text for v in variables if v.kind == "string" for text, _ in v.items}
+    return b"".join(
+        _NUMBER.pack(number_of(text)) + text.encode() + b"\0"
+        for text in sorted(texts, key=number_of)
+    )
 
 
 def _type_number(variable: Variable, version: int) -> int:
     if is_start_time(variable):
         return _START_TIME
+    if variable.kind == "string":
+        return _TYPES.index("String")
     if version == 0:
         return _TYPES.index("Float64")
     if variable.kind == "enumeration":
@@ -249,18 +262,27 @@ def variables_of(
     types: Sequence[int],
     references: Sequence[int],
     places: Sequence[int],
+    values: Sequence[float],
 ) -> tuple[Variable, ...]:
-    """Find variables by C type, value reference and place in an array; aliases are as good."""
+    """Find start variables by C type, value reference and place in an array.
+
+    Aliases are as good. A String knows the text that its value stands for.
+    """
     version = table_of(description)
     known = {
-        (_type_number(v, version), v.value_reference): v
+        (_type_number(one, version), one.value_reference): one
         for v in description.variables.values()
-        if v.is_number
+        if v.is_number or v.kind == "string"
+        for one in (v.elements if v.driven is not None else (v,))
     }
     known[_START_TIME, START_TIME.value_reference] = START_TIME
-    return tuple(
+    found = [
         known[type_, reference].elements[place]
         for type_, reference, place in zip(types, references, places, strict=True)
+    ]
+    return tuple(
+        with_texts(variable, [text_of(value)]) if variable.kind == "string" else variable
+        for variable, value in zip(found, values, strict=True)
     )
 
 
@@ -280,9 +302,10 @@ def record_from(
         steps: The number of steps.
         inputs: Those of each step, float64.
     """
-    *identities, values = zip(*starts, strict=True) if starts else ((), (), (), ())
-    return Record(
-        tuple(variable.name for variable in variables_of(description, *identities)),
+    columns = zip(*starts, strict=True) if starts else ((), (), (), ())
+    types, references, places, values = columns
+    return Record.of(
+        variables_of(description, types, references, places, values),
         np.array(values, np.float64),
         np.frombuffer(inputs).reshape(steps, len(spec.inputs)),
     )

@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.archive.description import Variable
 from fmugym.errors import FMUGymError, SimulationError, printable
 from fmugym.fmi.access import Access
-from fmugym.fmi.instance import Instance, SavedState
+from fmugym.fmi.instance import SavedState
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
 from fmugym.pool.attendant import InitialState
@@ -20,7 +20,7 @@ from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.samples import Samples
-from fmugym.pool.spec import ResetMethod, is_start_time
+from fmugym.pool.spec import REUSING, ResetMethod, is_start_time
 
 __all__ = ["Slot", "Snapshot"]
 
@@ -30,19 +30,18 @@ class Snapshot:
     """A saved state of one instance.
 
     Attributes:
-        instance: The only instance that can restore the state.
+        life: The only life of an instance that can restore the state.
         state: The FMU state.
         count: The number of communication steps before the state.
         start_time: The first communication point of its episode.
     """
 
-    instance: Instance
+    life: object
     state: SavedState
     count: int
     start_time: float
 
 
-_REUSING = (ResetMethod.RESTORE, ResetMethod.RESET)
 _STEPPING = Phase.STEPPING
 _WARNING = int(Status.WARNING)
 _STATUSES = {Phase.FAILED: Status.ERROR, Phase.DEAD: Status.FATAL}
@@ -90,7 +89,7 @@ class Slot:
     ) -> None:
         self.failure = ""
         self.is_due = self.keeps_record = False
-        self._played: tuple[tuple[str, ...], FloatArray, list[bytes]] | None = None
+        self._played: tuple[Record, list[bytes]] | None = None
         self._unexplained = False
         self._counts, self._pacer = counts, pacer
         self._count = self._counted = 0
@@ -118,7 +117,7 @@ class Slot:
 
     def begin_by(self, method: ResetMethod) -> None:
         """Let later episodes begin in another way, without saved states."""
-        self._spec = replace(self._spec, reset_method=method)
+        self._spec = self._spec.beginning_by(method)
         self._restores, self._saved = False, None
 
     def reset(self, variables: tuple[Variable, ...], values: FloatArray) -> int:
@@ -135,7 +134,7 @@ class Slot:
         self._counts[Column.RETRIED] = 0
         self._played = None
         if self.keeps_record:
-            self._played = tuple(v.name for v in variables), np.array(values), []
+            self._played = Record.of(variables, np.array(values), np.zeros((0, 0))), []
         self.start_time = self._start_time_in(variables, values)
         try:
             self._make_anew_if_due()
@@ -175,7 +174,7 @@ class Slot:
             self._replace()
         elif unexplained and not self._has_snapshots and self._instance.can_say_more:
             self._rebuild(hear_all=True)
-        elif self._spec.reset_method not in _REUSING or self._instance.hears_more_than_wanted:
+        elif self._spec.whole_reset_method not in REUSING or self._instance.hears_more_than_wanted:
             self._rebuild()
 
     @property
@@ -274,8 +273,7 @@ class Slot:
 
     def _set_start_values(self) -> None:
         self._instance.check("setting the start values", self._start.set())
-        for variable, text in self._spec.strings:
-            self._instance.set_string(variable, text)
+        self._start.set_texts()
 
     def _warm_up(self) -> None:
         self._begin_counting_at(0)
@@ -293,7 +291,7 @@ class Slot:
         if not _all_finite(inputs):
             return self._not_finite("inputs", self._spec.inputs, inputs)
         if self._played is not None:
-            self._played[2].append(self._input_row.tobytes())
+            self._played[1].append(self._input_row.tobytes())
         if self._spec.fault_retries:
             self._counts[Column.RETRIED] = 0
         status = self._inputs.set()
@@ -429,11 +427,11 @@ class Slot:
     def save(self) -> Snapshot:
         """Copy the FMU state and the time."""
         state = self._instance.save_state()
-        return Snapshot(self._instance, state, self._count, self.start_time)
+        return Snapshot(self._instance.life, state, self._count, self.start_time)
 
     def require_own(self, snapshot: Snapshot) -> None:
         """Refuse a state of another instance, because FMUs accept it silently."""
-        if snapshot.instance is not self._instance:
+        if snapshot.life is not self._instance.life:
             raise SimulationError("the snapshot is of another instance than this one")
 
     def restore(self, snapshot: Snapshot) -> int:
@@ -520,16 +518,16 @@ class Slot:
 
     def replace_record(self, record: Record) -> None:
         """Let the episode count as the one of a record."""
-        self._played = record.names, record.starts, [row.tobytes() for row in record.inputs]
+        self._played = record, [row.tobytes() for row in record.inputs]
 
     @property
     def record(self) -> Record | None:
         """The episode until now; None if it is not known as a whole."""
         if self._played is None:
             return None
-        names, starts, rows = self._played
+        record, rows = self._played
         inputs = np.frombuffer(b"".join(rows)).reshape(len(rows), len(self._spec.inputs))
-        return Record(names, starts, inputs)
+        return replace(record, inputs=inputs)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """Read any variables now."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.texts import with_texts
 from fmugym.fmi.methods import METHODS
 from fmugym.fmi.solver import Solving
 
@@ -19,6 +20,7 @@ __all__ = [
     "FIXED_STEP_SOLVERS",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
+    "REUSING",
     "SAMPLINGS",
     "SOLVERS",
     "START_TIME",
@@ -72,14 +74,18 @@ def is_start_time(variable: Variable) -> bool:
     return variable.type == START_TIME.type
 
 
-def start_variables(find: Callable[[str], Variable], names: Iterable[str]) -> tuple[Variable, ...]:
+def start_variables(
+    find: Callable[[str], Variable], names: Iterable[str], texts: Sequence[str] = ()
+) -> tuple[Variable, ...]:
     """Find start variables by name, ``START_TIME`` included.
 
     Args:
         find: Finds a variable of the FMU.
         names: The names.
+        texts: Those that Strings among them may get.
     """
-    return tuple(START_TIME if n == START_TIME.name else find(n) for n in names)
+    found = (START_TIME if name == START_TIME.name else find(name) for name in names)
+    return tuple(with_texts(v, texts) if v.kind == "string" else v for v in found)
 
 
 class ResetMethod(StrEnum):
@@ -95,6 +101,10 @@ class ResetMethod(StrEnum):
     """Also load the shared library anew, to reset its global variables."""
     PROCESS = "process"
     """Start a new worker process."""
+
+
+REUSING: Final = (ResetMethod.RESTORE, ResetMethod.RESET)
+"""The methods that keep the instance."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +125,12 @@ class PoolSpec:
         tolerance: Passed to the FMU unless it is None.
         warm_up_steps: Steps simulated at each reset, inputs at their start values, before the
             first output is read.
-        strings: String parameters and their values.
         fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
             8 ... smaller ones, from the FMU state before it.
         leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
         reset_method: How instances start a new episode.
+        component_resets: For each component of a system, how it starts a new episode; empty if all
+            do by ``reset_method``.
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
         one_initialization: Whether only one instance in a process may be made, initialized, reset
             or freed at a time. Steps run in parallel all the same.
@@ -151,10 +162,10 @@ class PoolSpec:
     stop_time: float | None = None
     tolerance: float | None = None
     warm_up_steps: int = 0
-    strings: tuple[tuple[Variable, str], ...] = ()
     fault_retries: int = 0
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET
+    component_resets: tuple[ResetMethod, ...] = ()
     input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
     initialization_interval: float = 0.0
@@ -186,13 +197,31 @@ class PoolSpec:
         return tuple(variable.start_number for variable in self.outputs)
 
     def fitting(self, description: ModelDescription) -> PoolSpec:
-        """The spec for this FMU: one that has no function for resets is instantiated anew."""
-        if description.has_reset or self.reset_method not in (
-            ResetMethod.RESTORE,
-            ResetMethod.RESET,
-        ):
+        """The spec for this FMU: one that has no function for resets is instantiated anew.
+
+        Of a system, only the components without this function are.
+        """
+        if description.has_reset or self.component_resets or self.reset_method not in REUSING:
             return self
-        return replace(self, reset_method=ResetMethod.INSTANCE)
+        methods = tuple(
+            ResetMethod.RESET if part.has_reset else ResetMethod.INSTANCE
+            for part in description.components
+        )
+        return replace(self, reset_method=ResetMethod.INSTANCE, component_resets=methods)
+
+    def beginning_by(self, method: ResetMethod) -> PoolSpec:
+        """The spec with another reset method for the whole FMU or system."""
+        return replace(self, reset_method=method, component_resets=())
+
+    @property
+    def whole_reset_method(self) -> ResetMethod:
+        """How a pool treats the FMU as a whole: components with methods of their own are reset."""
+        return ResetMethod.RESET if self.component_resets else self.reset_method
+
+    @property
+    def reloads(self) -> bool:
+        """Whether anything is loaded anew, which must be a private copy then."""
+        return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)
 
     @property
     def solving(self) -> Solving:

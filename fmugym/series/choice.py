@@ -141,7 +141,8 @@ def _of_config(env: FMUEnv) -> Quantities:
     find, interface = env.fmu.variable, env._interface
     inputs, outputs = interface.input_names, tuple(env.out)
     episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
-    parameters = tuple(interface.parameters)
+    strings = env.fmu.description.strings
+    parameters = tuple(name for name in interface.parameters if name not in strings)
 
     def read(env: Any) -> Sequence[Any]:
         drawn, variables = env.parameters, env.variables

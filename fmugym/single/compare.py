@@ -115,9 +115,7 @@ class _Comparison:
         env = self._env
         with reading(env, self._readings(index)):
             try:
-                inputs = env._input_writer.write(
-                    env._get_inputs(), env.action, np.zeros(len(env.inputs))
-                )
+                inputs = env._input_writer.checked(env._get_inputs(), env.action)
             except Exception as error:  # hooks may raise anything
                 if is_of_signal_handler(error):
                     raise

@@ -190,7 +190,8 @@ class Player:
                 return False
             self._now[name][:, 0] = self._before[name][:, 0] = np.ravel(value)
         if self._reads_parameters:
-            self._parameters[:, 0] = list(env.parameters.values())
+            values = env.parameters.values()
+            self._parameters[:, 0] = [np.nan if type(v) is str else v for v in values]
         if self._reads_actions:
             if not _is_plain(env, env.action):
                 return False

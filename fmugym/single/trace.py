@@ -16,7 +16,7 @@ from fmugym.single.purity import unchanged_globals
 from fmugym.single.watch import Watched, noting_reads, watched_in
 from fmugym.task.readings import Readings, reading
 from fmugym.task.results import FLOAT32_LIMIT
-from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
+from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive, numpy_of
@@ -28,6 +28,7 @@ from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.tables import tables_in
 from fmugym.vector.hooks.trace import (
     SeenArray,
+    SymbolicParameters,
     in_hook,
     require_unchanged,
     tables_of,
@@ -359,12 +360,13 @@ class _Tracer:
         return array_of(graph, kind, names, action.dtype)
 
     def _symbolic_parameters(self) -> dict[str, Any]:
-        return ParameterValues(
-            (name, scalar_of(self._graph, "row", ("parameter", name, i), np.float64, float))
+        symbols = {
+            name: scalar_of(self._graph, "row", ("parameter", name, i), np.float64, float)
             if type(value) is float
-            else (name, value)
+            else value
             for i, (name, value) in enumerate(self._parameters.items())
-        )
+        }
+        return SymbolicParameters(symbols, self._env.fmu.description.strings)
 
     def _symbolic_variables(self, head: str) -> EpisodeVariables:
         variables = EpisodeVariables(self._variables)

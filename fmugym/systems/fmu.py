@@ -186,6 +186,7 @@ def _open(component: Component) -> FMU:
             limits=component.limits,
             preload=component.preload,
             interface=component.interface,
+            sizes=dict(component.sizes),
         )
 
 

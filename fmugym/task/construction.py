@@ -31,7 +31,7 @@ from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_de
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
 from fmugym.task.results import finiteness_of
-from fmugym.task.step import Numbers
+from fmugym.task.step import NUMBERS
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
@@ -222,7 +222,7 @@ class Constructed(Pictured):
         if self.config.draws_start_time and self.config.stop_time is not None:
             self._let_stop_time_end_episodes()
             self._own = own = OwnHooks.of(self, self._base)
-        self._form = Numbers(self)
+        self._form = NUMBERS
         # A subclass with its own step may take other actions.
         self._elements = None if own.step else elements_of(self.action_space)
         derived = not own.get_action_space
@@ -267,7 +267,7 @@ class Constructed(Pictured):
         own = self._interface.start_values(given)
         parameters |= own
         return EpisodePlan(
-            tuple(map(self._interface.parameter, parameters)),
+            tuple(map(self._interface.parameter, parameters, parameters.values())),
             parameters,
             self.config.episode_variables,
             own.keys(),

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmugym.archive.description import Variable
+from fmugym.archive.texts import number_of, text_of, texts_of
 from fmugym.checks import check_number
 from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
@@ -64,8 +65,11 @@ class EpisodePlan:
 
     Attributes:
         model_variables: As given.
-        constants: The parameters' values, shape (P,); 0 for those that are drawn.
+        constants: The parameters' values, shape (P,); 0 for those that are drawn, and of Strings
+            the number of a text.
         told: The overridden parameters and their values, which infos report.
+        strings: The parameters that are Strings. Hooks and infos get their texts, and all else the
+            numbers that stand for these; see ``fmugym.archive.texts``.
     """
 
     def __init__(
@@ -78,16 +82,16 @@ class EpisodePlan:
         self.model_variables = model_variables
         self._parameters = ParameterValues(parameters)
         self._variables = dict(episode_variables)
-        self.constants = np.array(
-            [0.0 if is_distribution(value) else value for value in parameters.values()],
-            dtype=np.float64,
-        )
+        pairs = zip(model_variables, parameters.values(), strict=True)
+        self.constants = np.array([_constant(v, value) for v, value in pairs], np.float64)
         self.told = {name: parameters[name] for name in overridden}
         self._random_parameters = [
             (index, name, not _always_fits(value, model_variables[index]))
             for index, (name, value) in enumerate(parameters.items())
             if is_distribution(value)
         ]
+        strings = (v.name for v in model_variables if v.kind == "string")
+        self.strings = frozenset(strings)
         self._all_fit = not any(may_not_fit for *_, may_not_fit in self._random_parameters)
         self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
         self._variables.update((name, array.constants) for name, array in self._arrays.items())
@@ -163,11 +167,22 @@ class EpisodePlan:
         known = [recipe for recipe in recipes if recipe is not None]
         return known if len(known) == len(recipes) else None
 
+    def shown(self, values: FloatArray) -> dict[str, Any]:
+        """The same as ``named``, but Strings are texts: arrays of objects."""
+        named = self.named(values)
+        return named | {n: texts_of(named[n]) for n in self.strings & named.keys()}
+
     @cached_property
     def constant_parameters(self) -> dict[str, Any]:
-        """The parameters that are not drawn."""
+        """The parameters that are not drawn; numbers, also for Strings."""
         drawn = set(self.drawn_names)
-        return {name: value for name, value in self._parameters.items() if name not in drawn}
+        pairs = zip(self._parameters, self.constants.tolist(), strict=True)
+        return {name: value for name, value in pairs if name not in drawn}
+
+    @cached_property
+    def constants_shown(self) -> dict[str, Any]:
+        """The parameters that are not drawn, as hooks read them."""
+        return {name: self._parameters[name] for name in self.constant_parameters}
 
     @cached_property
     def constant_variables(self) -> dict[str, Any]:
@@ -200,6 +215,8 @@ class EpisodePlan:
         starts = self._starts
         for (index, name, _), value in zip(self._random_parameters, values, strict=False):
             drawn[name] = parameters[name] = starts[index] = value
+        for name in self.strings & drawn.keys() if self.strings else ():
+            drawn[name] = parameters[name] = text_of(drawn[name])
         for name, array in self._random_variables:
             own = next(values) if array is None else array.of_episode(values)
             drawn[name] = variables[name] = own
@@ -279,6 +296,12 @@ def _unchangeable(array: FloatArray) -> FloatArray:
 def is_drawn(value: Any) -> bool:
     """Whether an episode variable of the config is an array with distributions in it."""
     return isinstance(value, np.ndarray) and value.dtype == object
+
+
+def _constant(variable: Variable, value: Any) -> float:
+    if is_distribution(value):
+        return float(variable.items[0][1]) if variable.kind == "string" else 0.0
+    return number_of(value) if variable.kind == "string" else value
 
 
 def _always_fits(distribution: Any, variable: Variable) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import hypot, isfinite
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ _FLOATS: Final = frozenset({float, np.float64, np.float32})
 
 
 class InputWriter:
-    """Writes the inputs of a single environment.
+    """Checks and writes the inputs of a single environment.
 
     Args:
         variables: The inputs.
@@ -32,32 +32,44 @@ class InputWriter:
         self._variables = variables
         self.all_real = all(variable.kind == "real" for variable in variables)
         self._is_one_real = self.all_real and len(variables) == 1
+        self._are_float64 = all(variable.type in {"Real", "Float64"} for variable in variables)
 
-    def write(self, values: Any, action: Any, row: FloatArray) -> tuple[float, ...]:
-        """Check values and write them.
+    def checked(self, values: Any, action: Any) -> tuple[float, ...]:
+        """Check values.
 
         Args:
             values: What ``_get_inputs`` returned.
             action: The action, for errors.
-            row: The pool's array of inputs, shape (k,).
 
         Returns:
             The values, rounded to the inputs' types.
 
         Raises:
-            ConfigError: If they are not one finite number for each input. Nothing is written then.
+            ConfigError: If they are not one finite number for each input.
         """
         if self._is_one_real and type(values) in _FLOATS and isfinite(values):
-            row[0] = values
             return (float(values),)
+        if self._are_float64 and type(values) is np.ndarray and values.dtype.char in "fd":
+            inputs = tuple(values.ravel().tolist())
+            if len(inputs) == len(self._variables) and isfinite(hypot(*inputs)):
+                return inputs
+        return self._flat(values, action)
+
+    def _flat(self, values: Any, action: Any) -> tuple[float, ...]:
         flat = flat_inputs(values, self._variables, lambda values: _source(values, action))
         inputs = tuple(flat.tolist())
         if not all(map(isfinite, inputs)):
             pairs = zip((v.name for v in self._variables), inputs, strict=True)
             listing = ", ".join(f"{name} = {value}" for name, value in pairs)
             raise ConfigError(f"action {shown(action)} makes {listing}; every input must be finite")
-        row[:] = inputs
         return inputs
+
+    def write(self, inputs: tuple[float, ...], row: FloatArray) -> None:
+        """Write checked inputs to the pool's array, shape (k,)."""
+        if self._is_one_real:
+            row[0] = inputs[0]  # takes a quarter of the time
+        else:
+            row[:] = inputs
 
 
 def _source(values: Any, action: Any) -> str:

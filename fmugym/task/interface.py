@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription, Variable
-from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
+from fmugym.archive.description import ModelDescription, Variable, unlisted
+from fmugym.archive.texts import with_texts
+from fmugym.checks import LARGEST_COUNT, check_number, integer_of, parts_of_array
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.fmi.access import unlisted
 from fmugym.pool.spec import (
     FIXED_STEP_SOLVERS,
     START_TIME,
@@ -24,6 +25,7 @@ from fmugym.pool.spec import (
 __all__ = [
     "Interface",
     "checked",
+    "checked_column",
     "checked_value",
     "input_variable",
     "output_variable",
@@ -46,22 +48,21 @@ class Interface:
 
     Attributes:
         inputs, outputs, monitors: The variables.
-        parameters: The numeric parameters and their values or distributions by name, a start time
+        parameters: The parameters and their values, texts or distributions by name, a start time
             that is drawn last.
-        strings: The parameters that are texts.
         config: The config.
         description: That of the FMU.
+        texts: By name, those that Strings may get besides what ``parameters`` has.
     """
 
     inputs: tuple[Variable, ...]
     outputs: tuple[Variable, ...]
     monitors: tuple[Variable, ...]
     parameters: Mapping[str, Any]
-    strings: tuple[tuple[Variable, str], ...]
     config: EnvConfig
     description: ModelDescription
-
     limits: Mapping[str, tuple[float, float]]
+    texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -79,31 +80,47 @@ class Interface:
             )
         return step
 
-    def parameter(self, name: str) -> Variable:
+    def parameter(self, name: str, value: Any) -> Variable:
         """The variable of one of the parameters, to which a start time belongs if it is drawn.
+
+        Args:
+            name: Its name.
+            value: What it starts with, or is drawn from; a String knows these texts then.
 
         Raises:
             ConfigError: If the FMU has no variable of this name.
         """
         if name == "start_time" and self.config.draws_start_time:
             return START_TIME
-        return self.description.variable(name)
+        variable = self.description.variable(name)
+        if variable.kind != "string":
+            return variable
+        return with_texts(variable, (*_texts_in(variable, value), *self.texts.get(name, ())))
+
+    def with_parameter(self, name: str, values: npt.NDArray[Any], index: int) -> Interface:
+        """The same with another value of a parameter, whose values in N environments differ.
+
+        Args:
+            name: A parameter.
+            values: Checked values: numbers, or the texts of a String, shape (N,).
+            index: Which of them is the value.
+        """
+        own = values[index : index + 1].tolist()[0]
+        parameters = {**self.parameters, name: own}
+        if values.dtype != object:
+            return replace(self, parameters=parameters)
+        return replace(self, parameters=parameters, texts={**self.texts, name: tuple(values)})
 
     def start_values(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Check the parameters of episodes, by the names of scalars and elements.
 
         Raises:
-            ConfigError: If a name is unknown, or its variable cannot start with the value, or is a
-                String.
+            ConfigError: If a name is unknown, or its variable cannot start with the value.
         """
         own = {n: v for n, v in given.items() if n == "start_time" and self.config.draws_start_time}
         values = {name: checked(START_TIME, value) for name, value in own.items()}
         rest = {name: value for name, value in given.items() if name not in own}
         for variable, value in start_values(self.description, rest):
-            if not variable.numeric:
-                raise ConfigError(
-                    f"{variable.name!r} is a String: it can be set in the config only"
-                )
             values[variable.name] = value
         return values
 
@@ -143,7 +160,6 @@ class Interface:
             stop_time=config.stop_time,
             tolerance=description.tolerance if config.tolerance is None else config.tolerance,
             warm_up_steps=self._warm_up_steps(),
-            strings=self.strings,
             fault_retries=config.fault_retries,
             leak_limit=config.leak_limit,
             input_limits=tuple(map(self._limits, self.inputs)),
@@ -242,8 +258,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
         inputs=inputs,
         outputs=outputs,
         monitors=monitors,
-        parameters={v.name: value for v, value in given if v.numeric} | drawn,
-        strings=tuple((v, value) for v, value in given if not v.numeric),
+        parameters={v.name: value for v, value in given} | drawn,
         config=config,
         description=description,
         limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
@@ -311,7 +326,9 @@ def _check_inputs_are_whole(inputs: Sequence[Variable], started: Sequence[Variab
     arrays = {variable.array for variable in inputs}
     for variable in started:
         array = variable.array
-        if array is not None and array in arrays and variable.name not in names:
+        if array is None or variable.is_apart:
+            continue
+        if array in arrays and variable.name not in names:
             raise ConfigError(
                 f"{variable.name!r} cannot be given a start value while other elements of "
                 f"{array.name!r} are inputs; let all of {array.name!r} be inputs"
@@ -336,7 +353,7 @@ def start_values(
         scalars = description.scalars(name)
         for variable, own in zip(scalars, spread(name, scalars, value), strict=True):
             _check_start(variable, own)
-            pair = variable, (checked(variable, own) if variable.numeric else str.__str__(own))
+            pair = variable, checked(variable, own)
             found.setdefault(variable.name, pair)
             if variable.name == name:
                 elements[name] = pair
@@ -388,14 +405,8 @@ def spread(name: str, scalars: Sequence[Variable], value: Any) -> list[Any]:
     is_array = len(scalars) != 1 or (array is not None and array.name == name)
     if not is_array:
         return [value]
-    shape, parts = flattened(value)
-    if shape == ():
-        return parts * len(scalars)
-    expected = (len(scalars),) if array is None else array.shape
-    if shape not in {expected, (len(scalars),)}:
-        found = "lists of different lengths" if shape is None else f"the shape {shape}"
-        raise ConfigError(f"{name!r} is an array of shape {expected}, got {found}: {shown(value)}")
-    return [as_distribution(repr(name), part) for part in parts]
+    shape = (len(scalars),) if array is None else array.shape
+    return [as_distribution(repr(name), part) for part in parts_of_array(name, shape, value)]
 
 
 def _interval(frequency: float | None) -> float:
@@ -505,9 +516,27 @@ def _check_start(variable: Variable, value: Any) -> None:
             f"with initial={variable.initial!r}"
         )
     if variable.kind == "string" and not variable.shape and variable.array is None:
-        _require_text(name, value)
+        for text in _texts_in(variable, value):
+            _require_text(name, text)
     else:
         _require_numeric(variable, "given a start value")
+
+
+def _texts_in(variable: Variable, value: Any) -> Sequence[str]:
+    """The texts that a String may get: the given one, or those of a distribution.
+
+    Raises:
+        ConfigError: If the distribution does not tell them.
+    """
+    if not is_distribution(value):
+        return (value,)
+    texts = getattr(value, "values", None)
+    if not isinstance(texts, Sequence) or isinstance(texts, str) or not texts:
+        raise ConfigError(
+            f"{variable.name!r} is a String, which is drawn from a Choice of texts, or from an "
+            f"object with a list of its texts as 'values', got {shown(value)}"
+        )
+    return texts
 
 
 def _require_text(name: str, value: Any) -> None:
@@ -522,12 +551,16 @@ def _require_text(name: str, value: Any) -> None:
 
 
 def checked(variable: Variable, value: Any) -> Any:
-    """Check a start value of a numeric variable; distributions are checked when they are drawn."""
-    return value if is_distribution(value) else checked_value(variable, value)
+    """Check a start value; distributions are checked when they are drawn."""
+    if is_distribution(value):
+        return value
+    return str.__str__(value) if variable.kind == "string" else checked_value(variable, value)
 
 
 def checked_value(variable: Variable, value: Any) -> float:
-    """Convert a value for a numeric variable, without loss.
+    """Convert a value for a variable to a number, without loss.
+
+    Of a String, this is the number of one of the texts that the variable knows.
 
     Raises:
         ConfigError: If the value is not finite, not of the variable's kind, or outside its type's
@@ -536,6 +569,8 @@ def checked_value(variable: Variable, value: Any) -> float:
     if isinstance(value, str) and variable.items:
         return _item_value(variable, str.__str__(value))
     number = check_number(repr(variable.name), value)
+    if variable.kind == "string" and number not in dict(variable.items).values():
+        raise ConfigError(f"{variable.name!r} is a String, got {shown(value)}")
     if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
         raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {number}")
     if variable.kind == "boolean" and number not in {0.0, 1.0}:
@@ -544,6 +579,22 @@ def checked_value(variable: Variable, value: Any) -> float:
         whole = integer_of(value)  # which no float has rounded
         _check_integer(variable, number if whole is None else whole)
     return number
+
+
+def checked_column(variable: Variable, values: Sequence[Any]) -> npt.NDArray[Any]:
+    """Check the values of a parameter in N environments.
+
+    Returns:
+        Numbers, or the texts of a String as objects, shape (N,).
+
+    Raises:
+        ConfigError: If the variable cannot start with one of them.
+    """
+    if variable.kind != "string":
+        return np.array([checked_value(variable, value) for value in values])
+    for value in values:
+        _require_text(variable.name, value)
+    return np.array([str.__str__(value) for value in values], object)
 
 
 def _item_value(variable: Variable, name: str) -> float:

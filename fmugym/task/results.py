@@ -101,7 +101,9 @@ def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
         does not check bounds.
     """
     if isinstance(space, spaces.Dict):
-        return _of_dict({name: finiteness_of(inner) for name, inner in space.spaces.items()})
+        checked = _of_dict({name: finiteness_of(inner) for name, inner in space.spaces.items()})
+        are_short = all(map(_is_short, space.spaces.values()))
+        return _of_short_arrays(space, checked) if are_short else checked
     if isinstance(space, spaces.Tuple):
         return _of_tuple([finiteness_of(inner) for inner in space.spaces])
     if isinstance(space, spaces.Box) and space.dtype.kind == "f":
@@ -111,9 +113,15 @@ def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
     return _of_others(space)
 
 
+def _is_short(space: spaces.Space[Any]) -> bool:
+    if not isinstance(space, spaces.Box) or space.dtype.kind != "f":
+        return False
+    return len(space.shape) == 1 and space.shape[0] <= _FEW
+
+
 def _of_floats(space: spaces.Box) -> Finiteness:
     shape, dtype = space.shape, space.dtype
-    is_short = len(shape) == 1 and shape[0] <= _FEW
+    is_short = _is_short(space)
 
     def is_finite(observation: Any) -> bool:
         if type(observation) is not np.ndarray or observation.dtype is not dtype:
@@ -150,6 +158,25 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
                 f"{', '.join(map(repr, parts))}"
             )
         return all(check(observation[name]) for name, check in parts.items())
+
+    return is_finite
+
+
+def _of_short_arrays(space: spaces.Dict, checked: Finiteness) -> Finiteness:
+    """Check all arrays of a dict at once; what is not as usual is left to the other function."""
+    parts = tuple((name, part.dtype, part.shape) for name, part in space.spaces.items())
+
+    def is_finite(observation: Any) -> bool:
+        if type(observation) is not dict or len(observation) != len(parts):
+            return checked(observation)
+        numbers: list[float] = []
+        for name, dtype, shape in parts:
+            array: Any = observation.get(name)
+            is_array = type(array) is np.ndarray
+            if not is_array or array.dtype is not dtype or array.shape != shape:
+                return checked(observation)
+            numbers += array.tolist()
+        return isfinite(hypot(*numbers)) or checked(observation)
 
     return is_finite
 

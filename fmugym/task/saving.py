@@ -96,6 +96,8 @@ def native_value(column: Any, place: int) -> Any:
     value = column[place]
     if isinstance(column, list):
         return copy.deepcopy(value)
+    if column.dtype == object:
+        return value
     if isinstance(value, np.ndarray):
         return value.copy()
     return value.item() if value.dtype.kind == "f" else value

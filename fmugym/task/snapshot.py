@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-from fmugym.trial.trial import Candidate, content_of
+from fmugym.trial.candidate import Candidate, content_of
 
 if TYPE_CHECKING:
     from fmugym.task.construction import Constructed
@@ -216,6 +216,8 @@ def _content(column: Any) -> Any:
     """What two equal columns have in common, whatever the type of their numbers is."""
     if isinstance(column, dict):
         return {name: _content(part) for name, part in column.items()}
+    if isinstance(column, np.ndarray) and column.dtype == object:
+        column = column.tolist()
     try:
         array = np.asarray(column)
     except ValueError:  # arrays of different shapes

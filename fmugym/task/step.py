@@ -6,7 +6,6 @@ return: numbers, arrays or symbols. They share this order.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from fmugym.task.results import as_flag, as_reward
@@ -14,7 +13,7 @@ from fmugym.task.results import as_flag, as_reward
 if TYPE_CHECKING:
     from fmugym.task.hooks import Hooks
 
-__all__ = ["ORDER", "Form", "Numbers", "conclude"]
+__all__ = ["NUMBERS", "ORDER", "Form", "Numbers", "conclude"]
 
 ORDER: Final = (
     "_get_inputs",
@@ -41,7 +40,7 @@ class Form(Protocol):
     flag_type: type | None
     reward_type: type | None
 
-    def update(self) -> None:
+    def update(self, env: Hooks) -> None:
         """Call ``_update``."""
 
     def flags(self, hook: str, value: Any) -> Any:
@@ -54,12 +53,13 @@ class Form(Protocol):
 class Numbers:
     """The ``Form`` of a single environment."""
 
-    __slots__ = ("flag_type", "reward_type", "update")
+    flag_type: type | None = bool
+    reward_type: type | None = float
 
-    def __init__(self, env: Hooks) -> None:
-        self.flag_type: type | None = bool
-        self.reward_type: type | None = float
-        self.update: Callable[[], None] = env._update
+    @staticmethod
+    def update(env: Hooks) -> None:
+        """See ``Form.update``."""
+        env._update()
 
     @staticmethod
     def flags(hook: str, value: Any) -> bool:
@@ -70,6 +70,10 @@ class Numbers:
     def rewards(value: Any) -> float:
         """See ``Form.rewards``."""
         return as_reward(value)
+
+
+NUMBERS: Final = Numbers()
+"""All single environments share it, so that it stays in the processor's caches."""
 
 
 def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) -> tuple[Any, ...]:
@@ -87,7 +91,7 @@ def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) 
     """
     own = env._own
     if own.update:
-        form.update()
+        form.update(env)
     done = env._is_done()
     if type(done) is not form.flag_type:
         done = form.flags("_is_done", done)

@@ -8,9 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.archive.texts import texts_of
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["EpisodeVariables", "LateDict", "NamedValues", "ParameterValues"]
+__all__ = ["EpisodeVariables", "LateDict", "NamedValues", "ParameterValues", "ShownParameters"]
 
 
 def array_places(names: Iterable[str]) -> dict[str, list[int]]:
@@ -49,6 +50,11 @@ class NamedValues(Mapping[str, Any]):
         self._index = {name: index for index, name in enumerate(names)}
         self._get_values = get_values
         self._found_arrays: dict[str, list[int]] | None = None
+
+    def share_names(self, other: NamedValues) -> None:
+        """Look the names up in the table of another mapping, if it has the same ones."""
+        if list(self._index) == list(other._index):
+            self._index = other._index
 
     @property
     def _arrays(self) -> dict[str, list[int]]:
@@ -109,6 +115,28 @@ class ParameterValues(dict[str, Any]):
     def copy(self) -> ParameterValues:
         """A copy of the same kind."""
         return ParameterValues(self)
+
+
+class ShownParameters(Mapping[str, Any]):
+    """The parameters of N environments as hooks read them: Strings as arrays of texts.
+
+    Args:
+        rows: A row of shape (N,) for each parameter; of a String it has the numbers of the texts.
+        strings: The names of the Strings.
+    """
+
+    def __init__(self, rows: ParameterValues, strings: frozenset[str]) -> None:
+        self._rows, self._strings = rows, strings
+
+    def __getitem__(self, name: str) -> Any:
+        row = self._rows[name]
+        return texts_of(row) if name in self._strings else row
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
 
 
 class EpisodeVariables(dict[str, Any]):

@@ -27,7 +27,7 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.task.waiting import STEPS_BEFORE
-from fmugym.trial.trial import state_files
+from fmugym.trial.known import state_files
 
 __all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
 

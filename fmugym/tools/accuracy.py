@@ -22,6 +22,7 @@ from fmugym.errors import FMUGymError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
+from fmugym.task.interface import checked_value
 from fmugym.task.opening import PoolOpening
 
 __all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
@@ -80,7 +81,8 @@ class Replay:
         env.action_space.seed(0)
         env.reset(seed=0)
         plan, pool = env._plan, env._open_pool("a repetition")
-        starts = [float(env.parameters[name]) for name in plan.parameter_names]
+        pairs = zip(plan.model_variables, plan.parameter_names, strict=True)
+        starts = [checked_value(variable, env.parameters[name]) for variable, name in pairs]
         inputs: list[Any] = []
         fails = False
         while len(inputs) < _STEPS:

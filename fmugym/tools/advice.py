@@ -18,7 +18,7 @@ from fmugym.linearization import linearize
 from fmugym.pool.spec import FIXED_STEP_SOLVERS
 from fmugym.tools.accuracy import TOLERANCE, Course, Replay, error_of, substeps_of
 from fmugym.tools.overview import plain
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 
 __all__ = ["Advice", "Doubt", "advise", "lines_of"]
 

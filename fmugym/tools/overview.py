@@ -16,7 +16,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.archive.packages import missing_tool, source_of
 from fmugym.errors import FMULoadError, printable
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "overview", "plain", "start_value", "tables"]
 
@@ -89,6 +89,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "deterministic": verdict.deterministic,
         "resets": {str(method): str(grade) for method, grade in verdict.resets.items()},
         "reset_method": str(verdict.reset_method) if verdict.resets else None,
+        "component_resets": verdict.components_of(getattr(fmu, "plan", None)),
         "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
         "isolate": verdict.isolate,
         "cannot_be_read_before_a_step": verdict.blind_start,
@@ -234,6 +235,9 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
     parts = [grades] if grades else []
     if trial["reset_method"]:
         parts.append(f"episodes begin by {trial['reset_method']!r}")
+    if trial["component_resets"]:
+        own = trial["component_resets"].items()
+        parts.append("its components begin " + ", ".join(f"{name} by {m!r}" for name, m in own))
     if not trial["deterministic"]:
         parts.append("fresh instances differ")
     if trial["several_instances"]:

@@ -20,7 +20,7 @@ from fmugym.errors import FMUGymError
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, advise, lines_of
 from fmugym.tools.overview import plain
-from fmugym.trial.trial import known_verdict
+from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["Finding", "Report", "validate"]

@@ -28,10 +28,10 @@ from fmugym.pool.pacing import Pacer
 from fmugym.pool.patience import licence_errors, require_licence
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.spec import PoolSpec
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Starts
-from fmugym.trial.trial import Candidate
 
 __all__ = ["default_spec", "disturb_in_threads", "disturb_in_turn"]
 

@@ -31,13 +31,8 @@ from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
-from fmugym.trial.neighbours import disturb_in_turn
-from fmugym.trial.rehearsal import Starts
-from fmugym.trial.repetition import Repetition
-from fmugym.trial.resuming import method_that_works
-from fmugym.trial.trial import (
-    Candidate,
-    examine,
+from fmugym.trial.candidate import Candidate
+from fmugym.trial.known import (
     is_known_to_harm,
     known_resuming,
     locks_of,
@@ -46,6 +41,11 @@ from fmugym.trial.trial import (
     revise,
     state_files,
 )
+from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.rehearsal import Starts
+from fmugym.trial.repetition import Repetition
+from fmugym.trial.resuming import method_that_works
+from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 from fmugym.wine.prefix import Wine
 
@@ -183,6 +183,7 @@ def _open(
     spec = replace(
         spec,
         reset_method=plan.method,
+        component_resets=plan.component_resets,
         one_initialization=plan.one_initialization,
         state_files=plan.state_files,
     )
@@ -260,7 +261,7 @@ def _rehearse(
     if candidate.exempt or not verdict.deterministic or not verdict.resets or always_fresh:
         return
     tried = _tried(spec)
-    spec = replace(spec, reset_method=plan.method)
+    spec = replace(spec, reset_method=plan.method, component_resets=plan.component_resets)
 
     def keep(found: Verdict) -> None:
         revise(candidate, tried, starts, found)
@@ -325,6 +326,7 @@ class _Plan:
     private_libraries: bool | None = None
     isolation: str | None = None
     workers: int | None = None
+    component_resets: tuple[ResetMethod, ...] = ()
     one_initialization: bool = False
     state_files: str = ""
     own_files: bool = False
@@ -356,7 +358,8 @@ class _Plan:
         """Decide what the caller has left open, and log every unusual choice."""
         plan = self
         if plan.reset_method is None:
-            plan = replace(plan, reset_method=verdict.reset_method)
+            method, components = verdict.reset_method, verdict.components
+            plan = replace(plan, reset_method=method, component_resets=components)
             _tell_of_resets(fmu, verdict, log)
         if plan.private_libraries is None and num_instances > 1 and not plan.has_own_workers:
             if _is_alone(fmu):
@@ -424,12 +427,14 @@ class _Plan:
     def _with_means_of_reset(self, num_instances: int) -> _Plan:
         """Provide the private libraries or the processes that the reset method needs."""
         method = self.method
-        if method is ResetMethod.LIBRARY and (self.isolation == "process" or not self.native):
+        reloads = ResetMethod.LIBRARY in (method, *self.component_resets)
+        if reloads and (self.isolation == "process" or not self.native):
             method = ResetMethod.PROCESS
-        if method is ResetMethod.LIBRARY:
+        elif reloads:
             return replace(self, private_libraries=True)
         if method is ResetMethod.PROCESS:
-            return replace(self, reset_method=method, isolation="process", workers=num_instances)
+            plan = replace(self, reset_method=method, component_resets=())
+            return replace(plan, isolation="process", workers=num_instances)
         return replace(self, reset_method=method)
 
 
@@ -467,6 +472,8 @@ def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
         )
     elif verdict.resets:
         log.info("%s: episodes begin by the method %r", fmu.path.name, str(verdict.reset_method))
+    for component, method in verdict.components_of(Candidate.of(fmu).plan).items():
+        log.info("%s: component %r begins by the method %r", fmu.path.name, component, method)
 
 
 def _tell_of_reading(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:

@@ -23,15 +23,18 @@ from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.pools import trial_pool
-from fmugym.trial.trial import Candidate
 from fmugym.trial.verdict import Grade
 
 __all__ = ["Rehearsal", "Sample", "Starts", "difference", "tolerance_of"]
 
 _SHORT: Final = 3
 """The steps of a short episode."""
+
+_RESTORED: Final = 2
+"""The number of the first episode that begins with a restored state."""
 
 _LONGEST: Final = 400
 """The most steps of a long episode."""
@@ -201,15 +204,10 @@ class Rehearsal:
         finally:
             pool.close()
 
-    def _open(self, method: ResetMethod) -> AttendedPool:
+    def _open(self, method: ResetMethod, components: tuple[ResetMethod, ...] = ()) -> AttendedPool:
         log = logging.getLogger(__name__)
-        return trial_pool(
-            self._candidate.open(),
-            replace(self._spec, reset_method=method),
-            1,
-            log,
-            private_libraries=method is ResetMethod.LIBRARY,
-        )
+        spec = replace(self._spec, reset_method=method, component_resets=components)
+        return trial_pool(self._candidate.open(), spec, 1, log, private_libraries=spec.reloads)
 
     def _play(self, pool: Pool, start: int, steps: int, *, measured: bool = False) -> _Run:
         """Play one episode; a measured one determines how many steps a long episode has."""
@@ -232,23 +230,25 @@ class Rehearsal:
         status = int(statuses[0])
         return _Run(np.array(rows), status, pool.failure(0) if status > Status.WARNING else "")
 
-    def grade(self, method: ResetMethod) -> Grade:
+    def grade(self, method: ResetMethod, components: tuple[ResetMethod, ...] = ()) -> Grade:
         """Play several episodes with one instance and compare each with a fresh one.
 
         Args:
             method: How the episodes begin.
+            components: How each component of a system begins them; empty for ``method``.
 
         Returns:
             The worst grade of all episodes.
         """
         try:
-            pool = self._open(method)
+            pool = self._open(method, components)
         except LicenceError:
             raise
         except FMUGymError:
             return Grade.FAILS
         try:
-            return self._worst_grade(pool)
+            is_system = self._candidate.plan is not None
+            return self._worst_grade(pool, restores=is_system and method is ResetMethod.RESTORE)
         finally:
             pool.close()
 
@@ -285,15 +285,28 @@ class Rehearsal:
         finally:
             pool.close()
 
-    def _worst_grade(self, pool: Pool) -> Grade:
+    def _worst_grade(self, pool: AttendedPool, *, restores: bool = False) -> Grade:
+        """Grade episodes.
+
+        Args:
+            pool: Plays them.
+            restores: Whether it counts as wrong that the pool gives restores up. Of a system, the
+                components that are not to blame can be restored all the same; of a single FMU, the
+                initialization that takes the place of a restore is as good as any.
+        """
         worst = Grade.BITWISE
-        for start, steps in self._episodes():
+        for number, (start, steps) in enumerate(self._episodes()):
             run = self._play(pool, start, steps)
+            if restores and number == _RESTORED and self._has_given_up(pool):
+                return Grade.WRONG
             grade = self._compare(run, self._references[start].cut(steps))
             if grade in (Grade.WRONG, Grade.FAILS):
                 return grade
             worst = Grade.TOLERANCE if Grade.TOLERANCE in (grade, worst) else worst
         return worst
+
+    def _has_given_up(self, pool: AttendedPool) -> bool:
+        return not pool.knows_start(0, self._starts.variables, self._starts.column(0)[:, 0])
 
     def _episodes(self) -> Sequence[tuple[int, int]]:
         """The start values and numbers of steps; each kind follows a short and a long episode.

@@ -22,8 +22,8 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.tape import Tape
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.rehearsal import difference, tolerance_of
-from fmugym.trial.trial import Candidate
 from fmugym.trial.verdict import Grade, Verdict
 
 __all__ = ["Repetition"]
@@ -106,7 +106,7 @@ class Repetition:
             return self._play_now(tape)
 
     def _play_now(self, tape: Tape) -> _Run:
-        spec = replace(self._spec, reset_method=ResetMethod.RESET, leak_limit=None)
+        spec = replace(self._spec.beginning_by(ResetMethod.RESET), leak_limit=None)
         pool = ProcessPool(
             self._candidate.open(),
             spec,
@@ -160,25 +160,31 @@ class Repetition:
 
     def _go_down(self, what: str, begin_by: Callable[[ResetMethod], bool]) -> bool:
         """Take the next reset method; returns whether this pool can do so."""
-        used = self._spec.reset_method
-        bad = (Grade.WRONG, Grade.FAILS)
-        lower = [m for m in list(ResetMethod) if self._verdict.resets.get(m) not in bad]
-        lower = [m for m in lower if list(ResetMethod).index(m) > list(ResetMethod).index(used)]
-        method = lower[0] if lower else ResetMethod.PROCESS
+        used, own = self._spec.reset_method, self._spec.component_resets
+        method = max(used, ResetMethod.INSTANCE, key=_rank) if own else self._next()
         now = begin_by(method)
-        name = self._candidate.path.name
+        how = f"methods of its components {', '.join(own)}" if own else f"method {str(used)!r}"
         self._log.warning(
-            "%s does not begin anew by the method %r: %s. %s begin by the method %r",
-            *(name, str(used), what),
+            "%s does not begin anew by the %s: %s. %s begin by the method %r",
+            *(self._candidate.path.name, how, what),
             *("Episodes now" if now else "The episodes of later environments", str(method)),
         )
         resets = dict(self._verdict.resets) | {used: Grade.WRONG, method: Grade.BITWISE}
-        reason = f"in training, with the method {str(used)!r}, {what}"
-        reasons = (*self._verdict.reasons, reason)
-        self._verdict = replace(self._verdict, resets=resets, reasons=reasons)
-        self._spec = replace(self._spec, reset_method=method)
+        reasons = (*self._verdict.reasons, f"in training, with the {how}, {what}")
+        self._verdict = replace(self._verdict, resets=resets, components=(), reasons=reasons)
+        self._spec = self._spec.beginning_by(method)
         self._revise(self._verdict)
         return now
+
+    def _next(self) -> ResetMethod:
+        """The next method after the one that is used."""
+        bad, used = (Grade.WRONG, Grade.FAILS), self._spec.reset_method
+        lower = [m for m in ResetMethod if self._verdict.resets.get(m) not in bad]
+        return next((m for m in lower if _rank(m) > _rank(used)), ResetMethod.PROCESS)
+
+
+def _rank(method: ResetMethod) -> int:
+    return list(ResetMethod).index(method)
 
 
 def _played(pool: Pool, tape: Tape) -> _Run:

@@ -22,10 +22,12 @@ from fmugym.pool.patience import require_licence
 from fmugym.pool.saving import SavingPool
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
+from fmugym.trial.attempt import Request, run
+from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs
+from fmugym.trial.known import known_resuming, note_resuming
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Starts
-from fmugym.trial.trial import Candidate, Request, known_resuming, note_resuming, run
 from fmugym.trial.verdict import Grade
 
 __all__ = ["Halfway", "make_halfway", "method_that_works", "try_halfway"]

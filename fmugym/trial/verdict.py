@@ -9,10 +9,16 @@ from enum import StrEnum
 from typing import Any, Final
 
 from fmugym.pool.spec import ResetMethod
+from fmugym.systems.plan import SystemPlan
 
-__all__ = ["Grade", "Neighbours", "Verdict"]
+__all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 4
+_FORMAT: Final = 5
+
+FRUGAL: Final = (
+    "its initializations are slow or need licences, so no episode returned to earlier start values"
+)
+"""What a trial leaves out to need fewer initializations."""
 
 
 class Grade(StrEnum):
@@ -52,6 +58,7 @@ class Verdict:
         complete: Whether an instance could be made, initialized and stepped.
         deterministic: Whether two fresh instances give the same outputs.
         resets: The grade of each reset method that was tried.
+        components: How each component of a system begins an episode; empty if all do alike.
         neighbours: What several instances need; None if only one was tried.
         isolate: Whether a lone instance has harmed its process.
         states: The grade of an initial state in a second process; None if it was not tried.
@@ -65,6 +72,7 @@ class Verdict:
     complete: bool = False
     deterministic: bool = True
     resets: Mapping[ResetMethod, Grade] = field(default_factory=dict)
+    components: tuple[ResetMethod, ...] = ()
     neighbours: Neighbours | None = None
     isolate: bool = False
     states: Grade | None = None
@@ -83,6 +91,13 @@ class Verdict:
                     return method
         return ResetMethod.PROCESS if self.resets else ResetMethod.RESET
 
+    def components_of(self, plan: SystemPlan | None) -> dict[str, str]:
+        """The methods of a system's components by their names; empty if all begin alike."""
+        if plan is None or not self.components:
+            return {}
+        pairs = zip(plan.components, self.components, strict=True)
+        return {component.name: str(method) for component, method in pairs}
+
     def to_text(self) -> str:
         """Write the verdict as JSON."""
         return json.dumps(
@@ -91,6 +106,7 @@ class Verdict:
                 "complete": self.complete,
                 "deterministic": self.deterministic,
                 "resets": {str(method): str(grade) for method, grade in self.resets.items()},
+                "components": [str(method) for method in self.components],
                 "neighbours": None if self.neighbours is None else str(self.neighbours),
                 "isolate": self.isolate,
                 "states": None if self.states is None else str(self.states),
@@ -126,6 +142,7 @@ class Verdict:
             complete=flags[0],
             deterministic=flags[1],
             resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
+            components=tuple(map(ResetMethod, data["components"])),
             neighbours=None if given is None else Neighbours(given),
             isolate=flags[2],
             states=None if data["states"] is None else Grade(data["states"]),

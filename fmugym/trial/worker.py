@@ -33,13 +33,14 @@ from fmugym.pool.process.output import print_line_by_line
 from fmugym.pool.process.windows import ProgramCoding
 from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.attempt import Request, Stage, patience
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
 from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
-from fmugym.trial.trial import FRUGAL, Request, Stage, patience
-from fmugym.trial.verdict import Grade, Neighbours, Verdict
+from fmugym.trial.rungs import find_rungs, offers_of
+from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 _NO_DIALOGUES: Final = 0x0003
 """``SEM_FAILCRITICALERRORS | SEM_NOGPFAULTERRORBOX``: faults on Windows open no dialog."""
@@ -223,9 +224,33 @@ def _try_resets(request: Request, notes: Notes) -> Verdict:
         notes.answer(resets=grades, deterministic=rehearsal.deterministic)
         if grades[method] == Grade.BITWISE:
             break
+    components = _try_components(request, rehearsal, grades, notes)
     if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
         _make_sample(rehearsal, request, notes)
-    return Verdict(resets=grades, blind_start=notes.found("blind_start"))
+    blind = notes.found("blind_start")
+    return Verdict(resets=grades, components=components, blind_start=blind)
+
+
+def _try_components(
+    request: Request, rehearsal: Rehearsal, grades: dict[ResetMethod, Grade], notes: Notes
+) -> tuple[ResetMethod, ...]:
+    """Find a method for each component of a system that does not begin anew by restores."""
+    base = Verdict(resets=grades).reset_method
+    description = request.candidate.open().description
+    tried = grades.get(base) == Grade.BITWISE and base is not ResetMethod.RESTORE
+    if not tried or rehearsal.is_frugal or not description.components:
+        return ()
+
+    def grade(components: tuple[ResetMethod, ...]) -> Grade:
+        stage = f"the rehearsal of resets by component ({', '.join(components)})"
+        notes.stage(stage)
+        return Grade.FAILS if stage in request.skip else rehearsal.grade(base, components)
+
+    reloads = _can_copy_libraries(request.candidate.open())
+    offers = [offers_of(part, reloads=reloads) for part in description.components]
+    found = find_rungs(offers, base, grade)
+    notes.answer(components=found)
+    return found
 
 
 def _rehearsal(request: Request, notes: Notes) -> Rehearsal:
@@ -312,7 +337,12 @@ def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
         alone: The verdict on a lone instance.
     """
     method, blind = alone.reset_method, alone.blind_start
-    spec = replace(request.spec, reset_method=method, blind_start=blind)
+    spec = replace(
+        request.spec,
+        reset_method=method,
+        component_resets=alone.components,
+        blind_start=blind,
+    )
     request = replace(request, spec=spec)
     notes.answer(instances=2)
     notes.answer(neighbours=_need_of_several(request, notes))
@@ -354,7 +384,7 @@ def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bo
     notes.stage(stage)
     if stage in request.skip:
         return True
-    reloads = private_libraries and request.spec.reset_method is ResetMethod.LIBRARY
+    reloads = private_libraries and request.spec.reloads
     spec = request.spec if reloads else _without_reloading(request.spec)
     try:
         return disturb_in_turn(
@@ -368,8 +398,8 @@ def _disturbed(request: Request, notes: Notes, *, private_libraries: bool) -> bo
 
 def _without_reloading(spec: PoolSpec) -> PoolSpec:
     """Instances that share a library, or this process, can only be made anew themselves."""
-    reloads = spec.reset_method in (ResetMethod.LIBRARY, ResetMethod.PROCESS)
-    return replace(spec, reset_method=ResetMethod.INSTANCE) if reloads else spec
+    reloads = spec.reloads or spec.reset_method is ResetMethod.PROCESS
+    return spec.beginning_by(ResetMethod.INSTANCE) if reloads else spec
 
 
 class _Echo(logging.Logger):

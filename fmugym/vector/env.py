@@ -18,9 +18,9 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.fmi.status import Status
-from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.base import MaskArray, Pool
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.task.interface import checked_value, spread
+from fmugym.task.interface import checked_column, spread
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.vector.arguments import (
@@ -604,8 +604,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._prototype._plan_episode({name: values[0]})  # it refuses what cannot be set
         scalars = self._prototype.fmu.description.scalars(name)
         rows = [spread(name, scalars, value) for value in values]
-        columns: dict[str, FloatArray] = {
-            variable.name: np.array([checked_value(variable, row[place]) for row in rows])
+        columns = {
+            variable.name: checked_column(variable, [row[place] for row in rows])
             for place, variable in enumerate(scalars)
         }
         for scalar, numbers in columns.items():

@@ -40,11 +40,15 @@ def drawn_info(plan: EpisodePlan, values: FloatArray, mask: MaskArray) -> dict[s
 
 
 def _drawn_rows(plan: EpisodePlan, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    drawn = plan.told | plan.named(values)
-    rows = {name: np.zeros((len(mask), *np.shape(row)[1:])) for name, row in drawn.items()}
+    drawn = plan.told | plan.shown(values)
+    rows = {name: _empty(len(mask), row, name in plan.strings) for name, row in drawn.items()}
     for name, row in drawn.items():
         rows[name][mask] = row
     return with_masks(rows, mask)
+
+
+def _empty(count: int, row: Any, is_text: bool) -> npt.NDArray[Any]:
+    return np.full(count, None) if is_text else np.zeros((count, *np.shape(row)[1:]))
 
 
 def final_infos(

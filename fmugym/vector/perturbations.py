@@ -8,7 +8,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray
@@ -101,14 +100,15 @@ class _Perturbation:
         self._count_of_y = env._output_count
         self._start = start
         self._everywhere = np.arange(envs.num_envs)
-        fixed = {
-            name: checked_value(env._interface.parameter(name), column[0])
+        given = {
+            name: column[0]
             for name, column in start.columns_for(envs._scope)["parameters"].items()
-            if column[0] is not None and env._interface.parameter(name).kind != "string"
+            if column[0] is not None and name not in states.values()
         }
-        names = [*(name for name in fixed if name not in states.values()), *states.values()]
-        self._variables: tuple[Variable, ...] = tuple(map(env._interface.parameter, names))
-        self._fixed = np.array([fixed[name] for name in names[: -len(states)]])
+        fixed = [env._interface.parameter(name, value) for name, value in given.items()]
+        pairs = zip(fixed, given.values(), strict=True)
+        self._fixed = np.array([checked_value(variable, value) for variable, value in pairs])
+        self._variables = (*fixed, *map(env.fmu.variable, states.values()))
         self._starts = tuple(states.values())
 
     def differentiate(self, nominal: npt.NDArray[Any], steps: tuple[float, float]) -> Matrices:

@@ -166,7 +166,8 @@ class CompiledWarmUp:
             for name, dtype in tracer.variables.items()
         }
         self._before = {name: rows.copy() for name, rows in self._now.items()}
-        self._parameters = {name: np.zeros(n) for name in env._interface.parameters}
+        numbers = env._interface.parameters.keys() - env.fmu.description.strings
+        self._parameters = {name: np.zeros(n) for name in numbers}
         self._kept, self._state = np.zeros_like(pool.outputs), np.zeros((len(warm_up.starts), n))
         width = int(np.prod(space.shape or ()))
         self._actions = {

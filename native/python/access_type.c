@@ -23,22 +23,25 @@ bool is_access(const PyPool *self, PyObject *object) {
 }
 
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
-    const char *types, *elements, *rest;
-    Py_ssize_t count, size, size_of_rest;
+    const char *bytes[4];
+    Py_ssize_t sizes[4];
+    Block blocks[4];
     int version, manner = CO_SIMULATION_ALONE;
     Listing listing;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "iy#y#y#|i", &version, &types, &count, &elements, &size, &rest,
-                          &size_of_rest, &manner)) {
+    if (!PyArg_ParseTuple(args, "iy#y#y#y#|i", &version, &bytes[0], &sizes[0], &bytes[1],
+                          &sizes[1], &bytes[2], &sizes[2], &bytes[3], &sizes[3], &manner)) {
         return NULL;
+    }
+    for (int i = 0; i < 4; i++) {
+        blocks[i] = (Block){bytes[i], (size_t)sizes[i]};
     }
     const Fmi *fmi = fmi_of(version, manner);
     if (fmi == NULL) {
         return NULL;
     }
-    const char *fault = listing_take(&listing, types, (size_t)count, elements, (size_t)size, rest,
-                                     (size_t)size_of_rest);
+    const char *fault = listing_take(&listing, blocks[0], blocks[1], blocks[2], blocks[3]);
     if (fault != NULL) {
         PyErr_SetString(PyExc_ValueError, fault);
         return NULL;

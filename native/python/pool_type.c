@@ -184,7 +184,6 @@ static void pool_dealloc(PyObject *object) {
     drop_system(self->system);
     free(self->paths);
     free(self->categories);
-    free(self->strings);
     Py_XDECREF(self->playing);
     Py_XDECREF(self->single);
     Py_XDECREF(self->actions[0]);
@@ -197,7 +196,7 @@ static void pool_dealloc(PyObject *object) {
 /* Making a pool. Each argument is a dict of named values. */
 
 typedef struct {
-    PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance, *strings;
+    PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance;
     PyAccess *inputs, *outputs;
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
@@ -247,10 +246,9 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
-    static char *names[] = {"inputs", "outputs", "num_observed", "strings", "sampling", NULL};
-    return parse_group(group, "$O!O!nO!y#:variables", names, access_type, &a->inputs, access_type,
-                       &a->outputs, &a->num_observed, &PyTuple_Type, &a->strings, &a->sampling,
-                       &a->samplings);
+    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", NULL};
+    return parse_group(group, "$O!O!ny#:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings);
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
@@ -357,30 +355,6 @@ static bool take_paths(PyPool *self, PyObject *paths, Py_ssize_t wanted) {
     return count == wanted;
 }
 
-static bool take_string(PyObject *pair, StringValue *string) {
-    if (!PyTuple_Check(pair)) {
-        PyErr_SetString(PyExc_TypeError, "a String must be a tuple of reference and text");
-        return false;
-    }
-    return PyArg_ParseTuple(pair, "Iy", &string->reference, &string->text);
-}
-
-static bool take_strings(PyPool *self, PyObject *strings) {
-    const Py_ssize_t count = PyTuple_Size(strings);
-
-    self->strings = calloc((size_t)count + 1, sizeof *self->strings);
-    if (self->strings == NULL) {
-        PyErr_NoMemory();
-        return false;
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (!take_string(PyTuple_GetItem(strings, i), &self->strings[i])) {
-            return false;
-        }
-    }
-    return true;
-}
-
 static bool take_method(const char *name, Solving *solving) {
     solving->method = method_of(name);
     if (solving->method == NULL) {
@@ -458,6 +432,8 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->restores = s->can_save && a->restores;
     s->rebuilds = a->rebuilds;
     s->reloads = a->reloads;
+    s->renews = self->system != NULL && self->system->renews;
+    s->returns = self->system != NULL && self->system->restores;
     s->one_initialization = a->one_initialization;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
@@ -468,11 +444,13 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->paths = self->paths;
     s->categories = self->categories;
     s->number_of_categories = (size_t)PyTuple_Size(a->categories);
-    s->strings = self->strings;
-    s->number_of_strings = (size_t)PyTuple_Size(a->strings);
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;
+    if (self->system != NULL) {
+        self->system->private_libraries = s->private_libraries;
+        self->system->largest_state = STATES_LIMIT / s->count;
+    }
     s->pace.interval = (uint64_t)(a->pace * 1e9);
     s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
     return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
@@ -537,7 +515,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     self->arguments = copy_of_groups(kwargs);
     if (self->arguments != NULL && parse(self, args, self->arguments, &a) && check_numbers(&a) &&
         check_start_outputs(self, &a) && check_accesses(&a) && take_system(a.system, &self->system) && check_system(self, &a) && take_paths(self, a.paths, number_of_paths(self, &a)) &&
-        take_categories(self, a.categories) && take_strings(self, a.strings) && take_arrays(self, &a) && settle(self, &a) &&
+        take_categories(self, a.categories) && take_arrays(self, &a) && settle(self, &a) &&
         open_pool(self)) {
         return (PyObject *)self;
     }

@@ -44,7 +44,6 @@ typedef struct {
     Py_buffer buffers[BUFFERS];
     const char **paths, **categories;
     System *system;
-    StringValue *strings;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
     PyObject *single;  /* another one */
     PyObject *actions[2]; /* of a single environment, in the last step and in the one before */

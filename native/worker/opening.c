@@ -8,14 +8,14 @@
 #include "worker.h"
 
 bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
-    size_t count, size, size_of_rest;
-    const char *types = read_block(reader, &count);
-    const char *elements = read_block(reader, &size);
-    const char *rest = read_block(reader, &size_of_rest);
+    Block blocks[4];
     Listing listing;
 
+    for (int i = 0; i < 4; i++) {
+        blocks[i].bytes = read_block(reader, &blocks[i].size);
+    }
     return reader->sound &&
-           listing_take(&listing, types, count, elements, size, rest, size_of_rest) == NULL &&
+           listing_take(&listing, blocks[0], blocks[1], blocks[2], blocks[3]) == NULL &&
            access_open(access, fmi, &listing);
 }
 
@@ -193,20 +193,6 @@ static void read_experiment(Reader *reader, Settings *s) {
     s->pace.interval = (uint64_t)(read_number(reader) * 1e9);
 }
 
-static void read_strings(Reader *reader, Settings *s) {
-    const int64_t count = read_integer(reader);
-    StringValue *strings =
-        count < 0 || count > INT32_MAX ? NULL : calloc((size_t)count + 1, sizeof *strings);
-
-    reader->sound = reader->sound && strings != NULL;
-    for (int64_t i = 0; reader->sound && i < count; i++) {
-        strings[i].reference = (uint32_t)read_integer(reader);
-        strings[i].text = read_text(reader);
-    }
-    s->strings = strings;
-    s->number_of_strings = reader->sound ? (size_t)count : 0;
-}
-
 static void read_variables(Worker *w, Reader *reader) {
     Settings *s = &w->settings;
     size_t size;
@@ -216,7 +202,6 @@ static void read_variables(Worker *w, Reader *reader) {
     s->inputs = &w->inputs;
     s->outputs = &w->outputs;
     s->num_observed = (size_t)read_integer(reader);
-    read_strings(reader, s);
     s->sampling = (const unsigned char *)read_block(reader, &size);
     s->sampling = size == 0 ? NULL : s->sampling;
     reader->sound = reader->sound && (size == 0 || size == w->outputs.count) &&

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.texts import text_among
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
@@ -112,10 +113,9 @@ class BackendPool(CountedPool):
         chosen = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask)
         given = [not is_start_time(variable) for variable in variables]  # a real time begins now
         values = values[given]
-        names = [variable.name for variable in variables if not is_start_time(variable)]
-        strings = {variable.name: text for variable, text in self._spec.strings}
+        own = [variable for variable in variables if not is_start_time(variable)]
         starts = {
-            index: dict(zip(names, values[:, index].tolist(), strict=True)) | strings
+            index: _by_name(own, values[:, index].tolist())
             for index in np.flatnonzero(chosen).tolist()
         }
         with self._halted_by_errors():
@@ -300,6 +300,14 @@ def _backends(backend: Any, count: int) -> list[Backend]:
             "their number that returns one"
         )
     return backends
+
+
+def _by_name(variables: Sequence[Variable], values: Sequence[float]) -> dict[str, float | str]:
+    """Start values by name; those of Strings as texts."""
+    return {
+        variable.name: text_among(variable, value) if variable.kind == "string" else value
+        for variable, value in zip(variables, values, strict=True)
+    }
 
 
 def _stop(

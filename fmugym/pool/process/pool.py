@@ -284,12 +284,12 @@ class ProcessPool(SavingPool):
     def begin_by(self, method: ResetMethod) -> bool:
         """See ``Pool.begin_by``; the libraries of workers cannot be loaded anew."""
         if method == ResetMethod.PROCESS and self.workers == self.num_instances:
-            self._spec = replace(self._spec, reset_method=method)
+            self._spec = self._spec.beginning_by(method)
             return True
         if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
             return False
         with self._lock:
-            self._spec = replace(self._spec, reset_method=method)
+            self._spec = self._spec.beginning_by(method)
             for supervisor in self._crew.supervisors:
                 supervisor.begin_by(method)
             self._mistrust_states()

@@ -190,7 +190,7 @@ class Supervisor:
 
     def begin_by(self, method: ResetMethod) -> None:
         """Let the episodes of later processes begin in another way."""
-        spec = replace(self._setup.spec, reset_method=method)
+        spec = self._setup.spec.beginning_by(method)
         self._setup = replace(self._setup, spec=spec)
 
     def note_success(self) -> None:

@@ -213,7 +213,8 @@ class ProgramCoding:
         failure = Failure(
             doing, in_warm_up, status, time, string, said, values if has_values else None
         )
-        return describe_failure(failure, self._setup.spec, self._name(index))
+        setup = self._setup
+        return describe_failure(failure, setup.description, setup.spec, self._name(index))
 
     # The first request, which has no number
 
@@ -320,7 +321,8 @@ class ProgramCoding:
         return record_from(setup.description, setup.spec, starts, steps, reader.rest())
 
     def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
-        variables = start_variables(self._setup.description.variable, record.names)
+        find = self._setup.description.variable
+        variables = start_variables(find, record.names, record.texts)
         writer.integers(index, len(record.inputs))
         writer.access(variables, self._version)
         for values in (record.starts, record.inputs):
@@ -403,8 +405,5 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
 
 
 def _write_variables(writer: _Writer, variables: Mapping[str, Any]) -> None:
-    writer.integers(variables["num_observed"], len(variables["strings"]))
-    for reference, text in variables["strings"]:
-        writer.integers(reference)
-        writer.text(text)
+    writer.integers(variables["num_observed"])
     writer.block(variables["sampling"])

@@ -131,8 +131,13 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def set_parameter(self, name: str, values: FloatArray) -> None:
-        """Give a parameter one value for each environment, from its next episode on."""
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """Give a parameter one value for each environment, from its next episode on.
+
+        Args:
+            name: The parameter.
+            values: Checked values: numbers, or the texts of a String as objects, shape (N,).
+        """
 
     # Snapshots
 

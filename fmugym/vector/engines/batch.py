@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.texts import numbers_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status
@@ -21,10 +22,11 @@ from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
-from fmugym.task.values import ParameterValues
+from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.task.warm_up import WarmUps, grouped
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
@@ -76,14 +78,15 @@ class BatchEngine(Engine):
         self._parameters = ParameterValues(
             zip(plan.parameter_names, self._start_values, strict=True)
         )
-        self.env.parameters = MappingProxyType(self._parameters)
+        strings = self.env.fmu.description.strings
+        shown = ShownParameters(self._parameters, strings) if strings else self._parameters
+        self.env.parameters = MappingProxyType(shown)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         env, before = self.env, self._parameters
-        self._given[name] = values
-        parameters = {**env._interface.parameters, name: values[0]}
-        env._interface = replace(env._interface, parameters=parameters)
+        self._given[name] = numbers_of(values) if values.dtype == object else values
+        env._interface = env._interface.with_parameter(name, values, 0)
         env._plan = env._plan_episode({})
         self._make_parameters(env._plan)
         for known in before.keys() & self._parameters.keys():
@@ -345,7 +348,7 @@ class BatchEngine(Engine):
 
     def columns(self, indices: IndexArray) -> Columns:
         """See ``Engine.columns``."""
-        return columns_of(self.env, self._parameters, indices) | {
+        return columns_of(self.env, self.env.parameters, indices) | {
             "ended": self.ended[indices],
             **dict(zip(("streams", "seeds"), self._streams.taken(indices), strict=True)),
         }
@@ -355,8 +358,10 @@ class BatchEngine(Engine):
         whence = which_of(sources, len(columns["step_count"]))
         where = which_of(indices, self._n)
         place_columns(self.env, columns, whence, where)
+        strings = self.env.fmu.description.strings
         for name, values in (columns["parameters"] | columns["variables"]).items():
-            place_column(self._row(name), values, whence, where)
+            column = numbers_of(values) if name in strings else values
+            place_column(self._row(name), column, whence, where)
         if isinstance(columns["streams"], np.ndarray):
             seeds = np.array(columns["seeds"], object)[whence]
             self._streams.put(indices, columns["streams"][whence], seeds)
@@ -368,8 +373,11 @@ class BatchEngine(Engine):
     def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
         """Whether parameters that are placed are not all those of the plan."""
         plan = self.env._plan
-        known = plan.constant_parameters.items()
-        own = all((np.asarray(columns.get(name, value)) == value).all() for name, value in known)
+        own = all(
+            (np.asarray(columns[name]) == value).all()
+            for name, value in plan.constants_shown.items()
+            if name in columns
+        )
         return not own or not columns.keys() <= set(plan.parameter_names)
 
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
@@ -508,15 +516,15 @@ class BatchEngine(Engine):
         """See ``Form.rewards``."""
         return results.rewards(value, self._n)
 
-    def update(self) -> None:
+    def update(self, env: Hooks) -> None:
         """Call the hook, but keep the variables of environments that did not step.
 
         Values that it assigns are copied, because the next step may overwrite their array.
         """
-        variables = self.env.variables
+        variables = env.variables
         before = {name: self._row(name) for name in variables}
         self._variables_before = {name: row.copy() for name, row in before.items()}
-        self.env._update()
+        env._update()
         for name, row in before.items():
             if variables[name] is not row:
                 variables[name] = results.variable(name, variables[name], self._n)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +15,12 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
+from fmugym.task.snapshot import Columns
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.codec import coded, with_masks
@@ -97,10 +99,6 @@ def _require_playable(env: FMUEnv) -> None:
         raise UntraceableError("the pool is not a native one")
 
 
-_STEPS_UNTIL_KEPT: Final = {"action": 1, "previous_action": 2, "previous_state": 1}
-"""What steps may leave out, and how many steps it takes to have it once it was asked for."""
-
-
 class CompiledEngine(BatchEngine):
     """A ``BatchEngine`` in which the native pool does whole steps, hooks included.
 
@@ -125,8 +123,6 @@ class CompiledEngine(BatchEngine):
         self._actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
         self._rows: dict[str, npt.NDArray[Any]] = {}
         self._before: dict[str, npt.NDArray[Any]] = {}
-        self._is_read = False
-        self._missing: set[str] = set()
         self._prepare(task)
 
     def _prepare(self, task: TracedTask | None) -> None:
@@ -141,10 +137,6 @@ class CompiledEngine(BatchEngine):
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
         self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
-        reads_actions = task.judgement.loads("load_action") or task.loads("load_previous_action")
-        is_typed = not self.env._input_writer.all_real  # then an error may name the action
-        self._keeps_actions = self._is_read or reads_actions or is_typed or bool(task.left)
-        self._keeps_outputs = self._is_read or self._needs_outputs(task)
         in_pass = not self._draws_ahead and self.env._warm_ups is None
         in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
@@ -180,8 +172,7 @@ class CompiledEngine(BatchEngine):
     def _show(self) -> None:
         """Let hooks on arrays read what the pool keeps."""
         env = self.env
-        if self._keeps_actions:
-            env.action, env.previous_action = (np.moveaxis(a, 0, -1) for a in self._actions)
+        env.action, env.previous_action = (np.moveaxis(a, 0, -1) for a in self._actions)
         self._kept[: env._output_count] = env.previous_state
         env.previous_state = self._kept[: env._output_count]
 
@@ -191,9 +182,8 @@ class CompiledEngine(BatchEngine):
         for name, row in self._rows.items():
             row[...] = env.variables[name]
             env.variables[name] = row
-        if self._keeps_actions:
-            for own, theirs in zip(self._actions, (env.action, env.previous_action), strict=True):
-                own[...] = np.moveaxis(theirs, -1, 0)
+        for own, theirs in zip(self._actions, (env.action, env.previous_action), strict=True):
+            own[...] = np.moveaxis(theirs, -1, 0)
         self._show()
 
     def _find(self, row: Row) -> Any:
@@ -232,17 +222,10 @@ class CompiledEngine(BatchEngine):
             "check": check,
             "lowest": low,
             "highest": high,
-            "current": flat[0] if self._keeps_actions else None,
-            "previous": flat[1] if self._keeps_actions else None,
+            "current": flat[0],
+            "previous": flat[1],
             "none": np.array(env._no_action, dtype).reshape(-1),
         }
-
-    @staticmethod
-    def _needs_outputs(task: TracedTask) -> bool:
-        """Whether the outputs before a step are needed after it."""
-        judgement = task.judgement
-        needs = not judgement.is_always_finite or bool(task.left) or bool(task.seen)
-        return needs or judgement.loads("kept")
 
     def _surroundings(self, task: TracedTask) -> dict[str, Any]:
         """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
@@ -253,7 +236,7 @@ class CompiledEngine(BatchEngine):
         constants = plan.constant_variables
         return {
             "kept": self._kept,
-            "keeps_always": self._keeps_outputs,
+            "keeps_always": True,  # methods and snapshots read them, and they cost little
             "copies": tuple(
                 pair for name in flat for pair in zip(flat[name], before[name], strict=True)
             ),
@@ -273,7 +256,7 @@ class CompiledEngine(BatchEngine):
             ),
         }
 
-    def set_parameter(self, name: str, values: FloatArray) -> None:
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         super().set_parameter(name, values)
         self._prepare(self._task)
@@ -366,37 +349,19 @@ class CompiledEngine(BatchEngine):
             env._in_hooks = False
         env.done = (done | self._stopped(self._pool.statuses)) & (env.step_count > 0)
 
-    def read(self, name: str, index: int) -> Any:
-        """See ``Engine.read``.
+    def columns(self, indices: IndexArray) -> Columns:
+        """See ``Engine.columns``."""
+        if self._prepared:
+            self._find_done()
+        return super().columns(indices)
 
-        The pool keeps what no hook reads of the last step once it was asked for.
-
-        Raises:
-            ConfigError: Where it was not kept in the last step.
-        """
-        if self._prepared and name in self._not_kept():
-            self._keep_all()
-        if name in self._missing:
-            steps = int(self.env.step_count[index] - self._asked_at[index])
-            if 0 <= steps < _STEPS_UNTIL_KEPT[name]:
-                raise ConfigError(
-                    f"{name!r} of the last step was not kept, because no hook reads it. It is kept "
-                    "from now on; to have it from the first step, read it once after the reset"
-                )
-        return super().read(name, index)
-
-    def _not_kept(self) -> set[str]:
-        """The attributes that steps leave out."""
-        actions = set() if self._keeps_actions else {"action", "previous_action"}
-        return actions if self._keeps_outputs else actions | {"previous_state"}
-
-    def _keep_all(self) -> None:
-        """Let the pool keep everything from the next step on."""
-        self._asked_at = self.env.step_count.copy()
-        self._missing = self._not_kept() if self._asked_at.any() else set()
-        self._is_read = True
-        self._kept[: self.env._output_count] = self.env.state
-        self._prepare(self._task)
+    def evaluate(
+        self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
+    ) -> FloatArray:
+        """See ``Engine.evaluate``."""
+        if self._prepared:
+            self._find_done()
+        return super().evaluate(function, actions, indices)
 
     def call(
         self,
@@ -690,4 +655,4 @@ def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[
 
 
 def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(plan.named(drawn), mask)
+    return coded(plan.shown(drawn), mask)

@@ -6,26 +6,27 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from itertools import repeat
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import iterate
 
-from fmugym.env import FMUEnv
+from fmugym.env import IN_POOL, FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
+from fmugym.task.values import NamedValues
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.stacking import ArrayStack, make_stack
 
 __all__ = ["PerEnvEngine"]
 
@@ -59,12 +60,12 @@ class PerEnvEngine(Engine):
         self._checks_all = self._together and is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
-        self._space = envs[0].observation_space
-        self._observations: list[Any] = [None] * len(envs)
-        shared = pool.observations
-        is_default = shared.dtype == self._space.dtype and shared.shape[1:] == self._space.shape
-        self._observes = is_default and all(env._pool_observes for env in envs)
-        self._shared: tuple[npt.NDArray[np.float32], list[Any]] = shared.copy(), [None] * len(envs)
+        space, shared = envs[0].observation_space, pool.observations
+        self._stack = stack = make_stack(space, len(envs))
+        is_default = self._together and all(env._pool_observes for env in envs)
+        fits = shared.dtype == space.dtype and shared.shape[1:] == space.shape
+        observes = is_default and fits
+        self._observed_by_pool = stack if isinstance(stack, ArrayStack) and observes else None
 
     def close(self) -> None:
         """See ``Engine.close``."""
@@ -106,11 +107,10 @@ class PerEnvEngine(Engine):
         for index, value in values.items():
             setattr(self._envs[index], name, value)
 
-    def set_parameter(self, name: str, values: FloatArray) -> None:
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
-        for env, value in zip(self._envs, values.tolist(), strict=True):
-            parameters = {**env._interface.parameters, name: value}
-            env._interface = replace(env._interface, parameters=parameters)
+        for index, env in enumerate(self._envs):
+            env._interface = env._interface.with_parameter(name, values, index)
             env._plan = env._plan_episode({})
 
     def reset(
@@ -121,9 +121,10 @@ class PerEnvEngine(Engine):
         self.has_moved = False
         for index in np.flatnonzero(mask).tolist():
             seed = None if seeds is None else seeds[index]
-            self._observations[index], infos[index] = self._reset(index, seed, options)
+            observation, infos[index] = self._reset(index, seed, options)
+            self._stack.put(index, observation)
         self.note_starts(mask)
-        return self._stacked(), gathered(infos, len(self._envs))
+        return self._stack.copied(), gathered(infos, len(self._envs))
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
@@ -144,15 +145,18 @@ class PerEnvEngine(Engine):
     def _results(self, items: Sequence[Any], idle: Sequence[bool]) -> StepResult:
         infos: dict[int, dict[str, Any]] = {}
         rewards, terminated, truncated = [], [], []
-        steps = self._told() if self._together else items
-        for index, (env, action) in enumerate(zip(self._envs, items, strict=True)):
+        told = self._told() if self._together else repeat((0, ()))
+        if self._observed_by_pool is not None:
+            self._observed_by_pool.put_all(self._pool.observations)
+        for index, (env, action, one) in enumerate(zip(self._envs, items, told, strict=False)):
             if idle[index]:
                 observation, info = self._reset(index, None, {})
                 reward, ended, cut_off = 0.0, False, False
             else:
-                result = self._stepped(index, env, action, steps[index])
+                result = self._stepped(index, env, action, *one)
                 observation, reward, ended, cut_off, info = result
-            self._observations[index] = observation
+            if observation is not IN_POOL:
+                self._stack.put(index, observation)
             rewards.append(reward)
             terminated.append(ended)
             truncated.append(cut_off or env.step_count >= self._limit)
@@ -160,40 +164,40 @@ class PerEnvEngine(Engine):
                 infos[index] = info
         ends = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
         self.note_ends(*ends)
-        told = gathered(infos, len(items))
-        return StepResult(self._stacked(), np.array(rewards, np.float64), *ends, told)
+        gained = np.array(rewards, np.float64)
+        return StepResult(self._stack.copied(), gained, *ends, gathered(infos, len(items)))
 
-    def _told(self) -> list[tuple[Any, ...]]:
-        """What the pool tells each environment after a step: status, outputs and observation.
+    def _told(self) -> Iterator[tuple[int, tuple[float, ...]]]:
+        """What the pool tells each environment after a step: the status and the outputs.
 
-        A single call for all takes less time than one for each, and less memory is touched.
+        One call for all takes less time than one for each, and less memory is touched.
         """
-        pool = self._pool
-        count = len(self._envs)
-        shared = pool.observations.copy()
-        rows: list[Any] = list(shared) if self._observes else [None] * count
-        self._shared = shared, rows
-        outputs = map(tuple, pool.outputs.T.tolist())
-        return list(zip(pool.statuses.tolist(), outputs, rows, strict=True))
+        outputs = map(tuple, self._pool.outputs.T.tolist())
+        return zip(self._pool.statuses.tolist(), outputs, strict=True)
 
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
+        env = self._envs[index]
+        is_first = not env._was_reset
         try:
-            result = self._envs[index].reset(seed=seed, options=dict(options))
+            result = env.reset(seed=seed, options=dict(options))
             self.has_moved = True
+            if is_first:  # a reset prepares the hooks
+                _share_constants(self._envs[0], env)
             return result
         except FMUGymError as error:
             raise _located(error, index) from error
 
     def _stepped(
-        self, index: int, env: FMUEnv, action: Any, told: tuple[Any, ...]
+        self, index: int, env: FMUEnv, action: Any, status: int, outputs: tuple[float, ...]
     ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         try:
             if not self._together:
                 return env.step(action)
             env.step_count += 1
-            result = env._conclude(self._columns[index], *told)
+            seen = None if self._observed_by_pool is None else IN_POOL
+            result = env._conclude(self._columns[index], status, outputs, seen)
         except FMUGymError as error:
             raise _located(error, index) from error
         env._in_hooks = False
@@ -205,21 +209,23 @@ class PerEnvEngine(Engine):
         self, actions: Sequence[Any], idle: Sequence[bool], resetting: MaskArray | None
     ) -> None:
         """Step the FMUs whose episodes go on, after checking that all their actions are valid."""
-        taken = []
+        taken, inputs = [], []
         try:
             for index, env in enumerate(self._envs):
                 if not idle[index]:
-                    taken.append((env, env.previous_action, env.previous_state, env.inputs))
                     env._in_hooks = True
-                    take = env._take_usable if self._checks_all else env._take_action
-                    take(actions[index])
+                    if not self._checks_all:
+                        env._require_usable(actions[index])
+                    taken.append((env, env._take_usable(actions[index])))
+                    inputs.append(env.inputs)
         except BaseException as error:
-            for env, previous_action, previous_state, inputs in taken[:-1]:  # the last has done it
-                env.action, env.inputs = env.previous_action, inputs
-                env.previous_action, env.previous_state = previous_action, previous_state
+            for env, before in taken:
+                env._give_up(before)
             if isinstance(error, FMUGymError):
                 raise _located(error, index) from error
             raise
+        if inputs:
+            self._pool.inputs[:, ... if resetting is None else ~resetting] = np.transpose(inputs)
         self._pool.step(None, resetting, self._pool.observations)
 
     def _actions(self, actions: Any) -> Sequence[Any]:
@@ -258,37 +264,20 @@ class PerEnvEngine(Engine):
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
         for index in indices.tolist():
-            self._observations[index] = self._envs[index]._observation_and_info()[0]
-        return self._stacked()
-
-    def _with_others(self) -> npt.NDArray[np.float32] | None:
-        """The pool's observations, with those of resets and faults; None if hooks make them."""
-        shared, rows = self._shared
-        for index, observation in enumerate(self._observations):
-            if observation is not rows[index]:
-                fits = type(observation) is np.ndarray and observation.dtype == shared.dtype
-                if not self._observes or not fits or observation.shape != shared.shape[1:]:
-                    return None
-                shared[index] = observation
-        return shared if self._observes else None
-
-    def _stacked(self) -> Any:
-        shared = self._with_others()
-        if shared is not None:
-            return shared.copy()
-        empty: Any = create_empty_array(self._space, n=len(self._envs), fn=np.zeros)
-        try:
-            if isinstance(self._space, spaces.Box) and self._space.dtype.kind == "f":
-                stacked = np.array(self._observations, empty.dtype)  # a fifth of the time
-                if stacked.shape == empty.shape:
-                    return stacked
-            return concatenate(self._space, self._observations, empty)
-        except Exception:  # users' observations may raise anything
-            raise ConfigError(
-                f"_get_observation returned {shown(self._observations[0])}, which is no element of "
-                f"{self._space}"
-            ) from None
+            self._stack.put(index, self._envs[index]._observation_and_info()[0])
+        return self._stack.copied()
 
 
 def _located(error: FMUGymError, index: int) -> FMUGymError:
     return type(error)(f"environment {index}: {error}")
+
+
+def _share_constants(first: FMUEnv, env: FMUEnv) -> None:
+    """Let an environment use the same objects as the first one, where they are equal.
+
+    The objects of a thousand environments do not fit into the processor's caches.
+    """
+    env._is_finite, env._input_writer = first._is_finite, first._input_writer
+    cast(NamedValues, env.out).share_names(cast(NamedValues, first.out))
+    if env._own == first._own:
+        env._own, env._observe, env._elements = first._own, first._observe, first._elements

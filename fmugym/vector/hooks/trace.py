@@ -40,6 +40,7 @@ from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
 __all__ = [
     "SeenArray",
+    "SymbolicParameters",
     "TracedTask",
     "Tracer",
     "in_hook",
@@ -473,10 +474,39 @@ def symbolic_readings(
         done=loaded(graph, "missing", missing, np.bool_),
         after_end=lift(graph, np.zeros(LANES, np.bool_)),
         parameters=MappingProxyType(
-            ParameterValues((n, rows((), "parameter", n)) for n in env._interface.parameters)
+            SymbolicParameters(
+                {n: rows((), "parameter", n) for n in env._interface.parameters},
+                env.fmu.description.strings,
+            )
         ),
         variables=names,
     )
+
+
+class SymbolicParameters(ParameterValues):
+    """The symbols of parameters; Strings have none, and hooks that read one cannot be traced.
+
+    Args:
+        symbols: The symbols by name; those of Strings are not used.
+        strings: The names of the Strings.
+    """
+
+    def __init__(self, symbols: Mapping[str, Any], strings: frozenset[str]) -> None:
+        super().__init__(symbols)
+        self._strings = strings
+
+    def __getitem__(self, name: str) -> Any:
+        self._require_number(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Do what ``dict.get`` does."""
+        self._require_number(name)
+        return super().get(name, default)
+
+    def _require_number(self, name: Any) -> None:
+        if name in self._strings:
+            raise UntraceableError(f"it reads the String {name!r}")
 
 
 def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:

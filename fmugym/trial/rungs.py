@@ -1,0 +1,91 @@
+"""The choice of a reset method for each component of a system, by comparison with fresh systems."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
+
+from fmugym.archive.description import ModelDescription
+from fmugym.pool.spec import ResetMethod
+from fmugym.trial.verdict import Grade
+
+__all__ = ["find_rungs", "offers_of"]
+
+Rungs = tuple[ResetMethod, ...]
+
+_METHODS: Final = list(ResetMethod)
+
+
+def offers_of(component: ModelDescription, *, reloads: bool) -> list[ResetMethod]:
+    """The reset methods that a component offers, the fastest first.
+
+    Args:
+        component: The description of its FMU.
+        reloads: Whether libraries can be loaded anew.
+    """
+    offers = [ResetMethod.RESTORE] if component.capabilities.can_get_and_set_fmu_state else []
+    offers += [ResetMethod.RESET] if component.has_reset else []
+    offers += [ResetMethod.INSTANCE]
+    return [*offers, ResetMethod.LIBRARY] if reloads else offers
+
+
+def find_rungs(
+    offers: Sequence[Sequence[ResetMethod]],
+    base: ResetMethod,
+    grade: Callable[[Rungs], Grade],
+) -> Rungs:
+    """Find the fastest reset method of each component with which the system begins anew.
+
+    Often all honest components can begin by the fastest method that they offer. If not, each one
+    is tried while the others begin by a method that is known to work.
+
+    Args:
+        offers: For each component, the methods that it offers, the fastest first.
+        base: The method with which the system begins anew as a whole.
+        grade: Plays episodes with a method for each component.
+
+    Returns:
+        A method for each component; empty if none can begin by a faster one than ``base``.
+    """
+    slow = tuple(_at_least(base, own) for own in offers)
+    fast = tuple(own[0] for own in offers)
+    if all(map(_is_no_faster, fast, slow)):
+        return ()
+    if grade(fast) is Grade.BITWISE:
+        return fast
+    found = tuple(_fastest(slow, index, own, grade) for index, own in enumerate(offers))
+    changes = sum(one is not other for one, other in zip(found, slow, strict=True))
+    good = changes == 1 or (changes > 1 and grade(found) is Grade.BITWISE)
+    return found if good else ()
+
+
+def _rank(method: ResetMethod) -> int:
+    return _METHODS.index(method)
+
+
+def _is_no_faster(one: ResetMethod, other: ResetMethod) -> bool:
+    return _rank(one) >= _rank(other)
+
+
+def _at_least(base: ResetMethod, offers: Sequence[ResetMethod]) -> ResetMethod:
+    """The fastest offered method that is as sure as the base."""
+    return next((own for own in offers if _is_no_faster(own, base)), offers[-1])
+
+
+def _fastest(
+    slow: Rungs,
+    index: int,
+    offers: Sequence[ResetMethod],
+    grade: Callable[[Rungs], Grade],
+) -> ResetMethod:
+    for rungs in _faster(slow, index, offers):
+        if grade(rungs) is Grade.BITWISE:
+            return rungs[index]
+    return slow[index]
+
+
+def _faster(slow: Rungs, index: int, offers: Sequence[ResetMethod]) -> Iterator[Rungs]:
+    """Let one component begin by each of its faster methods, and the others as before."""
+    for method in offers:
+        if not _is_no_faster(method, slow[index]):
+            yield (*slow[:index], method, *slow[index + 1 :])

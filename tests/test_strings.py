@@ -1,0 +1,309 @@
+"""Strings that episodes begin with: constant, drawn, and given for one episode."""
+
+import pickle
+
+import numpy as np
+import pytest
+import values_tools
+from gymnasium import spaces
+
+import fmugym
+from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
+
+POOLS = {
+    "native": {},
+    "python": {"backend": "python"},
+    "isolated": {"isolation": "process"},
+    "isolated python": {"isolation": "process", "backend": "python"},
+}
+pools = pytest.mark.parametrize("options", POOLS.values(), ids=POOLS)
+VERSIONS = (1, 2, 3)
+versions = pytest.mark.parametrize("version", VERSIONS)
+WORDS = ("a", "ünter", "longest of all", "")
+CHOICE = Choice(WORDS)
+SIZES = {word: len(word.encode()) for word in WORDS}
+"""``length`` of ``feedthrough.c`` is the number of bytes of ``String_parameter``."""
+
+
+class Reading(fmugym.FMUEnv):
+    """An FMU of ``feedthrough.c``, with the text among the infos."""
+
+    def __init__(self, path, words=CHOICE, backend=None, isolation=None, **changes):
+        config = {
+            "model_input_names": [],
+            "model_output_names": "length",
+            "model_parameters": {"String_parameter": words},
+            "time_step": 0.1,
+            "probe_timeout": None,
+        }
+        super().__init__(path, config | changes, backend=backend, isolation=isolation)
+
+    def _get_action_space(self):
+        return spaces.Discrete(2)
+
+    def _get_inputs(self):
+        return []
+
+    def _is_done(self):
+        return self.out["length"] > 1e9
+
+
+class Telling(Reading):
+    """Has hooks that read the text."""
+
+    def _reward_policy(self):
+        return 2.0 * (self.parameters["String_parameter"] == "a")
+
+    def _get_info(self):
+        return {"long": self.out["length"] > 3}
+
+
+@pytest.fixture(scope="module")
+def feedthrough(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("strings")
+    return {v: values_tools.feedthrough_fmu(folder / f"F{v}.fmu", v) for v in VERSIONS}
+
+
+def drawn_words(seed, count):
+    """What numpy draws with the same generator."""
+    rng = np.random.default_rng(seed)
+    return [WORDS[rng.choice(len(WORDS), p=None)] for _ in range(count)]
+
+
+@versions
+@pools
+def test_a_string_is_drawn_for_each_episode(feedthrough, version, options):
+    env = Reading(feedthrough[version], **options)
+    wanted = drawn_words(3, 12)
+    for episode, word in enumerate(wanted):
+        observation, info = env.reset(seed=None if episode else 3)
+        assert info["drawn"] == {"String_parameter": word}
+        assert env.parameters["String_parameter"] == word
+        assert observation.tolist() == [SIZES[word]]
+        assert env.step(0)[0].tolist() == [SIZES[word]]
+    assert len(set(wanted)) > 2
+    env.close()
+
+
+@pools
+@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+def test_vector_environments_draw_what_single_ones_do(feedthrough, options, hooks):
+    def make():
+        parameters = {"String_parameter": CHOICE, "Float64_parameter": Uniform(0, 1)}
+        outputs = ["length", "Float64_told"]
+        path = feedthrough[3]
+        return Telling(path, model_parameters=parameters, model_output_names=outputs, **options)
+
+    env = make()
+    expected = []
+    for index in range(3):
+        runs = []
+        for episode in range(3):
+            start = env.reset(seed=None if episode else 11 + index)
+            runs.append((start[0].tolist(), start[1]["drawn"], env.step(0)[1]))
+        expected.append(runs)
+    env.close()
+    envs = FMUVectorEnv(make, 3, hooks=hooks)
+    for episode in range(3):
+        observations, infos = envs.reset(seed=None if episode else 11)
+        rewards = envs.step(np.zeros(3, np.int64))[1]
+        for index in range(3):
+            first, drawn, reward = expected[index][episode]
+            assert observations[index].tolist() == first
+            assert {name: infos["drawn"][name][index] for name in drawn} == drawn
+            assert rewards[index] == reward
+            assert (
+                envs.get_attr("parameters")[index]["String_parameter"]
+                == (drawn["String_parameter"])
+            )
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@pytest.mark.parametrize("cls", [Reading, Telling])
+def test_episodes_that_follow_in_the_pass(feedthrough, mode, cls):
+    """Compiled hooks draw numbers; ``Telling`` has one hook in Python."""
+
+    def make():
+        return cls(feedthrough[3], max_episode_steps=2)
+
+    envs = FMUVectorEnv(make, 2, autoreset_mode=mode)
+    words = [drawn_words(5, 6), drawn_words(6, 6)]
+    envs.reset(seed=5)
+    episode = 1
+    for _ in range(10):
+        observations, rewards, _, _, infos = envs.step(np.zeros(2, np.int64))
+        if "drawn" in infos:
+            expected = [row[episode] for row in words]
+            assert infos["drawn"]["String_parameter"].tolist() == expected
+            assert observations[:, 0].tolist() == [SIZES[word] for word in expected]
+            episode += 1
+        elif cls is Telling:
+            assert rewards.tolist() == [2.0 * (row[episode - 1] == "a") for row in words]
+    assert episode > 3
+    envs.close()
+
+
+@pools
+def test_a_text_for_one_episode(feedthrough, options):
+    env = Reading(feedthrough[3], words="abc", **options)
+    _, info = env.reset(options={"model_parameters": {"String_parameter": "four"}})
+    assert (info["drawn"], env.state) == ({"String_parameter": "four"}, (4.0,))
+    _, info = env.reset(seed=3, options={"model_parameters": {"String_parameter": CHOICE}})
+    assert info["drawn"]["String_parameter"] == drawn_words(3, 1)[0]
+    assert env.state == (SIZES[drawn_words(3, 1)[0]],)
+    env.reset()
+    assert env.state == (3.0,)
+    assert env.parameters["String_parameter"] == "abc"
+    _, info = env.reset(options={"model_parameters": {"String_in": "other"}})
+    assert info["drawn"] == {"String_in": "other"}
+    env.close()
+
+
+@pools
+@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+def test_each_environment_has_its_own_text(feedthrough, options, hooks):
+    envs = FMUVectorEnv(lambda: Telling(feedthrough[3], words="abc", **options), 3, hooks=hooks)
+    assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]
+    envs.set_attr("String_parameter", ["a", "bbbb", "cc"])
+    for _ in range(2):
+        assert envs.reset()[0][:, 0].tolist() == [1, 4, 2]
+        assert envs.step(np.zeros(3, np.int64))[1].tolist() == [2, 0, 0]
+    assert [one["String_parameter"] for one in envs.get_attr("parameters")] == ["a", "bbbb", "cc"]
+    given = {"model_parameters": {"String_parameter": "sixsix"}}
+    assert envs.reset(options=given)[0][:, 0].tolist() == [6, 6, 6]
+    assert envs.reset()[0][:, 0].tolist() == [1, 4, 2]
+    envs.set_attr("String_parameter", "all")
+    assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]
+    with pytest.raises(ConfigError, match=r"'String_parameter'.*String.*3"):
+        envs.set_attr("String_parameter", ["a", "b", 3])
+    envs.close()
+
+
+@pools
+def test_snapshots_hold_the_text(feedthrough, options):
+    """The FMU has no states, so that snapshots play episodes again."""
+
+    def make():
+        return Reading(feedthrough[3], **options)
+
+    env, envs = make(), FMUVectorEnv(make, 2)
+    env.reset(seed=4)
+    env.step(0)
+    saved = pickle.loads(pickle.dumps(env.save_state()))
+    assert saved == env.save_state()
+    word = env.parameters["String_parameter"]
+    while env.parameters["String_parameter"] == word:
+        env.reset()
+    env.restore_state(saved)
+    assert env.parameters["String_parameter"] == word
+    assert env.step(0)[0].tolist() == [SIZES[word]]
+    envs.reset(seed=1)
+    envs.restore_state(saved)
+    assert [one["String_parameter"] for one in envs.get_attr("parameters")] == [word] * 2
+    assert envs.step(np.zeros(2, np.int64))[0].tolist() == [[SIZES[word]]] * 2
+    env.restore_state(envs.save_state()[1])
+    assert env.parameters["String_parameter"] == word
+    env.close()
+    envs.close()
+
+
+def test_a_weighted_choice(feedthrough):
+    envs = FMUVectorEnv(lambda: Reading(feedthrough[2], words=Choice(["a", "bb"], [0.25, 0.75])), 2)
+    rng = [np.random.default_rng(seed) for seed in (8, 9)]
+    for episode in range(20):
+        observations, _ = envs.reset(seed=None if episode else 8)
+        wanted = [(1, 2)[one.choice(2, p=[0.25, 0.75])] for one in rng]
+        assert observations[:, 0].tolist() == wanted
+    envs.close()
+
+
+class Alternating:
+    """A distribution of the user's own, which tells its texts."""
+
+    values = ("x", "yy")
+
+    def sample(self, rng):
+        """One of the texts."""
+        return self.values[int(rng.random() < 0.5)]
+
+
+@pytest.mark.parametrize("hooks", ["auto", "per_env"])
+def test_a_distribution_of_the_users_own(feedthrough, hooks):
+    def make():
+        return Reading(feedthrough[3], words=Alternating(), max_episode_steps=1)
+
+    envs = FMUVectorEnv(make, 2, hooks=hooks)
+    streams = [np.random.default_rng(seed) for seed in (8, 9)]
+    envs.reset(seed=8)
+    wanted = [[1 + (one.random() < 0.5) for _ in range(4)] for one in streams]
+    seen = [envs.step(np.zeros(2, np.int64))[0][:, 0].tolist() for _ in range(6)]
+    assert seen[0] == [row[0] for row in wanted]
+    assert seen[1] == [row[1] for row in wanted]
+    assert seen[3] == [row[2] for row in wanted]
+    envs.close()
+
+
+def test_a_task_file_draws_texts(feedthrough, tmp_path):
+    (tmp_path / "task.toml").write_text(
+        f"""
+        fmu = "{feedthrough[3]}"
+        time_step = 0.1
+        [agent]
+        actions = ["idle"]
+        observations = ["length"]
+        [variables]
+        idle = {{ name = "Float64_in", min = -1, max = 1 }}
+        [reward]
+        near = "-length"
+        [parameters]
+        String_parameter = {{ distribution = "choice", values = ["a", "bb"] }}
+        """
+    )
+    env = fmugym.load(tmp_path / "task.toml")
+    seen = set()
+    for _ in range(20):
+        observation, info = env.reset()
+        word = info["drawn"]["String_parameter"]
+        assert observation.tolist() == [len(word)]
+        seen.add(word)
+    assert seen == {"a", "bb"}
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("value", "facts"),
+    [
+        (3, r"'String_parameter'.*String.*3"),
+        (Uniform(0, 1), r"'String_parameter'.*String.*Choice.*Uniform"),
+        (Choice(["a", 2]), r"'String_parameter'.*String.*2"),
+        (Choice(["a", "b\0"]), r"'String_parameter'.*NUL"),
+        (["a", "b"], r"'String_parameter'.*String.*\['a', 'b'\]"),
+    ],
+)
+def test_what_no_string_can_be(feedthrough, value, facts):
+    with pytest.raises(ConfigError, match=facts):
+        Reading(feedthrough[3], words=value)
+    env = Reading(feedthrough[3])
+    with pytest.raises(ConfigError, match=facts):
+        env.reset(options={"model_parameters": {"String_parameter": value}})
+    env.close()
+
+
+def test_a_distribution_that_draws_another_text(feedthrough):
+    class Wrong(Alternating):
+        def sample(self, rng):
+            return "zzz"
+
+    with pytest.raises(ConfigError, match=r"'String_parameter'.*'zzz'.*'x'"):
+        Reading(feedthrough[3], words=Wrong()).reset()
+
+
+def test_hooks_that_read_a_string_are_named(feedthrough, caplog):
+    with caplog.at_level("INFO", "fmugym"):
+        envs = FMUVectorEnv(lambda: Telling(feedthrough[3]), 2)
+        envs.reset()
+        envs.step(np.zeros(2, np.int64))
+        envs.close()
+    assert "_reward_policy" in caplog.text
+    assert "String_parameter" in caplog.text

@@ -1,0 +1,323 @@
+"""How the components of a system begin episodes, each in its own way.
+
+The FMUs are those of ``zoo/quirks.c``; what is right is an episode of a fresh system.
+"""
+
+import functools
+import itertools
+import logging
+import os
+
+import numpy as np
+import pytest
+import quirk_table
+from exchange_tools import exchange_fmu
+
+from fmugym import FMUSystem
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.local import local_pool
+from fmugym.pool.spec import ResetMethod
+from fmugym.systems.fmu import SystemFMU
+from fmugym.trial import opening
+from fmugym.trial.candidate import Candidate
+from fmugym.trial.rungs import find_rungs
+from fmugym.trial.trial import examine
+from fmugym.trial.verdict import Grade
+
+LOG = logging.getLogger("fmugym.test")
+ENGINES = [pytest.param(False, id="python")]
+if has_native_pool():
+    ENGINES.append(pytest.param(True, id="native"))
+in_each_engine = pytest.mark.parametrize("native", ENGINES)
+RESTORE, RESET, INSTANCE, LIBRARY, PROCESS = ResetMethod
+MIXES = list(itertools.product((RESTORE, RESET, INSTANCE), repeat=3))
+NAMES = ("a", "b", "c")
+GAINS = (1.5, 1.5, 1.5, 0.7, 1.5, 1.5, 1.5, 0.7, 0.7, 0.7)
+LENGTHS = (3, 25, 25, 4, 25, 25, 25, 3, 25, 25)
+
+
+@pytest.fixture(scope="module", name="fmu_of")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("components")
+
+    @functools.cache
+    def make(token, version=2):
+        return quirk_table.quirk_fmu(folder / f"{token} {version}", version, token)
+
+    return make
+
+
+@pytest.fixture(autouse=True)
+def trials(monkeypatch, tmp_path_factory):
+    """Trials as users have them; the cache serves all tests of a session."""
+    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
+    cache = os.path.join(tmp_path_factory.getbasetemp(), "component verdicts")
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", cache)
+
+
+def chain(fmu_of, *tokens, version=2):
+    """Components in a row, the first of which feels the second."""
+    paths = [fmu_of(token, version) for token in tokens]
+    return FMUSystem(
+        dict(zip(NAMES, paths, strict=False)),
+        [
+            *(f"{one}.y -> {other}.u" for one, other in itertools.pairwise(NAMES[: len(paths)])),
+            "go -> a.gain",
+        ],
+    )
+
+
+def spec_of(fmu, **options):
+    names = [name for name in fmu.description.variables if name.endswith((".y", ".clock"))]
+    outputs = tuple(map(fmu.variable, names))
+    return PoolSpec((fmu.variable("a.u"),), outputs, 0.1, **options)
+
+
+def play(pool, fmu, gain, length):
+    """The outputs of all instances, shape (steps + 1, outputs, instances)."""
+    start = (fmu.variable("b.gain"),)
+    outputs, statuses = pool.reset(start, np.full((1, pool.num_instances), gain))
+    rows = [outputs.copy()]
+    assert not statuses.any(), pool.failure(0)
+    for step in range(length):
+        inputs = np.sin(0.9 * step + np.arange(pool.num_instances))[None]
+        outputs, statuses = pool.step(inputs)
+        assert not statuses.any(), pool.failure(0)
+        rows.append(outputs.copy())
+    return np.array(rows)
+
+
+def open_pool(system, native, count, methods=(), **options):
+    fmu = system.as_fmu()
+    spec = spec_of(fmu, component_resets=tuple(methods))
+    if native and spec.reloads:
+        options["private_libraries"] = True
+    return fmu, local_pool(fmu, spec, count, LOG, native=native, **options)
+
+
+def fresh_episode(system, native, gain, length, count=2):
+    options = {"private_libraries": True} if native else {}
+    fmu, pool = open_pool(system, native, count, **options)
+    try:
+        return play(pool, fmu, gain, length)
+    finally:
+        pool.close()
+
+
+def episodes(system, native, methods, count=2, lengths=LENGTHS):
+    fmu, pool = open_pool(system, native, count, methods)
+    try:
+        return [play(pool, fmu, *one) for one in zip(GAINS, lengths, strict=False)]
+    finally:
+        pool.close()
+
+
+def is_right(system, native, methods):
+    """Whether each of many episodes equals one of a fresh system, bit by bit."""
+    expected = {gain: fresh_episode(system, native, gain, max(LENGTHS)) for gain in set(GAINS)}
+    pairs = zip(GAINS, LENGTHS, strict=True)
+    found = episodes(system, native, methods)
+    return all(
+        rows.tobytes() == expected[gain][: length + 1].tobytes()
+        for rows, (gain, length) in zip(found, pairs, strict=True)
+    )
+
+
+LIARS = {
+    "reset does nothing": INSTANCE,
+    "reset keeps the state": INSTANCE,
+    "reset keeps outputs": INSTANCE,
+    "restore forgets": RESET,
+    "restore keeps the time": RESET,
+    "library keeps": LIBRARY,
+}
+
+
+LIARS_IN_ENGINES = [
+    (token, native)
+    for token, method in LIARS.items()
+    for native in (False, True)[: 1 + has_native_pool()]
+    if native or method is not LIBRARY  # which Python cannot load anew
+]
+
+
+class TestMethods:
+    @pytest.mark.parametrize(("token", "native"), LIARS_IN_ENGINES)
+    def test_a_liar_begins_by_its_own_one(self, fmu_of, token, native):
+        system = chain(fmu_of, "well behaved", token, "well behaved")
+        assert is_right(system, native, (RESTORE, LIARS[token], RESET))
+
+    @in_each_engine
+    @pytest.mark.parametrize("token", ["reset does nothing", "reset keeps the state"])
+    def test_this_test_would_find_a_liar(self, fmu_of, token, native):
+        system = chain(fmu_of, "well behaved", token)
+        assert not is_right(system, native, (RESET, RESET))
+
+    @in_each_engine
+    @pytest.mark.parametrize("token", ["restore forgets", "restore keeps the time"])
+    def test_who_restores_something_else_is_found_out(self, fmu_of, token, native):
+        """The other components are restored all the same, as their FMUs see."""
+        system = chain(fmu_of, "well behaved", token, "well behaved")
+        assert is_right(system, native, (RESTORE, RESTORE, RESTORE))
+
+    @in_each_engine
+    @pytest.mark.parametrize("version", [2, 3])
+    @pytest.mark.parametrize("methods", MIXES)
+    def test_in_any_mix(self, fmu_of, native, version, methods):
+        system = chain(fmu_of, *["well behaved"] * 3, version=version)
+        assert is_right(system, native, methods)
+
+    @in_each_engine
+    def test_some_are_really_not_initialized_again(self, fmu_of, native, monkeypatch):
+        """The state of the first is restored in all but the first two of like episodes."""
+        system = chain(fmu_of, "reset does nothing", "well behaved")
+        right = fresh_episode(system, native, 1.5, 25)
+        found = episodes(system, native, (RESTORE, INSTANCE), lengths=(25, 25, 25))
+        # the reset of the first does nothing, so that only its restored state can be right
+        assert found[2].tobytes() != right.tobytes()
+        assert found[2].tobytes() == found[1].tobytes() != found[0].tobytes()
+
+    def test_both_engines_agree(self, fmu_of):
+        if not has_native_pool():
+            pytest.skip("no C extension was built")
+        system = chain(fmu_of, "well behaved", "reset does nothing", "restore forgets")
+        methods = (RESTORE, INSTANCE, RESET)
+        one, other = (episodes(system, native, methods) for native in (False, True))
+        assert [rows.tobytes() for rows in one] == [rows.tobytes() for rows in other]
+
+    @in_each_engine
+    @pytest.mark.parametrize("version", [1])
+    def test_without_a_function_for_resets(self, fmu_of, native, version, tmp_path):
+        """Model exchange of FMI 1.0 has none: only this component is made anew."""
+        ball = exchange_fmu(tmp_path / "ball.fmu", "ball", version)
+        system = FMUSystem({"a": fmu_of("well behaved"), "b": ball}, ["a.y -> b.e"])
+        fmu = system.as_fmu()
+        fitted = PoolSpec((), (), 0.1).fitting(fmu.description)
+        assert fitted.component_resets == (RESET, INSTANCE)
+        assert fitted.reset_method is INSTANCE
+        assert fitted.whole_reset_method is RESET
+        spec = PoolSpec((fmu.variable("a.u"),), (fmu.variable("b.h"),), 0.1)
+        pool = local_pool(fmu, spec, 2, LOG, native=native)
+        try:
+            rows = []
+            for _ in range(3):
+                first = pool.reset((), np.zeros((0, 2)))[0].copy()
+                rows.append([first, *(pool.step(np.ones((1, 2)))[0].copy() for _ in range(9))])
+        finally:
+            pool.close()
+        assert np.array_equal(rows[0], rows[1])
+        assert np.array_equal(rows[0], rows[2])
+
+    @in_each_engine
+    def test_snapshots_end_with_the_instance(self, fmu_of, native):
+        """A state of a component that was made anew belongs to nobody."""
+        system = chain(fmu_of, "well behaved", "well behaved")
+        fmu, pool = open_pool(system, native, 2, (RESTORE, INSTANCE))
+        try:
+            play(pool, fmu, 1.5, 5)
+            snapshot = pool.save()
+            before = pool.step(np.zeros((1, 2)))[0].copy()
+            pool.restore(snapshot)
+            assert pool.step(np.zeros((1, 2)))[0].tobytes() == before.tobytes()
+            play(pool, fmu, 1.5, 5)
+            with pytest.raises(Exception, match="another instance"):
+                pool.restore(snapshot)
+        finally:
+            pool.close()
+
+
+class TestChoice:
+    """Which methods a trial finds, given what it would see."""
+
+    OFFERS = ((RESTORE, RESET, INSTANCE),) * 3
+
+    @staticmethod
+    def find(offers, base, truth):
+        """Components begin anew by what they are good at, and by everything slower."""
+        asked = []
+
+        def grade(methods):
+            asked.append(methods)
+            order = list(ResetMethod)
+            good = all(
+                order.index(method) >= order.index(own)
+                for method, own in zip(methods, truth, strict=True)
+            )
+            return Grade.BITWISE if good else Grade.WRONG
+
+        return find_rungs(offers, base, grade), asked
+
+    @pytest.mark.parametrize("truth", MIXES)
+    def test_each_gets_its_own(self, truth):
+        base = max(truth, key=list(ResetMethod).index)
+        found, _ = self.find(self.OFFERS, base, truth)
+        assert found == (truth if set(truth) != {base} else ())
+
+    def test_what_is_not_offered_is_not_asked_for(self):
+        offers = ((RESET, INSTANCE), (INSTANCE,), (RESTORE, RESET, INSTANCE))
+        found, asked = self.find(offers, RESET, (RESET, INSTANCE, RESTORE))
+        assert found == (RESET, INSTANCE, RESTORE)
+        assert len(asked) == 1
+
+    def test_what_is_wrong_together_is_not_used(self):
+        def grade(methods):
+            return Grade.BITWISE if list(methods).count(RESTORE) < 2 else Grade.WRONG
+
+        assert find_rungs(self.OFFERS, RESET, grade) == ()
+
+    def test_nothing_is_tried_without_a_choice(self):
+        found, asked = self.find(((INSTANCE,),) * 2, INSTANCE, (INSTANCE,) * 2)
+        assert not found
+        assert not asked
+
+
+def verdict_of(system):
+    fmu = system.as_fmu()
+    return examine(Candidate.of(fmu), spec_of(fmu), several=False)
+
+
+class TestTrial:
+    @pytest.mark.parametrize("token", LIARS)
+    def test_finds_who_lies(self, fmu_of, token):
+        system = chain(fmu_of, "well behaved", token, "well behaved")
+        verdict = verdict_of(system)
+        if LIARS[token] is LIBRARY and not has_native_pool():
+            assert verdict.reset_method is PROCESS
+        else:
+            others = {RESTORE}
+            assert {verdict.components[0], verdict.components[2]} == others
+            # a liar that gives itself away is not restored by the pool either
+            assert verdict.components[1] in {LIARS[token], RESTORE}
+            if "reset" in token or token == "library keeps":
+                assert verdict.components[1] is LIARS[token]
+
+    def test_honest_ones_are_restored_together(self, fmu_of):
+        verdict = verdict_of(chain(fmu_of, *["well behaved"] * 3))
+        assert verdict.reset_method is RESTORE
+        assert verdict.components == ()
+
+    def test_a_verdict_is_kept(self, fmu_of):
+        system = chain(fmu_of, "well behaved", "reset does nothing")
+        assert verdict_of(system) == verdict_of(system)
+        assert verdict_of(system).components_of(system.plan) == {"a": "restore", "b": "instance"}
+
+    @pytest.mark.parametrize("token", LIARS)
+    @pytest.mark.parametrize("options", [{}, {"isolation": "process", "workers": 2}], ids=str)
+    def test_pools_do_what_it_says(self, fmu_of, token, options, caplog):
+        caplog.set_level(logging.INFO)
+        system = chain(fmu_of, "well behaved", token)
+        fmu = system.as_fmu()
+        pool = opening.make_pool(fmu, spec_of(fmu), 3, LOG, **options)
+        try:
+            found = [play(pool, fmu, *one) for one in zip(GAINS, LENGTHS, strict=True)]
+        finally:
+            pool.close()
+        for rows, gain, length in zip(found, GAINS, LENGTHS, strict=True):
+            right = fresh_episode(system, has_native_pool(), gain, length, 3)
+            assert rows.tobytes() == right.tobytes()
+        assert "component 'a' begins by the method 'restore'" in caplog.text
+
+
+def test_the_plan_pickles_with_its_components(fmu_of):
+    system = chain(fmu_of, "well behaved", "well behaved")
+    assert SystemFMU(system.plan).description.components

@@ -1,0 +1,139 @@
+"""Hooks that are called one environment at a time: what comes of their observations and inputs."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from vector_tools import Drawing
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.vector import FMUVectorEnv
+
+
+class SharedArray(Drawing):
+    """Each observation is written to the same array."""
+
+    array = np.zeros(2, np.float32)
+
+    def __init__(self):
+        super().__init__(model_parameters={"q_0": fmugym.Uniform(-1.0, 1.0)})
+
+    def _get_observation(self):
+        self.array[:] = self.state
+        return self.array
+
+
+class SharedDict(SharedArray):
+    def _get_observation_space(self):
+        return spaces.Dict({"all": spaces.Box(-np.inf, np.inf, (2,), np.float32)})
+
+    def _get_observation(self):
+        return {"all": super()._get_observation()}
+
+
+@pytest.mark.parametrize("cls", [SharedArray, SharedDict])
+def test_an_array_that_hooks_share_does_not_mix_the_observations(cls):
+    envs = FMUVectorEnv(cls, 3, hooks="per_env")
+    seen = [envs.reset(seed=0)[0]]
+    seen += [envs.step(np.zeros((3, 1), np.float32))[0] for _ in range(2)]
+    states = [np.float32(env) for env in envs.get_attr("state")]
+    rows = seen[-1] if cls is SharedArray else seen[-1]["all"]
+    np.testing.assert_array_equal(rows, states)
+    assert len(set(rows[:, 0])) == 3
+    first = seen[0] if cls is SharedArray else seen[0]["all"]
+    assert not np.array_equal(first, rows)  # a later step leaves earlier observations alone
+    envs.close()
+
+
+class OfOtherTypes(Drawing):
+    """Observations as hooks may return them: lists, float64, and a number for a Discrete."""
+
+    def _get_observation_space(self):
+        box = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        parts = {"list": box, "wide": box, "sign": spaces.Discrete(2), "pair": spaces.Tuple([box])}
+        return spaces.Dict(parts)
+
+    def _get_observation(self):
+        wide = np.array(self.state)
+        return {
+            "list": list(self.state),
+            "wide": wide,
+            "sign": int(self.state[0] > 0),
+            "pair": (wide.astype(np.float32),),
+        }
+
+
+def test_observations_become_the_types_of_their_space():
+    envs = FMUVectorEnv(OfOtherTypes, 3, hooks="per_env")
+    envs.reset(seed=0)
+    seen = envs.step(np.zeros((3, 1), np.float32))[0]
+    states = np.float32(envs.get_attr("state"))
+    assert seen in envs.observation_space
+    for rows in (seen["list"], seen["wide"], seen["pair"][0]):
+        np.testing.assert_array_equal(rows, states)
+    np.testing.assert_array_equal(seen["sign"], states[:, 0] > 0)
+    envs.close()
+
+
+class Stepping(Drawing):
+    """A class with a step of its own, whose observations nobody has checked before."""
+
+    observed = (0.0, 0.0)
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return self.observed, *rest
+
+
+@pytest.mark.parametrize("observed", [np.zeros(3, np.float32), np.zeros(1), "text", 2**70, None])
+def test_an_observation_that_is_no_element_of_the_space_is_named(observed, monkeypatch):
+    envs = FMUVectorEnv(Stepping, 2, hooks="per_env")
+    envs.reset(seed=0)
+    monkeypatch.setattr(Stepping, "observed", observed)
+    with pytest.raises(ConfigError, match=r"_get_observation returned .*Box"):
+        envs.step(np.zeros((2, 1), np.float32))
+    envs.close()
+
+
+class Failing(Drawing):
+    """Environments fail in ``_get_inputs`` if the action says so."""
+
+    def _get_inputs(self):
+        if self.action[0] > 0.009:
+            raise ConfigError("no")
+        return self.action
+
+
+def test_a_step_that_one_environment_refuses_changes_none():
+    """The inputs too are those of the last step, in the environments and in the pool."""
+    envs = FMUVectorEnv(Failing, 3, hooks="per_env")
+    envs.reset(seed=0)
+    good = np.float32([[0.001], [0.002], [0.003]])
+    envs.step(good)
+    names = ("action", "previous_action", "state", "previous_state", "inputs", "step_count")
+    before = [envs.get_attr(name) for name in names]
+    given = envs._pool.inputs.copy()
+    with pytest.raises(ConfigError, match="environment 2"):
+        envs.step(np.float32([[0.004], [0.005], [0.01]]))
+    for name, values in zip(names, before, strict=True):
+        np.testing.assert_array_equal(envs.get_attr(name), values, err_msg=name)
+    np.testing.assert_array_equal(envs._pool.inputs, given)
+    envs.close()
+
+
+def test_inputs_reach_the_environments_that_go_on():
+    """In a step that starts some episodes anew, each input belongs to its own environment."""
+    envs = FMUVectorEnv(Failing, 3, hooks="per_env", autoreset_mode="next_step")
+    alone = Failing()
+    envs.reset(seed=[1, 2, 3])
+    actions = np.float32([[0.001], [0.002], [0.003]])
+    envs._engine.ended[1] = envs._engine.any_ended = True
+    for _ in range(2):
+        envs.step(actions)
+    alone.reset(seed=3)
+    for _ in range(2):
+        alone.step(actions[2])
+    assert envs.get_attr("state")[2] == alone.state
+    assert envs.get_attr("inputs") == tuple((float(action),) for action in actions[:, 0])
+    envs.close()
+    alone.close()
