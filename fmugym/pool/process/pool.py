@@ -246,25 +246,13 @@ class ProcessPool(SavingPool):
         """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
         return has_native_pool() and self._setup.native and not self._spec.licence_wait
 
-    def prepare_play(
-        self,
-        variables: tuple[Variable, ...],
-        programs: Any,
-        actions: Any,
-        start_values: FloatArray,
-        draws: Any,
-        episodes: Any,
-        surroundings: Any,
-    ) -> Callable[..., tuple[int, int, int]]:
+    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[int, int, int]]:
         """See ``Pool.prepare_play``."""
         if not self.can_play:
             raise SimulationError("compiled hooks need the native pool")
         from fmugym.pool.process.play import PlayAround
 
-        around = PlayAround(self._setup, self._arrays, self._advance)
-        return around.prepare(
-            variables, programs, actions, start_values, draws, episodes, surroundings
-        )
+        return PlayAround(self._setup, self._arrays, self._advance).prepare(*parts, **named)
 
     def _advance(
         self, variables: tuple[Variable, ...], values: FloatArray, starting: MaskArray
