@@ -75,6 +75,13 @@ def echo_to(memory: Array, /) -> None:
         memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
     """
 
+def serve_component() -> None:
+    """Be the worker of a component until the standard input is closed, which ends the process.
+
+    Raises:
+        OSError: If the standard input is no socket, or on Windows.
+    """
+
 def claim_initialization(last: Array, interval: float, /) -> float:
     """Take the next moment at which an instance may be made or initialized.
 
@@ -175,6 +182,8 @@ class Library(TypedDict):
     mark: Mark | None
     solving: tuple[Any, ...] | None
     system: tuple[Any, ...] | None
+    structural_references: bytes
+    structural_values: bytes
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -291,26 +300,23 @@ class Pool:
         states: Array,
         episodes: Episodes,
         kept: Array,
-        keeps_always: bool,
+        reads_kept: bool,
         copies: tuple[tuple[Array, Array], ...],
         variable_starts: tuple[tuple[Array, bytes], ...],
         drawn_variables: tuple[tuple[Array, int], ...],
         input_starts: tuple[tuple[int, float], ...],
+        results: tuple[Any, ...] | None,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
     def play(
         self,
         actions: Array,
-        observations: Array | tuple[Array, ...],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
         drawn: Array,
         last_observations: Array | None,
         started: Array | None,
         /,
-    ) -> tuple[int, int, int]:
+    ) -> tuple[Any, int, int, int]:
         """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:
@@ -320,17 +326,8 @@ class Pool:
         """
 
     def play_before(
-        self,
-        actions: Array,
-        observations: Array | tuple[Array, ...],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
-        drawn: Array,
-        last_observations: None,
-        started: None,
-        /,
-    ) -> tuple[int, int, int]:
+        self, actions: Array, drawn: Array, last_observations: None, started: None, /
+    ) -> None:
         """Do what comes before the FMUs' part of ``play``, where they run in other processes.
 
         Such a pool was made without paths of libraries. It draws the start values of the instances
@@ -338,17 +335,8 @@ class Pool:
         """
 
     def play_after(
-        self,
-        actions: Array,
-        observations: Array | tuple[Array, ...],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
-        drawn: Array,
-        last_observations: None,
-        started: None,
-        /,
-    ) -> tuple[int, int, int]:
+        self, actions: Array, drawn: Array, last_observations: None, started: None, /
+    ) -> tuple[Any, int, int, int]:
         """Do what comes after the FMUs' part of ``play``.
 
         The outputs and statuses are those that the pool's arrays have. The arguments, results and

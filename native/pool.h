@@ -294,7 +294,7 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends);
 /* The two parts of a play around steps that are done elsewhere. The first runs the programs that
  * come before, and draws the start values of the instances in the mask, which are to be reset. The
  * second takes the outputs and statuses for those of the step. The turn has no arrays for episodes
- * that start in it, and keeps the outputs before each step. */
+ * that start in it, and reads_kept is set: the step overwrites the outputs. */
 size_t pool_play_before(Pool *pool, const Call *call);
 size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
 /* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,

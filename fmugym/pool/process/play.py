@@ -21,19 +21,30 @@ from fmugym.pool.native import prepare
 from fmugym.pool.pacing import last_initialization
 from fmugym.pool.process.shared_memory import Arrays
 from fmugym.pool.process.worker import Setup
-from fmugym.pool.settings import (
-    PlaceOfFMU,
-    experiment_settings,
-    library_settings,
-    listing,
-    manner_of,
-    solving_settings,
-    table_of,
-    variable_settings,
-)
-from fmugym.pool.systems import system_settings
+from fmugym.pool.settings import experiment_settings, listing, variable_settings
 
 __all__ = ["PlayAround"]
+
+_VERSION, _MANNER = 2, 0
+"""Of functions that are never called."""
+
+_NO_LIBRARY: _native.Library = {
+    "version": _VERSION,
+    "manner": _MANNER,
+    "model": b"",
+    "token": b"",
+    "resources": b"",
+    "paths": (),
+    "private": False,
+    "logging": False,
+    "states": False,
+    "categories": (),
+    "mark": None,
+    "solving": None,
+    "system": None,
+    "structural_references": b"",
+    "structural_values": b"",
+}
 
 Advance = Callable[[tuple[Variable, ...], FloatArray, MaskArray], None]
 """Resets the instances in a mask with values of variables, and steps the others."""
@@ -49,24 +60,15 @@ class PlayAround:
     """
 
     def __init__(self, setup: Setup, arrays: Arrays, advance: Advance) -> None:
-        self._description, self._spec = setup.description, setup.spec
         self._advance = advance
         self._pool = self._open(setup, arrays)
 
     def _open(self, setup: Setup, arrays: Arrays) -> _native.Pool:
-        description, spec = self._description, self._spec
-        no_library = PlaceOfFMU((), b"")
-        library = library_settings(description, spec, no_library) | {
-            "private": False,
-            "logging": False,
-            "mark": None,
-            "solving": solving_settings(description, spec),
-            "system": system_settings(description, spec, setup.folder),
-        }
+        spec = setup.spec
         accesses = {"inputs": self._access(spec.inputs), "outputs": self._access(spec.outputs)}
         return _native.Pool(
-            library=cast("_native.Library", library),
-            experiment=cast("_native.Experiment", experiment_settings(spec)),
+            library=_NO_LIBRARY,
+            experiment=cast("_native.Experiment", experiment_settings(spec) | {"retries": 0}),
             variables=cast("_native.Variables", variable_settings(spec) | accesses),
             arrays={
                 "inputs": arrays.inputs,
@@ -82,10 +84,9 @@ class PlayAround:
             listener=None,
         )
 
-    def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
-        version = table_of(self._description)
-        manner = manner_of(self._description, self._spec)
-        return _native.Access(version, *listing(variables, version), manner)
+    @staticmethod
+    def _access(variables: tuple[Variable, ...]) -> _native.Access:
+        return _native.Access(_VERSION, *listing(variables, _VERSION), _MANNER)
 
     def prepare(
         self,
@@ -96,15 +97,15 @@ class PlayAround:
         draws: Any,
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
         surroundings: Mapping[str, Any],
-    ) -> Callable[..., tuple[int, int, int]]:
+    ) -> Callable[..., tuple[Any, int, int, int]]:
         """See ``NativePool.prepare_play``; episodes start in the step after the end of others."""
         start, ended = self._access(variables), episodes[1]
-        kept = {**surroundings, "keeps_always": True}  # the workers overwrite the outputs
+        kept = {**surroundings, "reads_kept": True}  # the workers overwrite the outputs
         prepare(self._pool, start, programs, actions, start_values, draws, episodes, kept)
         before, after, advance = self._pool.play_before, self._pool.play_after, self._advance
 
         @passes_refusals
-        def play(*arrays: Any) -> tuple[int, int, int]:
+        def play(*arrays: Any) -> tuple[Any, int, int, int]:
             before(*arrays)
             advance(variables, start_values, ended)
             return after(*arrays)

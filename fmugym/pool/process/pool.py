@@ -246,7 +246,7 @@ class ProcessPool(SavingPool):
         """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
         return has_native_pool() and self._setup.native and not self._spec.licence_wait
 
-    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[int, int, int]]:
+    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
         """See ``Pool.prepare_play``."""
         if not self.can_play:
             raise SimulationError("compiled hooks need the native pool")
