@@ -68,7 +68,7 @@ class PlayAround:
         accesses = {"inputs": self._access(spec.inputs), "outputs": self._access(spec.outputs)}
         return _native.Pool(
             library=_NO_LIBRARY,
-            experiment=cast("_native.Experiment", experiment_settings(spec) | {"retries": 0}),
+            experiment=cast("_native.Experiment", experiment_settings(spec)),
             variables=cast("_native.Variables", variable_settings(spec) | accesses),
             arrays={
                 "inputs": arrays.inputs,
