@@ -95,7 +95,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
 def _require_playable(env: FMUEnv) -> None:
     """Refuse environments that the native pool cannot play, whatever their hooks are."""
     if not env._open_pool("a vector environment").can_play:
-        raise UntraceableError("the pool is not a native one")
+        raise UntraceableError("the pool is not the native one")
 
 
 class CompiledEngine(BatchEngine):
