@@ -287,6 +287,13 @@ class SystemInstance(Instance):
         assert self._pending is not None
         self._pending.append((self._description.ends[variable.value_reference][0], value))
 
+    def get_string(self, variable: Variable) -> tuple[int, str]:
+        """See ``Instance.get_string``."""
+        end = self._description.ends[variable.value_reference][0]
+        part = self._parts[end.part]
+        status, text = part.instance.get_string(end.variable)
+        return int(self._trying(lambda: part.judge(status))), text
+
     # Initialization: the components are initialized one inside of the other.
 
     def initialize(
