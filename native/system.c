@@ -14,7 +14,7 @@ static Status carry(Composite *me, size_t begin, size_t end) {
 
     for (size_t i = begin; i < end && goes_on(status); i++) {
         const Route *route = &me->system->routes[i];
-        status = route_carry(me, route, me->outputs[route->source], &me->inputs[route->target]);
+        status = route_carry(me, route, &me->outputs[route->source], &me->inputs[route->target]);
     }
     return status;
 }
@@ -105,14 +105,17 @@ static Status evaluate(void *context, const double *x, double *y) {
 
     r->moved = true;
     for (size_t i = 0; i < group->number_of_routes; i++) {
-        me->inputs[me->system->routes[group->routes[i]].target] = x[i];
+        const Route *route = &me->system->routes[group->routes[i]];
+        memcpy(&me->inputs[route->target], x, route->count * sizeof *x);
+        x += route->count;
     }
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
         status = step_part(me, group->parts[i], r->span);
     }
     for (size_t i = 0; i < group->number_of_routes && goes_on(status); i++) {
         const Route *route = &me->system->routes[group->routes[i]];
-        status = route_carry(me, route, me->outputs[route->source], &y[i]);
+        status = route_carry(me, route, &me->outputs[route->source], y);
+        y += route->count;
     }
     return status;
 }
@@ -125,15 +128,17 @@ static Status solve(Composite *me, const PartGroup *group, Span span) {
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
         status = carry_to(me, group->parts[i]);
     }
-    for (size_t i = 0; i < group->number_of_routes; i++) {
-        me->loop[i] = me->inputs[me->system->routes[group->routes[i]].target];
+    for (size_t i = 0, first = 0; i < group->number_of_routes; i++) {
+        const Route *route = &me->system->routes[group->routes[i]];
+        memcpy(&me->loop[first], &me->inputs[route->target], route->count * sizeof(double));
+        first += route->count;
     }
     const bool was_terminated = me->terminated;
     if (goes_on(status)) {
         status = save_all(&repetition);
     }
     if (goes_on(status)) {
-        status = loop_solve(&group->loop, group->number_of_routes, me->loop, evaluate, &repetition);
+        status = loop_solve(&group->loop, group->unknowns, me->loop, evaluate, &repetition);
     }
     me->terminated |= was_terminated;
     if (!goes_on(status) && me->blamed == NULL) {

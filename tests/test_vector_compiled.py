@@ -303,32 +303,12 @@ class TestReadingTheLastStep:
                 env.step(actions[index])
         return envs
 
-    def test_it_equals_single_environments_if_it_was_asked_for(self):
+    def test_it_equals_single_environments(self):
         env = gym.make_vec("fmugym/CartPole-v0", num_envs=2)
         env.reset(seed=0)
-        env.get_attr("action")
         for count, actions in enumerate(self.ACTIONS, 1):
             env.step(actions)
             for name in self.NAMES:
                 expected = tuple(getattr(one, name) for one in self.singles(self.ACTIONS[:count]))
                 assert env.get_attr(name) == expected, name
-        env.close()
-
-    def test_what_was_not_kept_is_refused_until_the_next_step(self):
-        env = gym.make_vec("fmugym/CartPole-v0", num_envs=2)
-        env.reset(seed=0)
-        env.step(self.ACTIONS[0])
-        for name in ("action", "previous_action", "previous_state", "action"):
-            with pytest.raises(ConfigError, match=f"'{name}'.*once after the reset"):
-                env.get_attr(name)
-        assert env.get_attr("inputs") == ((-10.0,), (10.0,))
-        env.step(self.ACTIONS[1])
-        singles = self.singles(self.ACTIONS[:2])
-        for name in ("action", "state", "previous_state"):
-            assert env.get_attr(name) == tuple(getattr(one, name) for one in singles)
-        with pytest.raises(ConfigError, match="'previous_action'"):
-            env.get_attr("previous_action")
-        env.step(self.ACTIONS[2])
-        expected = tuple(one.previous_action for one in self.singles(self.ACTIONS[:3]))
-        assert env.get_attr("previous_action") == expected
         env.close()

@@ -54,9 +54,11 @@ class Component:
         path: The ``.fmu`` file, absolute.
         interface: One of ``fmugym.archive.description.INTERFACES``; None for the FMU's first one.
         steps: Communication steps in one step of the master.
-        starts: Values set before initialization, by the names of the component's variables.
-            Those that an environment sets win.
+        starts: Values set before initialization, by the names of the component's variables and
+            elements of arrays. Those that an environment sets win.
         limits, preload: See ``fmugym.FMU``.
+        sizes: The values of structural parameters.
+        isolate: Whether it runs in a process of its own.
     """
 
     name: str
@@ -66,6 +68,8 @@ class Component:
     starts: tuple[tuple[str, float | str], ...] = ()
     limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
+    sizes: tuple[tuple[str, int], ...] = ()
+    isolate: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,9 @@ class Link:
 
     Attributes:
         source: The name of a component.
-        output: The name of its variable.
+        output: The name of its variable: a scalar, an element of an array, or a whole array.
         target: The name of a component.
-        input: The name of its variable; no other link has it.
+        input: The name of its variable, of the same shape; no other link has it.
         gain, offset: 1 and 0 leave the value as it is.
     """
 
@@ -136,7 +140,7 @@ class End:
 
     Attributes:
         component: The name of the component.
-        variable: The name of its variable.
+        variable: The name of its variable: a scalar, an element of an array, or a whole array.
         gain, offset: ``gain * x + offset`` is the value of the target if x is that of the source.
             An input or parameter of the system is the source, an output of it the target.
     """
