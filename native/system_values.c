@@ -271,7 +271,7 @@ Status system_get_string(const Library *library, void *component, uint32_t refer
     }
     const Fmi *fmi = me->system->parts[end->part].fmi;
     const Status status = fmi->get_string(&me->libraries[end->part], me->components[end->part],
-                                          end->reference, text);
+                                          end->element.reference, text);
     floats_restore_if_seen(me->floats);
     return part_judge(me, end->part, status);
 }
