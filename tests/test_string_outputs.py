@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import test_strings
 import values_tools
+import wine_tools
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv
@@ -115,6 +116,52 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     assert env.out["String_told"] == word
     env.close()
     envs.close()
+
+
+@pytest.mark.skipif(bool(wine_tools.why_not()), reason=wine_tools.why_not())
+@pytest.mark.parametrize("version", [1, 3])
+def test_in_wine(tmp_path, version):
+    path = values_tools.feedthrough_fmu(tmp_path / "Windows.fmu", version, for_windows=True)
+    envs = FMUVectorEnv(lambda: Echo(path), 2)
+    for episode in range(3):
+        _, infos = envs.reset(seed=None if episode else 3)
+        drawn = infos["drawn"]["String_parameter"].tolist()
+        assert drawn == [test_strings.drawn_words(seed, 3)[episode] for seed in (3, 4)]
+        assert infos["told"].tolist() == drawn
+        assert envs.step(np.zeros(2, np.int64))[4]["told"].tolist() == drawn
+    saved = envs.save_state()
+    envs.reset()
+    envs.restore_state(saved)
+    assert [out["String_told"] for out in envs.get_attr("out")] == drawn
+    envs.close()
+
+
+class Pair(test_strings.Reading):
+    """Two components without connections."""
+
+    def __init__(self, path, **options):
+        super().__init__(
+            fmugym.FMUSystem({"a": path, "b": path}, []),
+            model_output_names=["a.length", "b.length"],
+            monitor_names=["a.String_told", "b.String_told"],
+            model_parameters={"a.String_parameter": Choice(WORDS), "b.String_parameter": "zz"},
+            **options,
+        )
+
+    def _is_done(self):
+        return self.out["a.String_told"] == "never"
+
+
+@versions
+@pools
+def test_components_of_a_system(feedthrough, version, options):
+    env = Pair(feedthrough[version], **options)
+    for episode, word in enumerate(test_strings.drawn_words(1, 4)):
+        env.reset(seed=None if episode else 1)
+        env.step(0)
+        assert env.state == (test_strings.SIZES[word], 2.0)
+        assert (env.out["a.String_told"], env.out["b.String_told"]) == (word, "zz")
+    env.close()
 
 
 class Rig:
