@@ -182,6 +182,10 @@ Status system_do_step(const Library *library, void *component, double time, doub
     for (size_t i = 0; i < s->number_of_groups && goes_on(status); i++) {
         status = step_group(me, &s->groups[i], span);
     }
+    /* each tick is for one step only */
+    for (size_t i = 0; i < s->number_of_clocks && goes_on(status); i++) {
+        me->inputs[s->clocks[i]] = 0.0;
+    }
     me->is_fresh = goes_on(status);
     return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
 }

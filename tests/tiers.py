@@ -46,6 +46,7 @@ SLOW_MODULES = {
     "test_value_types",
     "test_systems",
     "test_systems_arrays",
+    "test_systems_clocks",
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",
