@@ -45,6 +45,7 @@ SLOW_MODULES = {
     "test_strings",
     "test_value_types",
     "test_systems",
+    "test_systems_apart",
     "test_systems_arrays",
     "test_systems_clocks",
     "test_systems_description",
@@ -228,7 +229,7 @@ EXHAUSTIVE_TESTS = (
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
     return (
-        node_id.startswith("test_windows_") and "::TestInWine" in node_id
+        node_id.startswith(("test_windows_", "test_systems_")) and "::TestInWine" in node_id
     ) or "wine" in node_id.partition("[")[2]
 
 

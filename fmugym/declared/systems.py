@@ -25,7 +25,7 @@ _KEYS: Final = (
     *("components", "connections", "name", "description", "units", "master", "loops"),
     *("loop_tolerance", "loop_iterations", "step_size", "tolerance"),
 )
-_COMPONENT_KEYS: Final = ("fmu", "start_values", "interface", "steps", "feedthrough")
+_COMPONENT_KEYS: Final = ("fmu", "start_values", "interface", "steps", "feedthrough", "isolate")
 _CONNECTION_KEYS: Final = ("source", "target", "gain", "offset", "convert_units")
 _CHECKS: Final[dict[str, Callable[..., Any]]] = {
     "loop_tolerance": check_number,
@@ -34,6 +34,7 @@ _CHECKS: Final[dict[str, Callable[..., Any]]] = {
     "tolerance": check_number,
     "steps": check_count,
     "feedthrough": check_flag,
+    "isolate": check_flag,
     "gain": check_number,
     "offset": check_number,
     "convert_units": check_flag,

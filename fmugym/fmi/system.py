@@ -869,6 +869,10 @@ class SystemLibrary(Library):
 def _load(
     part: LoadableFMU, label: str, target: logging.Logger, solving: Solving | None
 ) -> Library:
+    if part.is_apart:
+        raise FMULoadError(
+            f"{label}: it runs in a process of its own, which only the C extension can give it"
+        )
     try:
         return Library(part, target, solving)
     except FMULoadError as error:

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription
+from fmugym.archive.fmu import LoadableFMU
+from fmugym.pool.remote import Hosts, place_of, remote_settings
 from fmugym.pool.settings import (
-    PlaceOfFMU,
     library_settings,
     listing,
     manner_of,
@@ -28,23 +28,28 @@ _RUNGS: Final = tuple(ResetMethod)
 
 
 def system_settings(
-    description: ModelDescription, spec: PoolSpec, folder: Path
+    fmu: LoadableFMU, spec: PoolSpec, folder: Path, hosts: Hosts
 ) -> tuple[Any, ...] | None:
     """What ``take_system`` of ``native/python/systems.c`` takes; None for an FMU.
 
     Args:
-        description: That of the system or FMU.
+        fmu: The system or FMU.
         spec: That of the pool.
         folder: That of the extracted system.
+        hosts: For components that have processes of their own.
+
+    Raises:
+        FMULoadError: If Wine is needed and missing here.
     """
+    description = fmu.description
     if not isinstance(description, SystemDescription):
         return None
     layout = Layout(description, spec.inputs, spec.outputs)
     rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     return (
         tuple(
-            _part(part, spec, rung, folder / str(i))
-            for i, (part, rung) in enumerate(zip(layout.parts, rungs, strict=True))
+            _part(part, one, spec, rung, folder / str(i), hosts)
+            for i, (part, one, rung) in enumerate(zip(layout.parts, fmu.parts, rungs, strict=True))
         ),
         _routes(layout),
         (*_arrays(layout), *_variables(layout)),
@@ -54,10 +59,17 @@ def system_settings(
     )
 
 
-def _part(part: PartLayout, spec: PoolSpec, rung: ResetMethod, folder: Path) -> tuple[Any, ...]:
+def _part(
+    part: PartLayout,
+    fmu: LoadableFMU,
+    spec: PoolSpec,
+    rung: ResetMethod,
+    folder: Path,
+    hosts: Hosts,
+) -> tuple[Any, ...]:
     description = part.description
     version = description.fmi_major_version
-    known = library_settings(description, spec, PlaceOfFMU.here(folder, (), version))
+    known = library_settings(description, spec, place_of(fmu, folder))
     label = part.label
     numbers = [(v, float(x)) for v, x in part.starts if v.numeric]
     texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
@@ -79,6 +91,7 @@ def _part(part: PartLayout, spec: PoolSpec, rung: ResetMethod, folder: Path) -> 
         _doubles(x for _, x in numbers),
         tuple(texts),
         (known["structural_references"], known["structural_values"]),
+        remote_settings(fmu, folder, hosts),
     )
 
 

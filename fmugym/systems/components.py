@@ -43,6 +43,9 @@ class Component:
         steps: Communication steps of this component in one of the system.
         feedthrough: False says that no output depends on an input without a step in between, for
             FMUs that tell nothing of it; None for what the FMU tells.
+        isolate: Whether it runs in a process of its own, so that a crash of it ends single
+            episodes only. On Linux, FMUs that have libraries for Windows only run in processes of
+            their own in any case, in Wine.
 
     Raises:
         ConfigError: If a value does not fit.
@@ -53,6 +56,7 @@ class Component:
     interface: str | None = None
     steps: int = 1
     feedthrough: bool | None = None
+    isolate: bool = False
 
     def __post_init__(self) -> None:
         values = check_mapping("start_values of a component", self.start_values)
@@ -62,6 +66,7 @@ class Component:
             check_option("interface", self.interface, INTERFACES)
         if self.feedthrough is not None and check_flag("feedthrough", self.feedthrough):
             raise ConfigError("feedthrough of a component must be False or None, got True")
+        object.__setattr__(self, "isolate", check_flag("isolate", self.isolate))
         if not isinstance(self.fmu, FMU):
             check_path("the path of an FMU", self.fmu)
 
@@ -165,6 +170,7 @@ class OpenComponent:
             limits,
             preload,
             tuple(self.sizes.items()),
+            self.given.isolate,
         )
 
 

@@ -58,6 +58,7 @@ class Component:
             elements of arrays. Those that an environment sets win.
         limits, preload: See ``fmugym.FMU``.
         sizes: The values of structural parameters.
+        isolate: Whether it runs in a process of its own.
     """
 
     name: str
@@ -68,6 +69,7 @@ class Component:
     limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     sizes: tuple[tuple[str, int], ...] = ()
+    isolate: bool = False
 
 
 @dataclass(frozen=True)

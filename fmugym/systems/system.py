@@ -144,6 +144,7 @@ class FMUSystem(WiredSystem):
                 one.fmu.interface,
                 one.given.steps,
                 one.given.feedthrough,
+                one.given.isolate,
             )
             for name, one in self.components.items()
         }

@@ -119,6 +119,7 @@ class _Reader:
                 element.interface,
                 _own_value(element.own, "steps", int) if "steps" in element.own else 1,
                 False if element.own.get("feedthrough") == "false" else None,
+                element.own.get("isolate") == "true",
             )
             for path, element in flat.components.items()
         }

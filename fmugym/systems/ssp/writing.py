@@ -140,6 +140,8 @@ def _component(component: OpenComponent, source: str, used: set[str]) -> Any:
     own = {} if component.given.steps == 1 else {"steps": str(component.given.steps)}
     if component.given.feedthrough is False:
         own["feedthrough"] = "false"
+    if component.given.isolate:
+        own["isolate"] = "true"
     _annotate(element, "Component", own)
     return element
 
