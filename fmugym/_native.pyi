@@ -75,6 +75,13 @@ def echo_to(memory: Array, /) -> None:
         memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
     """
 
+def serve_component() -> None:
+    """Be the worker of a component until the standard input is closed, which ends the process.
+
+    Raises:
+        OSError: If the standard input is no socket, or on Windows.
+    """
+
 def claim_initialization(last: Array, interval: float, /) -> float:
     """Take the next moment at which an instance may be made or initialized.
 
@@ -291,26 +298,23 @@ class Pool:
         states: Array,
         episodes: Episodes,
         kept: Array,
-        keeps_always: bool,
+        reads_kept: bool,
         copies: tuple[tuple[Array, Array], ...],
         variable_starts: tuple[tuple[Array, bytes], ...],
         drawn_variables: tuple[tuple[Array, int], ...],
         input_starts: tuple[tuple[int, float], ...],
+        results: tuple[Any, ...] | None,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
     def play(
         self,
         actions: Array,
-        observations: Array | tuple[Array, ...],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
         drawn: Array,
         last_observations: Array | None,
         started: Array | None,
         /,
-    ) -> tuple[int, int, int]:
+    ) -> tuple[Any, int, int, int]:
         """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:

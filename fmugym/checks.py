@@ -36,6 +36,7 @@ __all__ = [
     "has_method",
     "integer_of",
     "number_of",
+    "parts_of_array",
 ]
 
 LARGEST_COUNT: Final = 2**31 - 1
@@ -253,8 +254,31 @@ def flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
         value = list(value)
     if not isinstance(value, list | tuple):
         return (), [value]
+    if not value:
+        return (0,), []
     parts = [flattened(one) for one in value]
     shapes = {shape for shape, _ in parts}
     elements = [element for _, own in parts for element in own]
     inner = shapes.pop() if len(shapes) == 1 else None
     return (None if inner is None else (len(parts), *inner)), elements
+
+
+def parts_of_array(name: str, shape: tuple[int, ...], value: Any) -> list[Any]:
+    """Give each element of an array its part of a value.
+
+    Args:
+        name: That of the array, for the error.
+        shape: Of the array.
+        value: Nested lists of this shape, a flat list in row-major order, or one value for all.
+
+    Raises:
+        ConfigError: If the value has another shape.
+    """
+    count = math.prod(shape)
+    found, parts = flattened(value)
+    if found == ():
+        return parts * count
+    if found not in {shape, (count,)}:
+        what = "lists of different lengths" if found is None else f"the shape {found}"
+        raise ConfigError(f"{name!r} is an array of shape {shape}, got {what}: {shown(value)}")
+    return parts

@@ -289,12 +289,12 @@ static void store(const Part *part, Type type, const double *values, void *typed
 }
 
 /* A Boolean is a char in FMI 1.0, an int in FMI 2.0, a C bool in FMI 3.0. */
-static Type stored_type(const Access *access, const Group *group) {
-    const Type boolean = access->fmi->boolean_size == 1 ? TYPE_UINT8 : TYPE_INT32;
-    if (group->type == TYPE_CLOCK) {
+static Type stored_type(const Fmi *fmi, Type type) {
+    const Type boolean = fmi->boolean_size == 1 ? TYPE_UINT8 : TYPE_INT32;
+    if (type == TYPE_CLOCK) {
         return TYPE_UINT8;
     }
-    return group->type == TYPE_BOOLEAN ? boolean : group->type;
+    return type == TYPE_BOOLEAN ? boolean : type;
 }
 
 Status access_get(const Access *access, const Library *library, void *component, double *values,
@@ -314,7 +314,7 @@ Status access_get(const Access *access, const Library *library, void *component,
                                        group->count, typed, group->size);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
-        load(&group->listed, stored_type(access, group), typed, values);
+        load(&group->listed, stored_type(access->fmi, group->type), typed, values);
     }
     return worst;
 }
@@ -335,14 +335,53 @@ Status access_set(const Access *access, const Library *library, void *component,
         if (group->type == TYPE_STRING) {
             continue;
         }
-        store(&group->listed, stored_type(access, group), values, typed);
-        store(&group->rest, stored_type(access, group), access->rest, typed);
+        store(&group->listed, stored_type(access->fmi, group->type), values, typed);
+        store(&group->rest, stored_type(access->fmi, group->type), access->rest, typed);
         const Status status = fmi->set(library, component, group->type, group->references,
                                        group->count, typed, group->size);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
     }
     return worst;
+}
+
+/* One element after the other is the whole of an array. */
+static void move(Type type, size_t size, double *values, void *typed, bool loads) {
+    for (uint32_t i = 0; i < size; i++) {
+        const Part one = {1, &i, &i};
+        if (loads) {
+            load(&one, type, typed, values);
+        } else {
+            store(&one, type, values, typed);
+        }
+    }
+}
+
+Status variable_get(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, double *values, void *typed, const Floats *floats) {
+    const bool direct = type == TYPE_FLOAT64;
+    const Status status = fmi->get(library, component, type, &variable->reference, 1,
+                                   direct ? values : typed, variable->size);
+
+    floats_restore_if_seen(floats);
+    if (!direct) {
+        move(stored_type(fmi, type), variable->size, values, typed, true);
+    }
+    return status;
+}
+
+Status variable_set(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, const double *values, void *typed,
+                    const Floats *floats) {
+    const bool direct = type == TYPE_FLOAT64;
+
+    if (!direct) {
+        move(stored_type(fmi, type), variable->size, (double *)values, typed, false);
+    }
+    const Status status = fmi->set(library, component, type, &variable->reference, 1,
+                                   direct ? values : typed, variable->size);
+    floats_restore_if_seen(floats);
+    return status;
 }
 
 static int compare_numbers(const void *number, const void *text) {

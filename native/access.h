@@ -92,6 +92,13 @@ static inline bool access_is_plain(const Access *access) {
     return access->direct && access->groups[0].count == access->groups[0].size;
 }
 
+/* A scalar or an array as a whole. Both functions are those below for one variable. */
+Status variable_get(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, double *values, void *typed, const Floats *floats);
+Status variable_set(const Fmi *fmi, const Library *library, void *component, Type type,
+                    const Element *variable, const double *values, void *typed,
+                    const Floats *floats);
+
 /* Both functions use typed as scratch memory for width doubles and return the worst
  * status. They stop after the first type whose status is worse than a warning. They restore the
  * floating-point environment after each call into the FMU. access_set leaves Strings out. */

@@ -1,7 +1,7 @@
 /* The method of Dormand and Prince of order 5 with an estimate of order 4 and dense output: Hairer,
  * Norsett, Wanner, Solving Ordinary Differential Equations I, section II.5 and II.6. */
 
-#include "solver.h"
+#include "stages.h"
 
 enum { STAGES = 7 };
 
@@ -26,32 +26,35 @@ static const double dense[STAGES] = {-12715105075.0 / 11282082432,  0.0,
                                      701980252875.0 / 199316789632, -1453857185.0 / 822651844,
                                      69997945.0 / 29380423};
 
-/* The weighted sum of the first stages of a state. */
-static double sum(const Solver *me, const double *factors, int count, size_t state) {
-    double total = 0.0;
+/* A stage with the states where it is evaluated, which after the last stage are the result. */
+static ALWAYS_INLINE Status do_stage(Solver *me, const int s, double end) {
+    const double time = me->memory.time, size = end - time;
 
-    for (int j = 0; j < count; j++) {
-        total += factors[j] * me->stages[(size_t)j * me->n + state];
-    }
-    return total;
+    move_by_sums(me->n, me->x, size, weights[s], s, me->stages, me->next);
+    return solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next,
+                        me->stages + (size_t)s * me->n);
+}
+
+/* Written out, so that the compiler knows the number of each stage. */
+static Status do_stages(Solver *me, double end) {
+    Status status = do_stage(me, 1, end);
+
+    status = status <= STATUS_WARNING ? do_stage(me, 2, end) : status;
+    status = status <= STATUS_WARNING ? do_stage(me, 3, end) : status;
+    status = status <= STATUS_WARNING ? do_stage(me, 4, end) : status;
+    status = status <= STATUS_WARNING ? do_stage(me, 5, end) : status;
+    return status <= STATUS_WARNING ? do_stage(me, 6, end) : status;
 }
 
 static Status step(Solver *me, double end, double *error) {
-    const double time = me->memory.time, size = end - time;
-    Status status = STATUS_OK;
+    const double size = end - me->memory.time;
 
     for (size_t i = 0; i < me->n; i++) {
         me->stages[i] = me->rates[i];
     }
-    for (int s = 1; s < STAGES && status <= STATUS_WARNING; s++) {
-        for (size_t i = 0; i < me->n; i++) {
-            me->next[i] = me->x[i] + size * sum(me, weights[s], s, i);
-        }
-        status = solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next,
-                              me->stages + (size_t)s * me->n);
-    }
+    const Status status = do_stages(me, end);
     for (size_t i = 0; i < me->n; i++) {
-        me->trial[i] = size * sum(me, errors, STAGES, i);
+        me->trial[i] = size * weighted_sum(errors, STAGES, me->stages + i, me->n);
     }
     *error = solver_norm(me, me->trial);
     return status;
@@ -65,7 +68,7 @@ static Status between(Solver *me, double end, double fraction, double *x) {
         const double change = me->next[i] - me->x[i];
         const double first = size * me->stages[i] - change;
         const double second = change - size * last[i] - first;
-        const double third = size * sum(me, dense, STAGES, i);
+        const double third = size * weighted_sum(dense, STAGES, me->stages + i, me->n);
         x[i] = me->x[i] +
                fraction * (change + rest * (first + fraction * (second + rest * third)));
     }

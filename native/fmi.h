@@ -158,8 +158,8 @@ typedef struct Fmi {
     Status (*deserialize)(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
 
-    /* Of systems only, otherwise NULL: which FMU failed last, or NULL; and freeing what may still be
-     * freed after a fatal error. */
+    /* Of systems and of components in other processes, otherwise NULL: which FMU failed last and why its
+     * process ended, or NULL; and freeing what may still be freed after a fatal error. */
     const char *(*blamed)(const void *component);
     void (*drop)(const Library *library, void *component);
 } Fmi;
@@ -179,6 +179,12 @@ extern const Fmi composite;
 
 /* NULL if the version has no such manner. Version 0 are systems. */
 const Fmi *fmi_table(int64_t version, int64_t manner);
+
+/* Of one value, in bytes. */
+static inline size_t value_size(const Fmi *fmi, Type type) {
+    static const size_t sizes[NUMBER_OF_TYPES] = {8, 4, 1, 2, 4, 8, 1, 2, 4, 8, 0, 1};
+    return type == TYPE_BOOLEAN ? fmi->boolean_size : sizes[type];
+}
 
 static inline bool has_outputs(Outcome outcome) {
     return outcome.stage == DOING_STEP &&

@@ -22,6 +22,8 @@ static struct {
     size_t length;
 } echo;
 
+static void (*pass)(uint64_t environment, int status, const char *category, const char *text);
+
 bool log_open(Log *log, size_t count, size_t parts, bool terse) {
     memset(log, 0, sizeof *log);
     log->recent = calloc(count * parts, sizeof *log->recent);
@@ -198,6 +200,11 @@ void log_echo_to(char *memory, size_t size) {
     mutex_unlock(&lock);
 }
 
+void log_pass_to(void (*function)(uint64_t environment, int status, const char *category,
+                                  const char *text)) {
+    pass = function;
+}
+
 /* Drops as much of the beginning as the new line needs. Only the end of a line that is too long
  * stays. */
 static void append_to_echo(const char *category, const char *text) {
@@ -230,12 +237,9 @@ static void trim_end(char *text) {
     }
 }
 
-static void deliver(uint64_t environment, int status, const char *category, char *text) {
+static void keep(uint64_t environment, int status, const char *category, const char *text) {
     const size_t index = (size_t)(environment & UINT32_MAX);
 
-    category = category == NULL ? "" : category;
-    trim_end(text);
-    mutex_lock(&lock);
     append_to_echo(category, text);
     Log *log = find_log((uint32_t)(environment >> INDEX_BITS));
     if (log != NULL && index < log->count) {
@@ -245,6 +249,17 @@ static void deliver(uint64_t environment, int status, const char *category, char
         } else {
             queue_message(log, index, status, category, text);
         }
+    }
+}
+
+void log_deliver(uint64_t environment, int status, const char *category, char *text) {
+    category = category == NULL ? "" : category;
+    trim_end(text);
+    mutex_lock(&lock);
+    if (pass == NULL) {
+        keep(environment, status, category, text);
+    } else {
+        pass(environment, status, category, text);
     }
     mutex_unlock(&lock);
 }
@@ -347,7 +362,7 @@ static void format_and_deliver(const char *name, int status, const char *categor
     if (format != NULL) {
         vsnprintf(text, sizeof text, format, arguments);
     }
-    deliver(environment_of(name), status, category, text);
+    log_deliver(environment_of(name), status, category, text);
 }
 
 void log_message_fmi1(void *component, const char *name, int status, const char *category,
@@ -374,5 +389,5 @@ void log_message_fmi3(void *environment, int status, const char *category, const
     char copy[TEXT_SIZE];
 
     snprintf(copy, sizeof copy, "%s", text == NULL ? "" : text);
-    deliver((uint64_t)(uintptr_t)environment, status, category, copy);
+    log_deliver((uint64_t)(uintptr_t)environment, status, category, copy);
 }

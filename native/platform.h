@@ -34,6 +34,13 @@ enum { CACHE_LINE = 64 };
 #define WIDE
 #endif
 
+/* For functions that become much faster when the compiler knows their arguments. */
+#if defined _MSC_VER
+#define ALWAYS_INLINE __forceinline
+#else
+#define ALWAYS_INLINE inline __attribute__((always_inline))
+#endif
+
 /* Atomics. All are sequentially consistent. That costs little, because each is used at most once
  * per chunk of work. */
 

@@ -2,9 +2,20 @@
 
 #include "solver.h"
 
-static void move(Solver *me, double step, const double *rates) {
-    for (size_t i = 0; i < me->n; i++) {
-        me->trial[i] = me->x[i] + step * rates[i];
+/* Its arrays do not overlap, as those of the next function. That helps the compiler. */
+static void move(size_t n, const double *restrict x, double step, const double *restrict rates,
+                 double *restrict moved) {
+    for (size_t i = 0; i < n; i++) {
+        moved[i] = x[i] + step * rates[i];
+    }
+}
+
+static void combine(size_t n, const double *restrict x, double step, const double *restrict k1,
+                    const double *restrict others, double *restrict after) {
+    const double *k2 = others, *k3 = others + n, *k4 = others + 2 * n, sixth = step / 6.0;
+
+    for (size_t i = 0; i < n; i++) {
+        after[i] = x[i] + sixth * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
     }
 }
 
@@ -12,14 +23,14 @@ static Status stages(Solver *me, double step) {
     const double time = me->memory.time, middle = time + 0.5 * step;
     double *k2 = me->stages, *k3 = k2 + me->n, *k4 = k3 + me->n;
 
-    move(me, 0.5 * step, me->rates);
+    move(me->n, me->x, 0.5 * step, me->rates, me->trial);
     Status status = solver_rates(me, middle, me->trial, k2);
     if (status <= STATUS_WARNING) {
-        move(me, 0.5 * step, k2);
+        move(me->n, me->x, 0.5 * step, k2, me->trial);
         status = solver_rates(me, middle, me->trial, k3);
     }
     if (status <= STATUS_WARNING) {
-        move(me, step, k3);
+        move(me->n, me->x, step, k3, me->trial);
         status = solver_rates(me, time + step, me->trial, k4);
     }
     return status;
@@ -29,11 +40,9 @@ static Status stages(Solver *me, double step) {
 static Status between(Solver *me, double end, double fraction, double *x) {
     const double step = (end - me->memory.time) * fraction;
     const Status status = stages(me, step);
-    const double *k2 = me->stages, *k3 = k2 + me->n, *k4 = k3 + me->n;
 
-    for (size_t i = 0; i < me->n && status <= STATUS_WARNING; i++) {
-        const double sum = me->rates[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i];
-        x[i] = me->x[i] + step * sum / 6.0;
+    if (status <= STATUS_WARNING) {
+        combine(me->n, me->x, step, me->rates, me->stages, x);
     }
     return status;
 }

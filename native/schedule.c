@@ -157,6 +157,10 @@ static size_t number_of_helpers(const Task *task, double total) {
 }
 
 static void run(Task *task, double cost, size_t first, size_t count) {
+    if (count - first == 1) { /* there is nothing to divide */
+        work(task, first, count);
+        return;
+    }
     Rest rest = {task, first};
     const Job job = {
         .work = work_on_rest,

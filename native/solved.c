@@ -151,11 +151,6 @@ Status solved_get(const Library *library, void *component, Type type, const uint
     return fmi_of(me)->get(library, me->component, type, references, count, values, size);
 }
 
-static size_t size_of(const Fmi *fmi, Type type) {
-    static const size_t sizes[NUMBER_OF_TYPES] = {8, 4, 1, 2, 4, 8, 1, 2, 4, 8, 0, 1};
-    return type == TYPE_BOOLEAN ? fmi->boolean_size : sizes[type];
-}
-
 /* Notes values; returns whether they are the same as those noted before. */
 static bool is_repeated(LastSet *last, const uint32_t *references, size_t count,
                         const void *values, size_t size) {
@@ -183,7 +178,7 @@ static Status set_one_by_one(Solved *me, Type type, size_t clock) {
     const Solving *s = me->solver.solving;
     const Fmi *fmi = fmi_of(&me->solver);
     const LastSet *last = &me->last[type];
-    const size_t size = size_of(fmi, type), count = last->references == NULL ? 0 : last->count;
+    const size_t size = value_size(fmi, type), count = last->references == NULL ? 0 : last->count;
     Status status = STATUS_OK;
 
     if (count > 0 && last->size != count * size) {
@@ -227,7 +222,7 @@ static Status set_clocks(Solver *me, const uint32_t *references, size_t count,
 static Status set_beside_ramps(Solver *me, Type type, const uint32_t *references, size_t count,
                                const void *values) {
     const Fmi *fmi = fmi_of(me);
-    const size_t size = size_of(fmi, type);
+    const size_t size = value_size(fmi, type);
     Status status = STATUS_OK;
 
     if (type == TYPE_FLOAT64) {
@@ -256,7 +251,7 @@ Status solved_set(const Library *library, void *component, Type type, const uint
         return set_beside_ramps(&me->solver, type, references, count, values);
     }
     if (me->solver.memory.mode != BEFORE_EVENTS) {
-        if (is_repeated(&me->last[type], references, count, values, size * size_of(fmi, type))) {
+        if (is_repeated(&me->last[type], references, count, values, size * value_size(fmi, type))) {
             return STATUS_OK;
         }
         if (me->solver.memory.mode == IN_CONTINUOUS_TIME) {

@@ -17,10 +17,19 @@ enum {
 static const double GROWTH = 6.0, SHRINKAGE = 0.2, SAFETY = 0.9;
 static const double SMALL = 0.01;   /* part of a nominal value that errors are compared with */
 static const double FIRST = 0.01;   /* part of its value that a state changes in the first step */
+static const double ROUNDED = 1.0 + 1e-6; /* a step may be longer than allowed by a rounding */
 static const double ROOT = 0x1p-26; /* of the resolution of doubles; for differences */
 
 static bool good(Status status) {
     return status <= STATUS_WARNING;
+}
+
+/* Like Python's max and min. Those of C are slow calls, because they care about NaN. */
+static inline double larger(double a, double b) {
+    return b > a ? b : a;
+}
+static inline double smaller(double a, double b) {
+    return b < a ? b : a;
 }
 
 /* Memory */
@@ -62,11 +71,11 @@ bool solver_open(Solver *me) {
 
     me->n = s->states;
     double *memory = calloc(me->n * rows + 4 * s->indicators + 1, sizeof *memory);
-    me->pivots = calloc(me->n + 1, sizeof *me->pivots);
+    me->order = calloc(me->n + 1, sizeof *me->order);
     me->kept = calloc(solver_kept_size(me) + 1, 1);
     me->active = calloc(s->number_of_clocks + 1, sizeof *me->active);
     me->arrays = memory;
-    if (memory == NULL || me->pivots == NULL || me->kept == NULL || me->active == NULL) {
+    if (memory == NULL || me->order == NULL || me->kept == NULL || me->active == NULL) {
         solver_close(me);
         return false;
     }
@@ -78,7 +87,7 @@ bool solver_open(Solver *me) {
 
 void solver_close(Solver *me) {
     free(me->arrays);
-    free(me->pivots);
+    free(me->order);
     free(me->kept);
     free(me->active);
 }
@@ -101,9 +110,19 @@ void solver_restore_floats(const Solver *me) {
     floats_restore_if_seen(me->floats);
 }
 
+/* The FMU keeps its time until another one is set. */
+static inline Status set_time(Solver *me, double time) {
+    if (time == me->fmu_time) {
+        return STATUS_OK;
+    }
+    const Status status = sane(me->equations->set_time(me->component, time));
+    me->fmu_time = good(status) ? time : NAN;
+    return status;
+}
+
 /* The caller restores the environment: mostly another call of the FMU follows. */
 static inline Status move(Solver *me, double time, const double *x) {
-    const Status status = sane(me->equations->set_time(me->component, time));
+    const Status status = set_time(me, time);
 
     me->is_there = false;
     return good(status) && me->n > 0
@@ -120,8 +139,11 @@ Status solver_place(Solver *me, double time, const double *x) {
 
 Status solver_indicators(Solver *me, double *z) {
     const size_t count = me->solving->indicators;
-    const Status status =
-        count == 0 ? STATUS_OK : sane(me->equations->get_indicators(me->component, z, count));
+
+    if (count == 0) {
+        return STATUS_OK;
+    }
+    const Status status = sane(me->equations->get_indicators(me->component, z, count));
     solver_restore_floats(me);
     return status;
 }
@@ -160,6 +182,7 @@ static Status read_states(Solver *me) {
         me->nominals[i] = nominal > 0.0 && nominal <= DBL_MAX ? nominal : 1.0;
     }
     me->stale = me->is_there = false;
+    me->fmu_time = NAN;
     me->knows_rates = me->knows_indicators = me->has_jacobian = false;
     return status;
 }
@@ -227,7 +250,7 @@ Status solver_settle(Solver *me) {
         return status;
     }
     const double next = events.has_next && !isnan(events.next) ? events.next : INFINITY;
-    me->memory.next_event = fmin(next, clocks_next(me));
+    me->memory.next_event = smaller(next, clocks_next(me));
     status = enter(me, me->equations->enter_continuous);
     me->memory.mode = IN_CONTINUOUS_TIME;
     return good(status) ? read_states(me) : status;
@@ -249,7 +272,7 @@ double solver_norm(const Solver *me, const double *errors) {
     double sum = 0.0;
 
     for (size_t i = 0; i < me->n; i++) {
-        const double size = fmax(fabs(me->x[i]), fabs(me->next[i]));
+        const double size = larger(fabs(me->x[i]), fabs(me->next[i]));
         const double part = errors[i] / (tolerance * (size + SMALL * me->nominals[i]));
         sum += part * part;
     }
@@ -257,10 +280,21 @@ double solver_norm(const Solver *me, const double *errors) {
 }
 
 static double step_for_difference(double value, double nominal) {
-    return ROOT * fmax(fabs(value), 1e-3 * nominal);
+    return ROOT * larger(fabs(value), 1e-3 * nominal);
 }
 
-/* The derivatives of the rates by one state, from the FMU or from a difference. */
+/* How fast the rates change from those at x, per change. The arrays do not overlap. */
+static void take_slope(size_t n, const double *restrict rates, double change,
+                       double *restrict column) {
+    const double inverse = 1.0 / change;
+
+    for (size_t i = 0; i < n; i++) {
+        column[i] = (column[i] - rates[i]) * inverse;
+    }
+}
+
+/* The derivatives of the rates by one state, from the FMU or from a difference. Between two calls
+ * the trial is x. */
 static Status differentiate_by(Solver *me, size_t state, double *column) {
     const Solving *s = me->solving;
     const double value = me->x[state];
@@ -272,45 +306,47 @@ static Status differentiate_by(Solver *me, size_t state, double *column) {
         solver_restore_floats(me);
         return status;
     }
-    memcpy(me->trial, me->x, me->n * sizeof(double));
     me->trial[state] = value + step_for_difference(value, me->nominals[state]);
     const double change = me->trial[state] - value; /* as rounded */
     const Status status = solver_rates(me, me->memory.time, me->trial, column);
-    for (size_t i = 0; i < me->n; i++) {
-        column[i] = (column[i] - me->rates[i]) / change;
+    me->trial[state] = value;
+    take_slope(me->n, me->rates, change, column);
+    return status;
+}
+
+static Status differentiate_by_states(Solver *me) {
+    const bool asks = me->solving->state_references != NULL;
+    Status status = asks ? solver_place(me, me->memory.time, me->x) : STATUS_OK;
+
+    memcpy(me->trial, me->x, me->n * sizeof *me->trial);
+    for (size_t j = 0; j < me->n && good(status); j++) {
+        status = differentiate_by(me, j, me->found);
+        for (size_t i = 0; i < me->n; i++) {
+            me->jacobian[i * me->n + j] = me->found[i];
+        }
     }
+    me->has_jacobian = good(status);
     return status;
 }
 
 static Status differentiate_by_time(Solver *me, double step) {
     const double time = me->memory.time;
-    const double later = time + fmax(1e-4 * step, ROOT * fabs(time));
+    const double later = time + larger(1e-4 * step, ROOT * fabs(time));
     const Status status = solver_rates(me, later, me->x, me->slope);
 
-    for (size_t i = 0; i < me->n; i++) {
-        me->slope[i] = (me->slope[i] - me->rates[i]) / (later - time);
-    }
+    take_slope(me->n, me->rates, later - time, me->slope);
     return status;
 }
 
 Status solver_differentiate(Solver *me, double step) {
-    double *column = me->found;
-    const bool asks = me->solving->state_references != NULL && !me->has_jacobian;
-    Status status = asks ? solver_place(me, me->memory.time, me->x) : STATUS_OK;
+    const Status status = me->has_jacobian ? STATUS_OK : differentiate_by_states(me);
 
-    for (size_t j = 0; j < me->n && good(status) && !me->has_jacobian; j++) {
-        status = differentiate_by(me, j, column);
-        for (size_t i = 0; i < me->n; i++) {
-            me->jacobian[i * me->n + j] = column[i];
-        }
-    }
-    me->has_jacobian = good(status);
     return good(status) ? differentiate_by_time(me, step) : status;
 }
 
 /* Two times that are this close are the same. */
 static double resolution(const Solver *me, double until) {
-    return 16.0 * DBL_EPSILON * fmax(fabs(me->memory.time), fabs(until));
+    return 16.0 * DBL_EPSILON * larger(fabs(me->memory.time), fabs(until));
 }
 
 /* In the first step each state changes by a small part of its value. */
@@ -329,13 +365,13 @@ static double size_of_step(Solver *me, double remaining) {
     const double most = me->solving->max_step;
 
     if (me->solving->method->order == 0.0) {
-        return remaining / fmax(1.0, ceil(remaining / most - 1e-6));
+        return remaining / larger(1.0, ceil(remaining / (ROUNDED * most)));
     }
     if (!(me->memory.step > 0.0)) {
         me->memory.step = first_step(me);
     }
-    const double size = fmin(me->memory.step, most);
-    if (remaining <= fmin(1.1 * size, most)) {
+    const double size = smaller(me->memory.step, most);
+    if (remaining <= smaller(1.1 * size, ROUNDED * most)) {
         return remaining;
     }
     return remaining < 2.0 * size ? 0.5 * remaining : size;
@@ -343,13 +379,13 @@ static double size_of_step(Solver *me, double remaining) {
 
 static double factor_after(const Solver *me, double error) {
     const double factor = SAFETY * pow(error, -1.0 / me->solving->method->order);
-    return error > 0.0 ? fmin(GROWTH, fmax(SHRINKAGE, factor)) : GROWTH;
+    return error > 0.0 ? smaller(GROWTH, larger(SHRINKAGE, factor)) : GROWTH;
 }
 
 /* A step that was shorter than proposed tells little of how long the next one may be. */
 static void accept(Solver *me, double size, double error) {
     const double proposed = size * factor_after(me, error);
-    me->memory.step = size < me->memory.step ? fmax(me->memory.step, proposed) : proposed;
+    me->memory.step = size < me->memory.step ? larger(me->memory.step, proposed) : proposed;
 }
 
 /* Tries shorter and shorter steps until the error is within the tolerance. Only a method without
@@ -370,7 +406,7 @@ static Status take_step(Solver *me, double until, double *end) {
             return status;
         }
         const bool finite = good(status) && error <= DBL_MAX;
-        me->memory.step = size *= finite ? fmin(SAFETY, factor_after(me, error)) : SHRINKAGE;
+        me->memory.step = size *= finite ? smaller(SAFETY, factor_after(me, error)) : SHRINKAGE;
         if (size < resolution(me, until)) {
             return solver_fail(me, "the solver %s needs steps below %.3g s at t = %.17g s", method->name,
                         size, me->memory.time);
@@ -438,8 +474,8 @@ static Status leave_zero(Solver *me, double until, double *end, bool *event) {
 static Status take_whole_step(Solver *me, double until, double *end, bool *event) {
     Status status = take_step(me, until, end);
 
-    if (good(status)) {
-        status = solver_place(me, *end, me->next);
+    if (good(status) && me->solving->method->last == 0) {
+        status = solver_place(me, *end, me->next); /* the last stage of the others was there */
     }
     if (good(status)) {
         status = solver_indicators(me, me->next_z);
@@ -467,7 +503,7 @@ static Status step_by_fmu(Solver *me, double until) {
         return solver_fail(me, "the FMU returned from a step from t = %.17g s to %.17g s at %.17g s",
                            time, until, reached);
     }
-    me->memory.time = fmin(fmax(time, reached), until);
+    me->memory.time = smaller(larger(time, reached), until);
     me->memory.terminated |= terminate;
     return event && !terminate ? handle_event(me) : status;
 }
@@ -500,7 +536,7 @@ static bool is_due(const Solver *me, double until) {
 }
 
 static Status handle_time_event(Solver *me) {
-    me->memory.time = fmax(me->memory.time, me->memory.next_event);
+    me->memory.time = larger(me->memory.time, me->memory.next_event);
     const bool is_there = me->model->step != NULL; /* the FMU itself keeps its time */
     const Status status = is_there ? STATUS_OK : solver_place(me, me->memory.time, me->x);
     return good(status) ? handle_event(me) : status;
@@ -522,9 +558,9 @@ Status solver_advance(Solver *me, double until) {
         if (is_due(me, until)) {
             status = handle_time_event(me);
         } else if (memory->time < until - resolution(me, until)) {
-            status = step(me, fmin(until, memory->next_event));
+            status = step(me, smaller(until, memory->next_event));
         } else {
-            memory->time = fmax(memory->time, until);
+            memory->time = larger(memory->time, until);
             break;
         }
     }

@@ -73,6 +73,7 @@ typedef struct Solver {
     const Floats *floats;
     uint64_t environment; /* for messages */
     Memory memory;
+    double fmu_time;       /* the time of the FMU; NaN if it must be set */
     bool is_there;         /* whether the FMU is at the time of the memory and at x */
     bool stale;            /* whether x and the nominal values must be read */
     bool knows_rates;      /* whether rates are those at x */
@@ -85,11 +86,12 @@ typedef struct Solver {
     double *next;          /* x at the end of the step that is tried */
     double *nominals;
     double *z, *next_z; /* event indicators at x, and after the step */
-    double *trial;      /* for the methods: a state, or errors */
-    double *found, *low_z, *found_z; /* while an event is located */
+    double *trial;      /* for the methods: a state, errors, or the right-hand side of a stage */
+    double *found;      /* a state where an event is looked for; for the methods: rates */
+    double *low_z, *found_z; /* while an event is located */
     double *stages;     /* n for each stage of the method */
     double *jacobian, *matrix, *slope; /* for methods that need them */
-    uint32_t *pivots;
+    uint32_t *order; /* of the rows of the matrix */
     char *kept;   /* the memory of ticks and ramps, which is saved with the state */
     Ticks *ticks; /* one for each clock */
     Ramp *ramps;

@@ -14,7 +14,7 @@ static Status carry(Composite *me, size_t begin, size_t end) {
 
     for (size_t i = begin; i < end && goes_on(status); i++) {
         const Route *route = &me->system->routes[i];
-        status = route_carry(me, route, me->outputs[route->source], &me->inputs[route->target]);
+        status = route_carry(me, route, &me->outputs[route->source], &me->inputs[route->target]);
     }
     return status;
 }
@@ -105,14 +105,17 @@ static Status evaluate(void *context, const double *x, double *y) {
 
     r->moved = true;
     for (size_t i = 0; i < group->number_of_routes; i++) {
-        me->inputs[me->system->routes[group->routes[i]].target] = x[i];
+        const Route *route = &me->system->routes[group->routes[i]];
+        memcpy(&me->inputs[route->target], x, route->count * sizeof *x);
+        x += route->count;
     }
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
         status = step_part(me, group->parts[i], r->span);
     }
     for (size_t i = 0; i < group->number_of_routes && goes_on(status); i++) {
         const Route *route = &me->system->routes[group->routes[i]];
-        status = route_carry(me, route, me->outputs[route->source], &y[i]);
+        status = route_carry(me, route, &me->outputs[route->source], y);
+        y += route->count;
     }
     return status;
 }
@@ -125,15 +128,17 @@ static Status solve(Composite *me, const PartGroup *group, Span span) {
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
         status = carry_to(me, group->parts[i]);
     }
-    for (size_t i = 0; i < group->number_of_routes; i++) {
-        me->loop[i] = me->inputs[me->system->routes[group->routes[i]].target];
+    for (size_t i = 0, first = 0; i < group->number_of_routes; i++) {
+        const Route *route = &me->system->routes[group->routes[i]];
+        memcpy(&me->loop[first], &me->inputs[route->target], route->count * sizeof(double));
+        first += route->count;
     }
     const bool was_terminated = me->terminated;
     if (goes_on(status)) {
         status = save_all(&repetition);
     }
     if (goes_on(status)) {
-        status = loop_solve(&group->loop, group->number_of_routes, me->loop, evaluate, &repetition);
+        status = loop_solve(&group->loop, group->unknowns, me->loop, evaluate, &repetition);
     }
     me->terminated |= was_terminated;
     if (!goes_on(status) && me->blamed == NULL) {
@@ -159,16 +164,12 @@ static Status step_group(Composite *me, const PartGroup *group, Span span) {
     return status;
 }
 
-Status system_do_step(const Library *library, void *component, double time, double step,
-                      bool no_return) {
-    Composite *me = component;
+Status system_step_once(Composite *me, double time, double step, bool no_return) {
     const System *s = me->system;
     const Span span = {time, step, no_return};
 
-    (void)library;
     me->blamed = NULL;
     me->terminated = false;
-    me->kept.stepped = true;
     Status status = me->is_fresh ? STATUS_OK : system_refresh(me);
     me->is_fresh = false;
     if (goes_on(status) && s->jacobi) {
@@ -179,6 +180,16 @@ Status system_do_step(const Library *library, void *component, double time, doub
     }
     me->is_fresh = goes_on(status);
     return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
+}
+
+Status system_do_step(const Library *library, void *component, double time, double step,
+                      bool no_return) {
+    Composite *me = component;
+
+    (void)library;
+    me->kept.stepped = true;
+    return me->system->control.tolerance > 0.0 ? system_step_controlled(me, time, step)
+                                               : system_step_once(me, time, step, no_return);
 }
 
 static bool exchange(const Library *library, const Exchange *e) {

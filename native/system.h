@@ -27,11 +27,13 @@ typedef enum {
 } Rung;
 
 /* An FMU of the system. */
-typedef struct {
+typedef struct Component {
     const char *name;
     const char *label;      /* names it in messages */
     const char *not_finite; /* the same if its outputs are not finite */
     const Fmi *fmi;
+    int64_t version, manner; /* for which fmi_table has the functions of the FMU itself */
+    const struct Remote *remote; /* how its workers run, or NULL in this process */
     const char *model, *token, *resources;
     const char **categories;
     size_t number_of_categories;
@@ -47,6 +49,8 @@ typedef struct {
     const double *start_values;
     PartString *strings;
     size_t number_of_strings;
+    size_t number_of_structural; /* see Experiment */
+    const char *structural_references, *structural_values;
 } Component;
 
 /* target = gain * source + offset; without arithmetic if they are 1 and 0. */
@@ -59,17 +63,19 @@ static inline double scaled(Scale scale, double value) {
     return scale.plain ? value : scale.gain * value + scale.offset;
 }
 
-/* From a slot of an output to a slot of an input. */
+/* From slots of outputs to as many slots of inputs: one, or those of a whole array. */
 typedef struct {
-    uint32_t source, target, source_part, target_part;
+    uint32_t source, target, source_part, target_part, count;
     Scale scale;
 } Route;
 
-/* A variable of an FMU behind one of the system. */
+/* A scalar or an element of an FMU behind one of the system. */
 typedef struct {
-    uint32_t part, reference;
+    uint32_t part;
     Type type;
+    Element element;
     int32_t input, output; /* its slots, or -1 */
+    const double *starts;  /* of all elements of its array; NULL for a scalar */
     Scale scale;
 } End;
 
@@ -79,6 +85,7 @@ typedef struct {
     size_t count;
     const uint32_t *routes;
     size_t number_of_routes;
+    size_t unknowns; /* the values that the routes carry */
     bool has_loop;
     LoopMethod loop;
     const char *label; /* names it in messages */
@@ -88,15 +95,36 @@ typedef struct {
 typedef struct {
     const uint32_t *routes;
     size_t count;
+    size_t unknowns; /* the values that they carry */
     bool has_loop;
     LoopMethod loop;
     const char *label;
 } Transfer;
 
+/* How the sizes of steps follow from an estimate of the error; see system_control.c. */
+typedef struct {
+    double tolerance; /* 0 for steps of one size */
+    double smallest;  /* step size, or 0 */
+    const uint32_t *sources; /* the slots of the outputs that are compared */
+    const double *nominals;
+    size_t count;
+} StepControl;
+
+/* Slots of outputs that the master fills; fmugym/systems/plan.py lists their names. */
+enum {
+    COUNT_OF_STEPS,
+    COUNT_OF_REJECTIONS,
+    NEXT_SIZE,
+    WORST_ERROR,
+    ERROR_OF_FIRST /* and those of all others that are compared */
+};
+
 typedef struct System {
     Component *parts;
     size_t count;
     size_t inputs, outputs; /* numbers of slots */
+    size_t first_statistic; /* the first slot of the master's own outputs */
+    StepControl control;
     Route *routes;          /* sorted by the parts of their targets */
     size_t number_of_routes;
     PartGroup *groups;
@@ -120,7 +148,14 @@ typedef struct {
     const End *end;
     double value;
     const char *text; /* of a String, or NULL */
+    bool done;        /* with another element of its array */
 } Pending;
+
+/* What becomes of the values of an array, or of the value of a scalar, before they are set. */
+typedef struct {
+    void (*make)(void *context, const End *end, double *values);
+    void *context;
+} Change;
 
 /* One place for each part. */
 typedef struct {
@@ -159,7 +194,9 @@ typedef struct {
     uint64_t environment; /* of the first part */
     bool logging;
     bool hears, has_chosen; /* whether the parts are asked for messages, if they were told */
-    double *loop, *typed; /* scratch memory */
+    void *beginning; /* the state before a step whose error is estimated */
+    double *coarse;  /* the values after a step that is repeated by halves; then scratch memory */
+    double *loop, *typed, *whole; /* scratch memory: of loops; for the values of a part */
     Pending *pending;
     size_t number_pending, room;
 } Composite;
@@ -179,6 +216,12 @@ Status system_choose_messages(const Library *library, void *component,
                               const char *const *categories, size_t count);
 Status system_initialize(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing);
+/* One step without an estimate of its error. */
+Status system_step_once(Composite *me, double time, double step, bool no_return);
+/* As many steps as the tolerance needs. */
+Status system_step_controlled(Composite *me, double time, double step);
+/* Frees the state before the last step. */
+void control_forget(Composite *me);
 Status system_do_step(const Library *library, void *component, double time, double step,
                       bool no_return);
 Status system_reset(const Library *library, void *component);
@@ -231,12 +274,17 @@ Status part_judge(Composite *me, size_t index, Status status);
 /* Sets the inputs of a part to its slots; and fills the slots of its outputs. The caller judges the
  * status. */
 Status part_set_inputs(Composite *me, size_t index);
-/* One variable of a part. The place of its reference must stay the same: solvers compare it. */
-Status part_get(Composite *me, size_t index, Type type, const uint32_t *reference, double *value);
-Status part_set(Composite *me, size_t index, Type type, const uint32_t *reference, double value);
 Status part_read(Composite *me, size_t index);
+/* A scalar, or the array of an element as a whole, which has slots. The place of the element must
+ * stay the same: solvers compare that of its reference. */
+Status part_get(Composite *me, size_t index, Type type, const Element *element, double *values);
+Status part_set(Composite *me, size_t index, Type type, const Element *element,
+                const double *values);
+/* Sets a scalar, or the array of an element as a whole: to the values, or else to those that it has
+ * now, with a change. */
+Status end_set(Composite *me, const End *end, const double *values, Change change);
 /* Computes what a route carries. Values that are not finite must not reach other FMUs. */
-Status route_carry(Composite *me, const Route *route, double value, double *carried);
+Status route_carry(Composite *me, const Route *route, const double *values, double *carried);
 /* Fills the output slots of all parts. */
 Status system_refresh(Composite *me);
 

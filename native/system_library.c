@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "log.h"
+#include "remote.h"
 #include "system.h"
 
 /* What takes the place of a table of functions. */
@@ -18,17 +19,28 @@ static Loaded *loaded(const Library *library) {
     return library->functions;
 }
 
-static bool load_part(Library *library, const Component *part, const char *path, char *error,
-                      size_t size) {
-    char reason[512];
+static bool load_part(Library *library, const System *system, size_t index, const char *path,
+                      char *error, size_t size) {
+    const Component *part = &system->parts[index];
+    char reason[1200];
 
     library->identifier = part->model;
-    const bool good = library_open(library, path, reason, sizeof reason) &&
-                      part->fmi->bind(library, reason, sizeof reason);
+    const bool good = part->remote != NULL
+                          ? remote_open(library, part, system->count, reason, sizeof reason)
+                          : library_open(library, path, reason, sizeof reason) &&
+                                part->fmi->bind(library, reason, sizeof reason);
     if (!good) {
         snprintf(error, size, "%s: %s", part->label, reason);
     }
     return good;
+}
+
+static void unload_part(Library *library, const Component *part) {
+    if (part->remote != NULL) {
+        remote_close(library);
+    } else {
+        library_close(library);
+    }
 }
 
 bool system_load(Library *library, const System *system, const char *const *paths, char *error,
@@ -41,7 +53,7 @@ bool system_load(Library *library, const System *system, const char *const *path
     loaded(library)->system = system;
     loaded(library)->paths = paths;
     for (size_t i = 0; i < system->count; i++) {
-        if (!load_part(&loaded(library)->parts[i], &system->parts[i], paths[i], error, size)) {
+        if (!load_part(&loaded(library)->parts[i], system, i, paths[i], error, size)) {
             system_unload(library);
             return false;
         }
@@ -51,7 +63,7 @@ bool system_load(Library *library, const System *system, const char *const *path
 
 void system_unload(Library *library) {
     for (size_t i = 0; library->functions != NULL && i < loaded(library)->system->count; i++) {
-        library_close(&loaded(library)->parts[i]);
+        unload_part(&loaded(library)->parts[i], &loaded(library)->system->parts[i]);
     }
     library_close(library);
 }
@@ -65,6 +77,7 @@ static void free_arrays(Composite *me) {
     free((void *)me->parts.before);
     free(me->parts.names);
     start_free(me);
+    free(me->coarse);
     free(me->loop);
     free(me->typed);
     free(me->pending);
@@ -77,10 +90,12 @@ static bool allocate(Composite *me, const System *s) {
     me->parts.failed = calloc(s->count, sizeof(bool));
     me->parts.before = calloc(s->count, sizeof(void *));
     me->parts.names = calloc(s->count, LOG_NAME);
+    me->coarse = calloc(ERROR_OF_FIRST + 2 * s->control.count, sizeof(double));
     me->loop = calloc(s->memory + 1, sizeof(double));
-    me->typed = calloc(s->scratch + 1, sizeof(double));
+    me->typed = calloc(2 * (s->scratch + 1), sizeof(double));
+    me->whole = me->typed == NULL ? NULL : me->typed + s->scratch + 1;
     return me->parts.dead != NULL && me->parts.started != NULL && me->parts.failed != NULL &&
-           me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
+           me->coarse != NULL && me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
            me->typed != NULL && start_allocate(me);
 }
 
@@ -159,24 +174,30 @@ bool part_reload(Composite *me, size_t index) {
     Library *library = &me->libraries[index];
     char unused[256];
 
-    library_close(library);
+    unload_part(library, &me->system->parts[index]);
     memset(library, 0, sizeof *library);
-    const bool good = load_part(library, &me->system->parts[index], me->paths[index], unused,
-                                sizeof unused);
+    const bool good =
+        load_part(library, me->system, index, me->paths[index], unused, sizeof unused);
     floats_restore_if_seen(me->floats);
     return good;
 }
 
-/* FMI forbids every call after a fatal error, so the memory of such a part is lost. */
+/* FMI forbids every call after a fatal error, so the FMU's memory of such a part is lost. */
 void system_free(const Library *library, void *component) {
     Composite *me = component;
     const bool complete =
         me->parts.dead != NULL && me->parts.before != NULL && me->kept.states != NULL;
 
     (void)library;
+    if (complete) {
+        control_forget(me);
+    }
     for (size_t i = 0; complete && i < me->system->count; i++) {
+        const Fmi *fmi = me->system->parts[i].fmi;
         if (me->components[i] != NULL && !me->parts.dead[i]) {
             part_free(me, i);
+        } else if (me->components[i] != NULL && fmi->drop != NULL) {
+            fmi->drop(&me->libraries[i], me->components[i]);
         }
     }
     free_arrays(me);

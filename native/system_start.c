@@ -18,16 +18,44 @@ typedef struct {
     size_t index;
 } Place;
 
-static Status set_pending(Composite *me, size_t index, const Pending *pending) {
+/* Those of the pending values that belong to an array, or to a scalar. */
+typedef struct {
+    Pending *first, *end;
+} Awaiting;
+
+static bool is_of_same_array(const End *one, const End *other) {
+    return one->part == other->part && one->type == other->type &&
+           one->element.reference == other->element.reference;
+}
+
+static void put_pending(void *context, const End *end, double *values) {
+    const Awaiting *awaiting = context;
+
+    for (Pending *p = awaiting->first; p < awaiting->end; p++) {
+        if (p == awaiting->first || (p->text == NULL && is_of_same_array(p->end, end))) {
+            values[p->end->element.place] = p->value;
+            p->done = true;
+        }
+    }
+}
+
+/* FMI sets whole arrays: all pending elements of an array are set with the first one, and the
+ * others start with what the system says. */
+static Status set_pending(Composite *me, size_t index, Pending *pending) {
     const End *end = pending->end;
     const Component *part = &me->system->parts[index];
+    Awaiting awaiting = {pending, end->starts == NULL ? pending + 1
+                                                      : me->pending + me->number_pending};
 
     if (pending->text == NULL) {
-        return part_set(me, index, end->type, &end->reference, pending->value);
+        const double *slots = end->starts == NULL || end->input < 0
+                                  ? end->starts
+                                  : me->inputs + end->input - end->element.place;
+        return end_set(me, end, slots, (Change){put_pending, &awaiting});
     }
     return part_judge(me, index, part->fmi->set_string(&me->libraries[index],
                                                        me->components[index],
-                                                       end->reference, pending->text));
+                                                       end->element.reference, pending->text));
 }
 
 /* What is set for this simulation wins over what the system says. */
@@ -47,7 +75,7 @@ static Status set_starts(void *context) {
                                                              string->text));
     }
     for (size_t i = 0; i < me->number_pending && status <= STATUS_WARNING; i++) {
-        if (me->pending[i].end->part == index) {
+        if (me->pending[i].end->part == index && !me->pending[i].done) {
             status = set_pending(me, index, &me->pending[i]);
         }
     }
@@ -66,11 +94,16 @@ static Status begin_next(void *context) {
 
 static Status initialize_part(const Beginning *b, size_t index, StartValues values) {
     Composite *me = b->me;
+    const Component *part = &me->system->parts[index];
+    Experiment experiment = *b->experiment;
 
+    experiment.number_of_structural = part->number_of_structural;
+    experiment.structural_references = part->structural_references;
+    experiment.structural_values = part->structural_values;
     me->parts.started[index] = true;
-    const Status status = part_judge(me, index, me->system->parts[index].fmi->initialize(
-                                                    &me->libraries[index], me->components[index],
-                                                    b->experiment, values, b->doing));
+    const Status status =
+        part_judge(me, index, part->fmi->initialize(&me->libraries[index], me->components[index],
+                                                    &experiment, values, b->doing));
     me->parts.failed[index] |= status > STATUS_WARNING;
     return status;
 }
@@ -91,28 +124,33 @@ static Status begin_if_old(const Beginning *b, size_t index) {
     return waits ? begin_part(b, index, false) : STATUS_OK;
 }
 
-static Status read_source(const Beginning *b, const Route *route, double *value) {
-    const Component *part = &b->me->system->parts[route->source_part];
+static Status read_source(const Beginning *b, const Route *route, double *values) {
+    Composite *me = b->me;
+    const Component *part = &me->system->parts[route->source_part];
     const size_t place = route->source - part->first_output;
+    const Element *element = &part->outputs.variables[place];
     Status status = begin_if_old(b, route->source_part);
 
     if (status <= STATUS_WARNING) {
-        status = part_get(b->me, route->source_part, (Type)part->outputs.types[place],
-                          &part->outputs.variables[place].reference, value);
+        status = part_get(me, route->source_part, (Type)part->outputs.types[place], element,
+                          me->whole);
     }
-    return status > STATUS_WARNING ? status : route_carry(b->me, route, *value, value);
+    return status > STATUS_WARNING ? status
+                                   : route_carry(me, route, me->whole + element->place, values);
 }
 
-/* An FMU of FMI 1.0 that waits gets the value when it begins. */
-static Status write_target(const Beginning *b, const Route *route, double value) {
+/* An FMU of FMI 1.0 that waits gets the values when it begins. An element of an array is set with
+ * the others, which stay as they are. */
+static Status write_target(const Beginning *b, const Route *route, const double *values) {
     Composite *me = b->me;
     const Component *part = &me->system->parts[route->target_part];
     const size_t place = route->target - part->first_input;
+    const Element *element = &part->inputs.variables[place];
 
-    me->inputs[route->target] = value;
+    memmove(&me->inputs[route->target], values, route->count * sizeof *values);
     return me->parts.started[route->target_part]
-               ? part_set(me, route->target_part, (Type)part->inputs.types[place],
-                          &part->inputs.variables[place].reference, value)
+               ? part_set(me, route->target_part, (Type)part->inputs.types[place], element,
+                          &me->inputs[route->target] - element->place)
                : STATUS_OK;
 }
 
@@ -121,30 +159,37 @@ typedef struct {
     const Transfer *transfer;
 } LoopOfLinks;
 
+static Status read_all(const Beginning *b, const Transfer *transfer, double *values) {
+    Status status = STATUS_OK;
+
+    for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
+        const Route *route = &b->me->system->routes[transfer->routes[i]];
+        status = read_source(b, route, values);
+        values += route->count;
+    }
+    return status;
+}
+
 static Status evaluate(void *context, const double *x, double *y) {
     const LoopOfLinks *loop = context;
     const Route *routes = loop->beginning->me->system->routes;
     Status status = STATUS_OK;
 
     for (size_t i = 0; i < loop->transfer->count && status <= STATUS_WARNING; i++) {
-        status = write_target(loop->beginning, &routes[loop->transfer->routes[i]], x[i]);
+        const Route *route = &routes[loop->transfer->routes[i]];
+        status = write_target(loop->beginning, route, x);
+        x += route->count;
     }
-    for (size_t i = 0; i < loop->transfer->count && status <= STATUS_WARNING; i++) {
-        status = read_source(loop->beginning, &routes[loop->transfer->routes[i]], &y[i]);
-    }
-    return status;
+    return status > STATUS_WARNING ? status : read_all(loop->beginning, loop->transfer, y);
 }
 
 static Status solve(const Beginning *b, const Transfer *transfer) {
     Composite *me = b->me;
     LoopOfLinks context = {b, transfer};
-    Status status = STATUS_OK;
+    Status status = read_all(b, transfer, me->loop);
 
-    for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
-        status = read_source(b, &me->system->routes[transfer->routes[i]], &me->loop[i]);
-    }
     if (status <= STATUS_WARNING) {
-        status = loop_solve(&transfer->loop, transfer->count, me->loop, evaluate, &context);
+        status = loop_solve(&transfer->loop, transfer->unknowns, me->loop, evaluate, &context);
     }
     if (status > STATUS_WARNING && me->blamed == NULL) {
         me->blamed = transfer->label;
@@ -157,10 +202,10 @@ static Status carry(const Beginning *b, const Transfer *transfer) {
 
     for (size_t i = 0; i < transfer->count && status <= STATUS_WARNING; i++) {
         const Route *route = &b->me->system->routes[transfer->routes[i]];
-        double value;
-        status = read_source(b, route, &value);
+        double *values = &b->me->inputs[route->target];
+        status = read_source(b, route, values);
         if (status <= STATUS_WARNING) {
-            status = write_target(b, route, value);
+            status = write_target(b, route, values);
         }
     }
     return status;
@@ -234,7 +279,7 @@ static Status set_links(void *context) {
 
     for (size_t i = part->first_route; i < part->end_route && status <= STATUS_WARNING; i++) {
         const Route *route = &me->system->routes[i];
-        status = write_target(place->beginning, route, me->inputs[route->target]);
+        status = write_target(place->beginning, route, &me->inputs[route->target]);
     }
     return status;
 }

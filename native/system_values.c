@@ -2,54 +2,104 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "system.h"
+
+/* Names a part, and tells why its process has ended. */
+static const char *label_of(const Composite *me, size_t index) {
+    const Component *part = &me->system->parts[index];
+    const char *label =
+        part->fmi->blamed == NULL ? NULL : part->fmi->blamed(me->components[index]);
+    return label == NULL ? part->label : label;
+}
 
 Status part_judge(Composite *me, size_t index, Status status) {
     floats_restore_if_seen(me->floats);
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
-        me->blamed = me->blamed == NULL ? me->system->parts[index].label : me->blamed;
+        me->blamed = me->blamed == NULL ? label_of(me, index) : me->blamed;
         me->parts.dead[index] |= status == STATUS_FATAL;
         me->parts.failed[index] |= status == STATUS_ERROR;
     }
     return status;
 }
 
-static Access access_of_one(const Component *part, Type type, const uint32_t *reference,
-                            uint32_t *position) {
-    Access access = {.fmi = part->fmi,
-                     .count = 1,
-                     .width = 1,
-                     .number_of_groups = 1,
-                     .direct = type == TYPE_FLOAT64,
-                     .start_time = -1};
-
-    *position = 0;
-    access.groups[0] = (Group){.type = type,
-                               .count = 1,
-                               .size = 1,
-                               .references = (uint32_t *)reference,
-                               .offsets = position,
-                               .listed = {1, position, position}};
-    return access;
+static Status get_variable(Composite *me, size_t index, Type type, const Element *element,
+                           double *values, void *typed) {
+    return part_judge(me, index, variable_get(me->system->parts[index].fmi, &me->libraries[index],
+                                              me->components[index], type, element, values, typed,
+                                              me->floats));
 }
 
-Status part_get(Composite *me, size_t index, Type type, const uint32_t *reference, double *value) {
-    uint32_t position;
-    const Access one = access_of_one(&me->system->parts[index], type, reference, &position);
-
-    return part_judge(me, index, access_get(&one, &me->libraries[index],
-                                            me->components[index], value, me->typed,
-                                            me->floats));
+static Status set_variable(Composite *me, size_t index, Type type, const Element *element,
+                           const double *values, void *typed) {
+    return part_judge(me, index, variable_set(me->system->parts[index].fmi, &me->libraries[index],
+                                              me->components[index], type, element, values, typed,
+                                              me->floats));
 }
 
-Status part_set(Composite *me, size_t index, Type type, const uint32_t *reference, double value) {
-    uint32_t position;
-    const Access one = access_of_one(&me->system->parts[index], type, reference, &position);
+Status part_get(Composite *me, size_t index, Type type, const Element *element, double *values) {
+    return get_variable(me, index, type, element, values, me->typed);
+}
 
-    return part_judge(me, index, access_set(&one, &me->libraries[index],
-                                            me->components[index], &value, me->typed,
-                                            me->floats));
+Status part_set(Composite *me, size_t index, Type type, const Element *element,
+                const double *values) {
+    return set_variable(me, index, type, element, values, me->typed);
+}
+
+/* Arrays without slots may be longer than the scratch memory. */
+typedef struct {
+    double *values, *typed;
+} Room;
+
+static bool make_room(const Composite *me, const End *end, Room *room) {
+    const size_t size = end->element.size;
+
+    *room = (Room){me->whole, me->typed};
+    if (size > 1) {
+        room->values = malloc(2 * size * sizeof(double));
+        room->typed = room->values == NULL ? NULL : room->values + size;
+    }
+    return room->values != NULL;
+}
+
+static void leave_room(const Composite *me, Room room) {
+    if (room.values != me->whole) {
+        free(room.values);
+    }
+}
+
+static Status end_get(Composite *me, const End *end, double *value) {
+    Room room;
+
+    if (!make_room(me, end, &room)) {
+        return STATUS_ERROR;
+    }
+    const Status status =
+        get_variable(me, end->part, end->type, &end->element, room.values, room.typed);
+    *value = room.values[end->element.place];
+    leave_room(me, room);
+    return status;
+}
+
+Status end_set(Composite *me, const End *end, const double *values, Change change) {
+    Room room;
+    Status status = STATUS_OK;
+
+    if (!make_room(me, end, &room)) {
+        return STATUS_ERROR;
+    }
+    if (values != NULL) {
+        memcpy(room.values, values, end->element.size * sizeof(double));
+    } else if (end->element.size > 1) {
+        status = get_variable(me, end->part, end->type, &end->element, room.values, room.typed);
+    }
+    if (status <= STATUS_WARNING) {
+        change.make(change.context, end, room.values);
+        status = set_variable(me, end->part, end->type, &end->element, room.values, room.typed);
+    }
+    leave_room(me, room);
+    return status;
 }
 
 Status part_set_inputs(Composite *me, size_t index) {
@@ -78,12 +128,14 @@ Status part_read(Composite *me, size_t index) {
                       me->outputs + part->first_output, me->typed, me->floats);
 }
 
-Status route_carry(Composite *me, const Route *route, double value, double *carried) {
-    if (!isfinite(value)) {
-        me->blamed = me->system->parts[route->source_part].not_finite;
-        return STATUS_NOT_FINITE;
+Status route_carry(Composite *me, const Route *route, const double *values, double *carried) {
+    for (size_t i = 0; i < route->count; i++) {
+        if (!isfinite(values[i])) {
+            me->blamed = me->system->parts[route->source_part].not_finite;
+            return STATUS_NOT_FINITE;
+        }
+        carried[i] = scaled(route->scale, values[i]);
     }
-    *carried = scaled(route->scale, value);
     return STATUS_OK;
 }
 
@@ -110,12 +162,13 @@ static Status get_one(Composite *me, uint32_t reference, double *value) {
     if (end == NULL) {
         return STATUS_ERROR;
     }
-    if (end->output >= 0 && me->is_fresh) {
+    const bool is_own = end->output >= (int64_t)me->system->first_statistic;
+    if (end->output >= 0 && (me->is_fresh || is_own)) {
         *value = me->outputs[end->output];
     } else if (end->input >= 0) {
         *value = me->inputs[end->input];
     } else {
-        status = part_get(me, end->part, end->type, &end->reference, value);
+        status = end_get(me, end, value);
     }
     *value = scaled(end->scale, *value);
     return status;
@@ -148,8 +201,12 @@ static Status note(Composite *me, const End *end, double value, const char *text
         me->pending = pending;
         me->room = room;
     }
-    me->pending[me->number_pending++] = (Pending){end, value, text};
+    me->pending[me->number_pending++] = (Pending){end, value, text, false};
     return STATUS_OK;
+}
+
+static void put(void *context, const End *end, double *values) {
+    values[end->element.place] = *(const double *)context;
 }
 
 static Status set_end(Composite *me, const End *end, double value) {
@@ -161,7 +218,7 @@ static Status set_end(Composite *me, const End *end, double value) {
         return note(me, end, value, NULL);
     }
     me->is_fresh = false;
-    return part_set(me, end->part, end->type, &end->reference, value);
+    return end_set(me, end, NULL, (Change){put, &value});
 }
 
 Status system_set(const Library *library, void *component, Type type, const uint32_t *references,
@@ -190,8 +247,15 @@ Status system_set(const Library *library, void *component, Type type, const uint
 Status system_set_string(const Library *library, void *component, uint32_t reference,
                          const char *text) {
     Composite *me = component;
+    const System *s = me->system;
+    bool good = true;
 
     (void)library;
-    const End *end = first_end(me, reference);
-    return end == NULL ? STATUS_ERROR : note(me, end, 0.0, text);
+    if (reference >= s->number_of_variables) {
+        return STATUS_ERROR;
+    }
+    for (uint32_t i = s->first_ends[reference]; i < s->first_ends[reference + 1] && good; i++) {
+        good = note(me, &s->ends[i], 0.0, text) == STATUS_OK;
+    }
+    return good ? STATUS_OK : STATUS_ERROR;
 }

@@ -1,12 +1,25 @@
-"""Systems of FMUs with linear equations (``zoo/linear.c``), and their exact solutions."""
+"""Systems of FMUs with linear equations (``zoo/linear.c``), their exact solutions, and pools."""
 
+import logging
 from pathlib import Path
 
 import model_tools
 import numpy as np
+import pytest
 from scipy.linalg import expm
 
-from fmugym.systems.plan import Component, Evaluation, Group, Link, SystemPlan
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.local import local_pool
+from fmugym.systems import FMUSystem
+from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
+
+LOG = logging.getLogger("fmugym.test")
+ENGINES = [pytest.param(False, id="python")]
+if has_native_pool():
+    ENGINES.append(pytest.param(True, id="native"))
+in_each_engine = pytest.mark.parametrize("native", ENGINES)
+by_each_master = pytest.mark.parametrize("master", MASTERS)
 
 STATES = {
     1: 'canHandleVariableCommunicationStepSize="true"',
@@ -23,6 +36,42 @@ VARIABLES = (
     *((f"{m}{i}{j}", "parameter", 'start="0"') for m in MATRICES for i in (1, 2) for j in (1, 2)),
     *((name, "parameter", 'start="0"') for name in ("limit", "fails", "status")),
 )
+
+
+@pytest.fixture(name="make")
+def closing_pools():
+    """Make pools of plans that are closed after the test."""
+    made = []
+
+    def make(plan, inputs=(), outputs=(), native=True, count=1, time_step=0.1, **options):
+        fmu = plan.as_fmu() if isinstance(plan, FMUSystem) else SystemFMU(plan)
+        spec = PoolSpec(
+            tuple(map(fmu.variable, inputs)),
+            tuple(map(fmu.variable, outputs)),
+            time_step,
+            **options,
+        )
+        pool = local_pool(fmu, spec, count, LOG, native=native)
+        pool.variable = fmu.variable
+        made.append(pool)
+        return pool
+
+    yield make
+    for pool in made:
+        pool.close()
+
+
+def play(pool, steps, inputs=None):
+    """Reset and step; the outputs, shape (steps + 1, k)."""
+    names, values = (), np.zeros((0, pool.num_instances))
+    outputs, statuses = pool.reset(names, values)
+    assert not statuses.any(), pool.failure(0)
+    rows = [outputs[:, 0].copy()]
+    for i in range(steps):
+        outputs, statuses = pool.step(None if inputs is None else inputs[i])
+        assert not statuses.any(), pool.failure(0)
+        rows.append(outputs[:, 0].copy())
+    return np.array(rows)
 
 
 def linear_fmu(path, version=2):

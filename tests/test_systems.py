@@ -1,6 +1,5 @@
 """Systems: what the masters compute, and that a system does what an FMU does."""
 
-import logging
 import pickle
 from dataclasses import replace
 
@@ -11,7 +10,18 @@ import fmu_tools
 import numpy as np
 import pytest
 import system_tools
-from system_tools import linear, linear_fmu, masses, system, tank
+from system_tools import (
+    LOG,
+    by_each_master,
+    closing_pools,  # noqa: F401  # the fixture "make"
+    in_each_engine,
+    linear,
+    linear_fmu,
+    masses,
+    play,
+    system,
+    tank,
+)
 
 import fmugym
 from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
@@ -34,12 +44,6 @@ from fmugym.systems.plan import (
 )
 from fmugym.trial import opening
 
-LOG = logging.getLogger("fmugym.test")
-ENGINES = [pytest.param(False, id="python")]
-if has_native_pool():
-    ENGINES.append(pytest.param(True, id="native"))
-in_each_engine = pytest.mark.parametrize("native", ENGINES)
-by_each_master = pytest.mark.parametrize("master", MASTERS)
 NO_START = ((), np.zeros((0, 1)))
 
 
@@ -48,42 +52,6 @@ def compiled(tmp_path_factory):
     """The FMU of linear equations by FMI version."""
     folder = tmp_path_factory.mktemp("linear")
     return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
-
-
-@pytest.fixture(name="make")
-def closing_pools():
-    """Make pools of plans that are closed after the test."""
-    made = []
-
-    def make(plan, inputs=(), outputs=(), native=True, count=1, time_step=0.1, **options):
-        fmu = SystemFMU(plan)
-        spec = PoolSpec(
-            tuple(map(fmu.variable, inputs)),
-            tuple(map(fmu.variable, outputs)),
-            time_step,
-            **options,
-        )
-        pool = local_pool(fmu, spec, count, LOG, native=native)
-        pool.variable = fmu.variable
-        made.append(pool)
-        return pool
-
-    yield make
-    for pool in made:
-        pool.close()
-
-
-def play(pool, steps, inputs=None):
-    """Reset and step; the outputs, shape (steps + 1, k)."""
-    names, values = (), np.zeros((0, pool.num_instances))
-    outputs, statuses = pool.reset(names, values)
-    assert not statuses.any(), pool.failure(0)
-    rows = [outputs[:, 0].copy()]
-    for i in range(steps):
-        outputs, statuses = pool.step(None if inputs is None else inputs[i])
-        assert not statuses.any(), pool.failure(0)
-        rows.append(outputs[:, 0].copy())
-    return np.array(rows)
 
 
 # Correctness

@@ -629,11 +629,12 @@ def test_sizes_cannot_change_from_episode_to_episode(sized):
     env.close()
 
 
-def test_systems_have_no_arrays(sized):
-    with pytest.raises(ConfigError, match=r"'n': 3.*arrays"):
-        fmugym.FMUSystem({"part": fmugym.FMU(sized, sizes={"n": 3})}, [])
-    with pytest.raises(ConfigError, match=r"x\[1\]"):
-        fmugym.FMUSystem({"part": sized}, [("part.x[1]", "part.u[1]")])
+def test_an_fmu_with_sizes_is_a_component(sized):
+    system = fmugym.FMUSystem({"part": fmugym.FMU(sized, sizes={"n": 3})}, [("part.x[3]", "third")])
+    description = system.as_fmu().description
+    assert description.variable("part.x").shape == (3,)
+    with pytest.raises(ConfigError, match=r"x\[4\]"):
+        fmugym.FMUSystem({"part": fmugym.FMU(sized, sizes={"n": 3})}, [("part.x[4]", "fourth")])
 
 
 def test_a_parameter_that_gives_no_size(sized):

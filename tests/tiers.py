@@ -45,11 +45,15 @@ SLOW_MODULES = {
     "test_strings",
     "test_value_types",
     "test_systems",
+    "test_systems_apart",
+    "test_systems_arrays",
+    "test_systems_control",
     "test_systems_description",
     "test_systems_faces",
     "test_systems_parts",
     "test_systems_resets",
     "test_systems_ssp",
+    "test_systems_strings",
     "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
@@ -86,6 +90,7 @@ EVERY_IN_CI = {
     "test_start_times": 5,
     "test_strings": 5,
     "test_systems": 5,
+    "test_systems_control": 3,
     "test_systems_resets": 5,
     "test_value_types": 3,
     "test_vector_readings": 4,
@@ -225,7 +230,7 @@ EXHAUSTIVE_TESTS = (
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
     return (
-        node_id.startswith("test_windows_") and "::TestInWine" in node_id
+        node_id.startswith(("test_windows_", "test_systems_")) and "::TestInWine" in node_id
     ) or "wine" in node_id.partition("[")[2]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -22,11 +22,13 @@ from fmugym.errors import ConfigError, shown, unknown_name
 __all__ = [
     "CLOCK_KINDS",
     "INTERFACES",
+    "MOST_ELEMENTS",
     "Capabilities",
     "ModelDescription",
     "ModelExchange",
     "Unit",
     "Variable",
+    "unlisted",
 ]
 
 INTERFACES = ("co_simulation", "model_exchange")
@@ -82,7 +84,10 @@ class Variable:
         dimensions: Of an array, for each dimension the structural parameter that gives its length;
             "" for a fixed length.
         array: Of an element of an array, the array; None for other variables.
-        place: Of an element, its place in the array, in row-major order.
+        place: Of an element, its place in the array, in row-major order. 0 in systems.
+        driven: Of an array of a system, the places of the elements that something else drives;
+            None for arrays of FMUs. FMUs get and set arrays as a whole; in systems each element has
+            a value reference of its own, the first one that of the array.
         clocks: The value references of the clocks that must tick whenever the value changes.
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
         interval, shift: Of a clock: the time between its ticks and that before the first one in
@@ -106,6 +111,7 @@ class Variable:
     dimensions: tuple[str, ...] = ()
     array: Variable | None = None
     place: int = 0
+    driven: frozenset[int] | None = None
     clocks: tuple[int, ...] = ()
     ticking: str = ""
     interval: float = math.nan
@@ -118,6 +124,11 @@ class Variable:
         A clock is a Boolean: whether it ticks.
         """
         return _KINDS.get(self.type, "integer")
+
+    @property
+    def is_scalar(self) -> bool:
+        """Whether it is neither an array nor an element of one."""
+        return not self.shape and self.array is None
 
     @property
     def numeric(self) -> bool:
@@ -181,7 +192,14 @@ class Variable:
     @property
     def size(self) -> int:
         """The number of values that FMI moves when it moves this variable; 1 for a scalar."""
-        return math.prod(self.shape if self.array is None else self.array.shape)
+        if self.array is None or self.is_apart:
+            return math.prod(self.shape)
+        return math.prod(self.array.shape)
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether it is an element that is got and set by itself, as those of systems are."""
+        return self.array is not None and self.array.driven is not None
 
     @cached_property
     def elements(self) -> tuple[Variable, ...]:
@@ -201,7 +219,7 @@ class Variable:
             )
         places = list(product(*map(range, self.shape)))
         starts = self._starts_of(len(places))
-        return tuple(
+        elements = (
             replace(
                 self,
                 name=f"{self.name}[{_index(place)}]",
@@ -210,9 +228,20 @@ class Variable:
                 array=self,
                 place=number,
                 start=starts[number],
+                driven=None,
             )
             for number, place in enumerate(places)
         )
+        return tuple(elements if self.driven is None else map(self._apart, elements))
+
+    def _apart(self, element: Variable) -> Variable:
+        """The element of an array of a system. What something else drives cannot be set."""
+        assert self.driven is not None
+        reference = self.value_reference + element.place
+        alone = replace(element, value_reference=reference, place=0)
+        if element.place not in self.driven:
+            return alone
+        return replace(alone, causality="local", initial=None)
 
     def _starts_of(self, count: int) -> list[str | None]:
         """The start value of each element; all of them where their number is wrong."""
@@ -239,6 +268,16 @@ class Variable:
             return 0, 2 ** int(self.type[4:]) - 1
         bits = _INTEGER_BITS[self.type]
         return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+def unlisted(variables: Sequence[Variable]) -> list[Variable]:
+    """Find what is missing of arrays of which only some elements are listed.
+
+    FMI moves whole arrays only. Elements that are not listed keep their start values.
+    """
+    listed = {variable.name for variable in variables}
+    arrays = dict.fromkeys(v.array for v in variables if v.array is not None and not v.is_apart)
+    return [one for array in arrays for one in array.elements if one.name not in listed]
 
 
 def _whole(value: Any) -> int | None:

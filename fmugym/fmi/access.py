@@ -9,25 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
+from fmugym.archive.description import Variable, unlisted
 from fmugym.archive.texts import text_among
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status, sane
 
-__all__ = ["Access", "unlisted"]
+__all__ = ["Access"]
 
 _Group = tuple[list[int], list[int], npt.NDArray[Any], Any]
 """The places of variables in the list and in the FMU's memory, this memory, and the calls."""
-
-
-def unlisted(variables: Sequence[Variable]) -> list[Variable]:
-    """Find what is missing of arrays of which only some elements are listed.
-
-    FMI moves whole arrays only. Elements that are not listed keep their start values.
-    """
-    listed = {variable.name for variable in variables}
-    arrays = dict.fromkeys(v.array for v in variables if v.array is not None)
-    return [one for array in arrays for one in array.elements if one.name not in listed]
 
 
 def _by_type(instance: Instance, variables: Sequence[Variable]) -> dict[str, list[int]]:

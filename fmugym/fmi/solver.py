@@ -31,6 +31,8 @@ _SMALL: Final = 0.01
 _FIRST: Final = 0.01
 _SHARP: Final = 1e-3
 _ROOT: Final = 2.0**-26
+_ROUNDED: Final = 1.0 + 1e-6
+"""A step may be longer than allowed by a rounding."""
 _EPSILON: Final = sys.float_info.epsilon
 _LARGEST: Final = sys.float_info.max
 
@@ -212,6 +214,7 @@ class Solver:
         if memory.ticks:
             self.timetable.ticks = list(memory.ticks)
         self._stale = True
+        self._fmu_time = math.nan  # of the FMU; it must be set
         self._knows_rates = self._knows_indicators = False
         self._jacobian: list[State] | None = None
 
@@ -230,7 +233,10 @@ class Solver:
     # Calls of the FMU.
 
     def _place(self, time: float, x: State) -> None:
-        self._fmu.set_time(time)
+        if time != self._fmu_time:
+            self._fmu_time = math.nan
+            self._fmu.set_time(time)
+            self._fmu_time = time
         if self._n:
             self._fmu.set_states(x)
 
@@ -248,6 +254,7 @@ class Solver:
         adaptive = self._n and self._method.order
         nominals = map(abs, self._fmu.get_nominals() if adaptive else [0.0] * self._n)
         self._nominals = [value if 0.0 < value <= _LARGEST else 1.0 for value in nominals]
+        self._fmu_time = math.nan
         self._stale = self._knows_rates = self._knows_indicators = False
         self._jacobian = None
 
@@ -344,9 +351,12 @@ class Solver:
             columns = [self._differentiate_by(state) for state in range(self._n)]
             self._jacobian = [list(row) for row in zip(*columns, strict=True)]
         later = self.time + max(1e-4 * step, _ROOT * abs(self.time))
-        rates, change = self.rates_at(later, self.x), later - self.time
-        slope = [(b - a) / change for a, b in zip(self.rates, rates, strict=True)]
-        return self._jacobian, slope
+        return self._jacobian, self._slope(self.rates_at(later, self.x), later - self.time)
+
+    def _slope(self, rates: State, change: float) -> State:
+        """How fast the rates change from those at x, per change."""
+        inverse = 1.0 / change
+        return [(b - a) * inverse for a, b in zip(self.rates, rates, strict=True)]
 
     def _differentiate_by(self, state: int) -> State:
         column = self._fmu.differentiate_by(state)
@@ -355,8 +365,7 @@ class Solver:
         value, trial = self.x[state], list(self.x)
         trial[state] = value + _ROOT * max(abs(value), 1e-3 * self._nominals[state])
         change = trial[state] - value  # as rounded
-        column = self.rates_at(self.time, trial)
-        return [(b - a) / change for a, b in zip(self.rates, column, strict=True)]
+        return self._slope(self.rates_at(self.time, trial), change)
 
     def _resolution(self, until: float) -> float:
         """Two times that are this close are the same."""
@@ -374,11 +383,11 @@ class Solver:
         """Divide what remains so that no very short step is left at the end."""
         most = self._solving.max_step
         if not self._method.order:
-            return remaining / max(1.0, math.ceil(remaining / most - 1e-6))
+            return remaining / max(1.0, math.ceil(remaining / (_ROUNDED * most)))
         if not self.memory.step > 0.0:
             self._remember(step=self._first_step())
         size = min(self.memory.step, most)
-        if remaining <= min(1.1 * size, most):
+        if remaining <= min(1.1 * size, _ROUNDED * most):
             return remaining
         return 0.5 * remaining if remaining < 2.0 * size else size
 
@@ -452,7 +461,8 @@ class Solver:
         event, z = left is not None, self._z
         end, after = left or self._take_step(until)
         if not event:
-            self._place(end, after)
+            if self._method.end_rates is None:  # the last stage of the others was there
+                self._place(end, after)
             z = self._indicators()
             event = _crosses(self._z, z)
             if event:

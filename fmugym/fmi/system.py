@@ -22,6 +22,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
+from fmugym.fmi.control import Repeatable, StepControl
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
 from fmugym.fmi.kept import KeptStart
 from fmugym.fmi.library import Library
@@ -29,8 +30,8 @@ from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.solver import Solving
 from fmugym.fmi.status import Phase, Status, failed_call, sane
-from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.layout import Layout, PartLayout, Route
+from fmugym.systems.description import MASTER, PartVariable, SystemDescription
+from fmugym.systems.layout import Layout, PartLayout, Route, array_key
 from fmugym.systems.plan import Evaluation, Group
 
 __all__ = ["SystemInstance", "SystemLibrary", "open_library"]
@@ -50,11 +51,22 @@ def _scaled(gain: float, offset: float, value: float) -> float:
     return value if gain == 1.0 and offset == 0.0 else gain * value + offset
 
 
-def _carried(source: _Part, route: Route, value: float) -> float:
+def _carried(source: _Part, route: Route, values: Iterable[float]) -> list[float]:
     """What a route carries. Values that are not finite must not reach other FMUs."""
-    if not math.isfinite(value):
-        raise _FailedError(Status.NOT_FINITE, f"{source.label}, whose outputs are not finite")
-    return _scaled(route.gain, route.offset, value)
+    carried = []
+    for value in values:
+        if not math.isfinite(value):
+            raise _FailedError(Status.NOT_FINITE, f"{source.label}, whose outputs are not finite")
+        carried.append(_scaled(route.gain, route.offset, value))
+    return carried
+
+
+def _shared_out(routes: Iterable[Route], values: Sequence[float]) -> Iterator[Any]:
+    """Each route with its part of the values of all."""
+    first = 0
+    for route in routes:
+        yield route, values[first : first + route.count]
+        first += route.count
 
 
 class _Part:
@@ -81,7 +93,7 @@ class _Part:
 
     def forget(self) -> None:
         """Return the slots to the start values."""
-        self.inputs.values[:] = [v.start_number for v in self.layout.inputs]
+        self.inputs.values[:] = self.layout.starts_of(self.layout.inputs)
         self.outputs.values[:] = 0.0
 
     def judge(self, status: int) -> None:
@@ -94,15 +106,15 @@ class _Part:
         if status not in _GOOD:
             raise _FailedError(status, self.label)
 
-    def get(self, variable: Variable) -> float:
-        """Get one variable."""
-        access = Access(self.instance, (variable,))
+    def get(self, variables: Sequence[Variable]) -> list[float]:
+        """Get a scalar, or some elements of an array."""
+        access = Access(self.instance, variables)
         self.judge(access.get())
-        return float(access.values[0])
+        return list(map(float, access.values))
 
-    def set(self, variable: Variable, value: float) -> None:
-        """Set one variable."""
-        access = Access(self.instance, (variable,), np.array([value]))
+    def set(self, variables: Sequence[Variable], values: Iterable[float]) -> None:
+        """Set a scalar, or all elements of an array, or several of both."""
+        access = Access(self.instance, variables, np.array(list(values), float))
         self.judge(access.set())
 
     def read(self) -> None:
@@ -131,7 +143,7 @@ class _Memory:
     states: tuple[SavedState, ...]
 
 
-class SystemInstance(Instance):
+class SystemInstance(Instance, Repeatable):
     """One instance of a system; made by ``Library.instantiate``.
 
     Args:
@@ -163,6 +175,9 @@ class SystemInstance(Instance):
         self._hearing, self.hears_all = Hearing(), True
         self.phase = Phase.INSTANTIATED
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
+        nominals = [nominal for _, nominal in layout.compared]
+        control = layout.plan.control
+        self._control = None if control is None else StepControl(control, nominals)
         self._fresh = False
         self._terminated = False
         self._pending: list[tuple[PartVariable, float | str]] | None = None
@@ -258,13 +273,15 @@ class SystemInstance(Instance):
             buffer[index] = _scaled(end.gain, end.offset, self._get(end))
 
     def _get(self, end: PartVariable) -> float:
+        if self._control is not None and end.part == MASTER:
+            return float(self._control.statistics[end.variable.value_reference])
         part = self._parts[end.part]
         output, given = self._layout.output_slot(end), self._layout.input_slot(end)
         if output >= 0 and self._fresh:
             return float(part.outputs.values[output - part.layout.first_output])
         if given >= 0:
             return float(part.inputs.values[given - part.layout.first_input])
-        return part.get(end.variable)
+        return part.get((end.variable,))[0]
 
     def _set_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for behind, value in zip(ends, buffer.tolist(), strict=True):
@@ -280,12 +297,20 @@ class SystemInstance(Instance):
             self._pending.append((end, value))
         elif given < 0:
             self._fresh = False
-            part.set(end.variable, value)
+            self._set_alone(part, end.variable, value)
+
+    def _set_alone(self, part: _Part, variable: Variable, value: float) -> None:
+        """Set a scalar, or one element of an array, of which the others stay as they are."""
+        whole = (variable if variable.array is None else variable.array).elements
+        values = [value] if variable.array is None else part.get(whole)
+        values[variable.place] = value
+        part.set(whole, values)
 
     def set_string(self, variable: Variable, value: str) -> None:
         """See ``Instance.set_string``."""
         assert self._pending is not None
-        self._pending.append((self._description.ends[variable.value_reference][0], value))
+        ends = self._description.ends[variable.value_reference]
+        self._pending += [(end, value) for end in ends]
 
     # Initialization: the components are initialized one inside of the other.
 
@@ -332,6 +357,8 @@ class SystemInstance(Instance):
             self._begin_all(span, self._collected(set_start_values))
 
     def _collected(self, set_start_values: Callable[[], None]) -> list[Any]:
+        if self._control is not None:
+            self._control.statistics[:] = 0.0
         for part in self._parts:
             part.forget()
         self._fresh = False
@@ -410,8 +437,8 @@ class SystemInstance(Instance):
         part = self._parts[index]
         for route in self._layout.routes:
             if route.target_part == index:
-                place = route.target - part.layout.first_input
-                self._write_target(route, float(part.inputs.values[place]))
+                first = route.target - part.layout.first_input
+                self._write_target(route, part.inputs.values[first : first + route.count].tolist())
 
     def _has_kept_states(self) -> bool:
         try:
@@ -456,19 +483,41 @@ class SystemInstance(Instance):
         """What is set for this simulation wins over what the system says."""
         part = self._parts[index]
         starts = part.layout.starts
+        numbers = [(v, value) for v, value in starts if not isinstance(value, str)]
+        part.set([v for v, _ in numbers], [value for _, value in numbers])
         for variable, value in starts:
-            self._set_start(part, variable, value)
-        for end, value in values:
-            if end.part == index:
-                self._set_start(part, end.variable, value)
+            if isinstance(value, str):
+                part.instance.set_string(variable, value)
+        self._set_pending(part, [(end, value) for end, value in values if end.part == index])
         if not part.layout.has_mode:
             part.judge(part.inputs.set())
 
-    def _set_start(self, part: _Part, variable: Variable, value: float | str) -> None:
-        if isinstance(value, str):
-            part.instance.set_string(variable, value)
+    def _set_pending(self, part: _Part, values: list[tuple[PartVariable, Any]]) -> None:
+        arrays: dict[Any, list[tuple[int, float]]] = {}
+        for end, value in values:
+            if end.variable.array is not None:
+                arrays.setdefault(array_key(end), []).append((end.variable.place, value))
+        for end, value in values:
+            if isinstance(value, str):
+                part.instance.set_string(end.variable, value)
+            elif end.variable.array is None:
+                part.set((end.variable,), (value,))
+            elif array_key(end) in arrays:
+                self._set_array(part, end, arrays.pop(array_key(end)))
+
+    def _set_array(
+        self, part: _Part, end: PartVariable, elements: Iterable[tuple[int, float]]
+    ) -> None:
+        """Set some elements of an array; the others start with what the system says."""
+        whole = self._layout.arrays[array_key(end)][1].elements
+        given = self._layout.input_slot(end)
+        if given >= 0:
+            values = list(part.inputs.values[part.layout.span_of(given - part.layout.first_input)])
         else:
-            part.set(variable, float(value))
+            values = part.layout.starts_of(whole)
+        for place, value in elements:
+            values[place] = value
+        part.set(whole, values)
 
     def _exchange_all(self, span: Span, values: list[Any]) -> None:
         def begin_if_old(index: int) -> None:
@@ -488,30 +537,35 @@ class SystemInstance(Instance):
                 self._write_target(route, self._read_source(route, begin_if_old))
             return
 
-        def evaluate(x: list[float]) -> list[float]:
-            for route, value in zip(routes, x, strict=True):
-                self._write_target(route, value)
-            return [self._read_source(route, begin_if_old) for route in routes]
+        def read_all() -> list[float]:
+            return [x for route in routes for x in self._read_source(route, begin_if_old)]
 
-        x = [self._read_source(route, begin_if_old) for route in routes]
+        def evaluate(x: list[float]) -> list[float]:
+            for route, values in _shared_out(routes, x):
+                self._write_target(route, values)
+            return read_all()
+
+        x = read_all()
         try:
             solve_loop(evaluation.loop, x, evaluate)
         except NotSolvedError:
             label = self._layout.loop_label(route.source_part for route in routes)
             raise _FailedError(Status.DISCARD, label) from None
 
-    def _read_source(self, route: Route, begin_if_old: Callable[[int], None]) -> float:
+    def _read_source(self, route: Route, begin_if_old: Callable[[int], None]) -> list[float]:
         begin_if_old(route.source_part)
         part = self._parts[route.source_part]
-        value = part.get(part.layout.outputs[route.source - part.layout.first_output])
-        return _carried(part, route, value)
+        first = route.source - part.layout.first_output
+        values = part.get(part.layout.outputs[first : first + route.count])
+        return _carried(part, route, values)
 
-    def _write_target(self, route: Route, value: float) -> None:
+    def _write_target(self, route: Route, values: Sequence[float]) -> None:
+        """Set inputs. An element of an array is set with the others, which stay as they are."""
         part = self._parts[route.target_part]
-        place = route.target - part.layout.first_input
-        part.inputs.values[place] = value
+        self._take(route, values)
         if part.started:
-            part.set(part.layout.inputs[place], value)
+            span = part.layout.span_of(route.target - part.layout.first_input)
+            part.set(part.layout.inputs[span], part.inputs.values[span])
 
     def _refresh(self) -> None:
         for part in self._parts:
@@ -522,11 +576,44 @@ class SystemInstance(Instance):
 
     def _step(self, time: float, step_size: float) -> int:
         self._who, self._terminated = "", False
+        self._kept.stepped = True
         try:
+            if self._control is not None:
+                status = self._control.step(self, time, step_size)
+                return self.judge_step(status) if status else status
             self._step_all(time, step_size)
         except _FailedError as failure:
             return self.judge_step(self._tell(failure))
         return self.judge_step(Status.TERMINATED) if self._terminated else Status.OK
+
+    # What the estimate of errors needs
+
+    def keep(self) -> SavedState:
+        """See ``Repeatable.keep``."""
+        states = tuple(self._save_part(index) for index in range(len(self._parts)))
+        return self._own(_Memory(*self._slots(), self._fresh, states))
+
+    def go_back(self, state: Any) -> None:
+        """See ``Repeatable.go_back``."""
+        for index, own in enumerate(state.memory.states):
+            self._restore_part(index, own)
+        self._put_slots(state.memory)
+
+    def try_step(self, time: float, size: float) -> int:
+        """See ``Repeatable.try_step``."""
+        self._terminated = False
+        try:
+            self._step_all(time, size)
+        except _FailedError as failure:
+            if failure.status not in (Status.DISCARD, Status.NOT_FINITE):
+                raise
+            return self._tell(failure)
+        return Status.TERMINATED if self._terminated else Status.OK
+
+    def sources(self) -> npt.NDArray[np.float64]:
+        """See ``Repeatable.sources``."""
+        outputs = np.frombuffer(self._slots()[1])
+        return outputs[[place for place, _ in self._layout.compared]]
 
     def judge_step(self, status: int) -> int:
         """See ``Instance.judge_step``; values for other components may be no numbers."""
@@ -536,7 +623,6 @@ class SystemInstance(Instance):
         return status
 
     def _step_all(self, time: float, step_size: float) -> None:
-        self._kept.stepped = True
         if not self._fresh:
             self._refresh()
         self._fresh = False
@@ -547,14 +633,15 @@ class SystemInstance(Instance):
             self._step_group(group, time, step_size)
         self._fresh = True
 
-    def _carried(self, route: Route) -> float:
+    def _carried(self, route: Route) -> list[float]:
         part = self._parts[route.source_part]
-        value = float(part.outputs.values[route.source - part.layout.first_output])
-        return _carried(part, route, value)
+        first = route.source - part.layout.first_output
+        return _carried(part, route, part.outputs.values[first : first + route.count].tolist())
 
-    def _take(self, route: Route, value: float) -> None:
+    def _take(self, route: Route, values: Sequence[float]) -> None:
         part = self._parts[route.target_part]
-        part.inputs.values[route.target - part.layout.first_input] = value
+        first = route.target - part.layout.first_input
+        part.inputs.values[first : first + route.count] = values
 
     def _carry(self, route: Route) -> None:
         self._take(route, self._carried(route))
@@ -588,7 +675,7 @@ class SystemInstance(Instance):
         routes = [self._layout.routes[i] for i in self._layout.inner_routes(group)]
         for index in indices:
             self._carry_to(index)
-        x = [self._carried(route) for route in routes]
+        x = [value for route in routes for value in self._carried(route)]
         was_terminated = self._terminated
         before = [self._save_part(index) for index in indices]
         moved = False
@@ -599,11 +686,11 @@ class SystemInstance(Instance):
                 for index, state in zip(indices, before, strict=True):
                     self._restore_part(index, state)
             moved = True
-            for route, value in zip(routes, x, strict=True):
-                self._take(route, value)
+            for route, values in _shared_out(routes, x):
+                self._take(route, values)
             for index in indices:
                 self._step_part(index, time, step_size)
-            return [self._carried(route) for route in routes]
+            return [value for route in routes for value in self._carried(route)]
 
         try:
             solve_loop(group.loop, x, evaluate)
@@ -668,9 +755,10 @@ class SystemInstance(Instance):
         return self._own(memory)
 
     def _slots(self) -> tuple[bytes, bytes]:
+        statistics = b"" if self._control is None else self._control.statistics.tobytes()
         return (
             b"".join(part.inputs.values.tobytes() for part in self._parts),
-            b"".join(part.outputs.values.tobytes() for part in self._parts),
+            b"".join(part.outputs.values.tobytes() for part in self._parts) + statistics,
         )
 
     def _own(self, memory: _Memory) -> SavedState:
@@ -695,6 +783,8 @@ class SystemInstance(Instance):
         for part in self._parts:
             first = part.layout.first_output
             part.outputs.values[:] = outputs[first : first + len(part.layout.outputs)]
+        if self._control is not None:
+            self._control.statistics[:] = outputs[self._layout.first_statistic :]
         self._fresh = memory.fresh
 
     def _put_inputs(self, data: bytes) -> None:
@@ -815,6 +905,10 @@ class SystemLibrary(Library):
 def _load(
     part: LoadableFMU, label: str, target: logging.Logger, solving: Solving | None
 ) -> Library:
+    if part.is_apart:
+        raise FMULoadError(
+            f"{label}: it runs in a process of its own, which only the C extension can give it"
+        )
     try:
         return Library(part, target, solving)
     except FMULoadError as error:

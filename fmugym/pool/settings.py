@@ -16,9 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription, Variable, unlisted
 from fmugym.archive.texts import number_of, text_of, with_texts
-from fmugym.fmi.access import unlisted
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.systems.description import SystemDescription
@@ -271,9 +270,10 @@ def variables_of(
     """
     version = table_of(description)
     known = {
-        (_type_number(v, version), v.value_reference): v
+        (_type_number(one, version), one.value_reference): one
         for v in description.variables.values()
         if v.is_number or v.kind == "string"
+        for one in (v.elements if v.driven is not None else (v,))
     }
     known[_START_TIME, START_TIME.value_reference] = START_TIME
     found = [

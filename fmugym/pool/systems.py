@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription
+from fmugym.archive.fmu import LoadableFMU
+from fmugym.pool.remote import Hosts, place_of, remote_settings
 from fmugym.pool.settings import (
-    PlaceOfFMU,
     library_settings,
     listing,
     manner_of,
@@ -18,7 +18,7 @@ from fmugym.pool.settings import (
 )
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.layout import Layout, PartLayout
+from fmugym.systems.layout import Layout, PartLayout, array_key
 from fmugym.systems.plan import Loop
 
 __all__ = ["system_settings"]
@@ -28,36 +28,49 @@ _RUNGS: Final = tuple(ResetMethod)
 
 
 def system_settings(
-    description: ModelDescription, spec: PoolSpec, folder: Path
+    fmu: LoadableFMU, spec: PoolSpec, folder: Path, hosts: Hosts
 ) -> tuple[Any, ...] | None:
     """What ``take_system`` of ``native/python/systems.c`` takes; None for an FMU.
 
     Args:
-        description: That of the system or FMU.
+        fmu: The system or FMU.
         spec: That of the pool.
         folder: That of the extracted system.
+        hosts: For components that have processes of their own.
+
+    Raises:
+        FMULoadError: If Wine is needed and missing here.
     """
+    description = fmu.description
     if not isinstance(description, SystemDescription):
         return None
     layout = Layout(description, spec.inputs, spec.outputs)
     rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     return (
         tuple(
-            _part(part, spec, rung, folder / str(i))
-            for i, (part, rung) in enumerate(zip(layout.parts, rungs, strict=True))
+            _part(part, one, spec, rung, folder / str(i), hosts)
+            for i, (part, one, rung) in enumerate(zip(layout.parts, fmu.parts, rungs, strict=True))
         ),
         _routes(layout),
-        _variables(layout),
+        (*_arrays(layout), *_variables(layout)),
         _groups(layout),
         _transfers(layout),
         layout.plan.master == "jacobi",
+        _control(layout),
     )
 
 
-def _part(part: PartLayout, spec: PoolSpec, rung: ResetMethod, folder: Path) -> tuple[Any, ...]:
+def _part(
+    part: PartLayout,
+    fmu: LoadableFMU,
+    spec: PoolSpec,
+    rung: ResetMethod,
+    folder: Path,
+    hosts: Hosts,
+) -> tuple[Any, ...]:
     description = part.description
     version = description.fmi_major_version
-    known = library_settings(description, spec, PlaceOfFMU.here(folder, (), version))
+    known = library_settings(description, spec, place_of(fmu, folder))
     label = part.label
     numbers = [(v, float(x)) for v, x in part.starts if v.numeric]
     texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
@@ -73,11 +86,26 @@ def _part(part: PartLayout, spec: PoolSpec, rung: ResetMethod, folder: Path) -> 
         part.component.steps,
         solving_settings(description, spec),
         listing(part.inputs, version),
-        _doubles(variable.start_number for variable in part.inputs),
+        _doubles(part.starts_of(part.inputs)),
         listing(part.outputs, version),
         listing([v for v, _ in numbers], version),
         _doubles(x for _, x in numbers),
         tuple(texts),
+        (known["structural_references"], known["structural_values"]),
+        remote_settings(fmu, folder, hosts),
+    )
+
+
+def _control(layout: Layout) -> tuple[Any, ...] | None:
+    """How the step sizes follow from an estimate of the error."""
+    control = layout.plan.control
+    if control is None:
+        return None
+    return (
+        control.tolerance,
+        control.min_step_size or 0.0,
+        _numbers(place for place, _ in layout.compared),
+        _doubles(nominal for _, nominal in layout.compared),
     )
 
 
@@ -86,8 +114,24 @@ def _routes(layout: Layout) -> tuple[bytes, ...]:
     return (
         _numbers(route.source for route in routes),
         _numbers(route.target for route in routes),
+        _numbers(route.count for route in routes),
         _doubles(route.gain for route in routes),
         _doubles(route.offset for route in routes),
+    )
+
+
+def _arrays(layout: Layout) -> tuple[bytes, ...]:
+    """The arrays that variables of the system are elements of."""
+    arrays = list(layout.arrays.values())
+    starts = (
+        layout.parts[part].starts_of(array.elements)
+        if array.settable_at_start
+        else [0.0] * array.size
+        for part, array in arrays
+    )
+    return (
+        _numbers(array.size for _, array in arrays),
+        _doubles(number for numbers in starts for number in numbers),
     )
 
 
@@ -96,13 +140,16 @@ def _variables(layout: Layout) -> tuple[bytes, ...]:
     groups = layout.description.ends
     ends = [end for group in groups for end in group]
     firsts = np.cumsum([0, *map(len, groups)])
+    numbers = {key: number for number, key in enumerate(layout.arrays)}
     return (
         firsts.astype(np.uint32).tobytes(),
-        _numbers(end.part for end in ends),
+        _numbers(max(0, end.part) for end in ends),
         b"".join(_type(layout, end) for end in ends),
         _numbers(end.variable.value_reference for end in ends),
         np.array([layout.input_slot(end) for end in ends], np.int32).tobytes(),
         np.array([layout.output_slot(end) for end in ends], np.int32).tobytes(),
+        np.array([numbers.get(array_key(end), -1) for end in ends], np.int32).tobytes(),
+        _numbers(end.variable.place for end in ends),
         _doubles(end.gain for end in ends),
         _doubles(end.offset for end in ends),
     )
@@ -113,7 +160,7 @@ def _type(layout: Layout, end: PartVariable) -> bytes:
     if not end.variable.numeric:
         return b"\0"
     version = layout.parts[end.part].description.fmi_major_version
-    return listing([end.variable], version)[0]
+    return listing([end.variable], version)[0][:1]
 
 
 def _groups(layout: Layout) -> tuple[tuple[Any, ...], ...]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fmugym.archive.description import INTERFACES, Variable
+from fmugym.archive.description import INTERFACES, Variable, unlisted
 from fmugym.archive.fmu import FMU
 from fmugym.archive.structure import Feedthrough
 from fmugym.checks import (
@@ -18,6 +18,7 @@ from fmugym.checks import (
     check_number,
     check_option,
     check_path,
+    parts_of_array,
 )
 from fmugym.errors import ConfigError, FMULoadError, shown, unknown_name
 from fmugym.systems import plan
@@ -34,12 +35,17 @@ class Component:
     Attributes:
         fmu: The path of the ``.fmu`` file, or an ``FMU``, whose limits and libraries are used.
         start_values: Parameters and start values by the names of the FMU's variables, in their
-            units. Those of an environment, such as ``model_parameters``, win.
+            units. An array takes nested lists of its shape, a flat list or one value for all
+            elements. Structural parameters give arrays their sizes. The values of an environment,
+            such as ``model_parameters``, win over others.
         interface: ``"co_simulation"`` or ``"model_exchange"``; by default co-simulation where the
             FMU offers it.
         steps: Communication steps of this component in one of the system.
         feedthrough: False says that no output depends on an input without a step in between, for
             FMUs that tell nothing of it; None for what the FMU tells.
+        isolate: Whether it runs in a process of its own, so that a crash of it ends single
+            episodes only. On Linux, FMUs that have libraries for Windows only run in processes of
+            their own in any case, in Wine.
 
     Raises:
         ConfigError: If a value does not fit.
@@ -50,6 +56,7 @@ class Component:
     interface: str | None = None
     steps: int = 1
     feedthrough: bool | None = None
+    isolate: bool = False
 
     def __post_init__(self) -> None:
         values = check_mapping("start_values of a component", self.start_values)
@@ -59,6 +66,7 @@ class Component:
             check_option("interface", self.interface, INTERFACES)
         if self.feedthrough is not None and check_flag("feedthrough", self.feedthrough):
             raise ConfigError("feedthrough of a component must be False or None, got True")
+        object.__setattr__(self, "isolate", check_flag("isolate", self.isolate))
         if not isinstance(self.fmu, FMU):
             check_path("the path of an FMU", self.fmu)
 
@@ -78,7 +86,8 @@ class OpenComponent:
     Attributes:
         name, given: As given.
         fmu: The FMU. Nothing of it is executed or extracted.
-        starts: The start values as numbers and texts.
+        starts: The start values as numbers and texts, by the names of scalars and elements.
+        sizes: The values of structural parameters.
 
     Raises:
         ConfigError: If the name or a start value does not fit.
@@ -93,28 +102,52 @@ class OpenComponent:
             self.fmu = _opened(given)
         except FMULoadError as error:
             raise type(error)(f"component {name!r}: {error}") from None
-        self.starts = tuple(map(self._start, given.start_values.items()))
+        self.sizes = dict(self.fmu.sizes)
+        found: dict[str, float | str] = {}
+        # what is given for an element counts more than what is given for its array
+        for one, value in sorted(given.start_values.items(), key=lambda item: item[0][-1:] == "]"):
+            if one not in self.sizes:
+                found.update(self._starts(one, value))
+        self.starts = tuple(found.items())
+        self._require_rest()
 
-    def _start(self, item: tuple[str, Any]) -> tuple[str, float | str]:
-        name, value = item
+    def _starts(self, name: str, value: Any) -> Iterator[tuple[str, float | str]]:
         variable = self.variable(name)
         if not variable.settable_at_start:
             raise ConfigError(
                 f"{self.name}.{name} cannot be set: it is a {variable.variability} "
                 f"{variable.causality} with initial={variable.initial!r}"
             )
-        return name, start_number(f"{self.name}.{name}", variable, value)
+        if not variable.shape:
+            yield name, start_number(f"{self.name}.{name}", variable, value)
+            return
+        parts = parts_of_array(f"{self.name}.{name}", variable.shape, value)
+        for element, part in zip(variable.elements, parts, strict=True):
+            yield element.name, start_number(f"{self.name}.{element.name}", element, part)
+
+    def _require_rest(self) -> None:
+        """FMI sets whole arrays, and the FMU does not tell the start values of a new size."""
+        for missing in unlisted([self.variable(name) for name, _ in self.starts]):
+            array = missing.array
+            if array is not None and array.start is None and array.dimensions:
+                raise ConfigError(
+                    f"there is no value of {missing.name!r} of the component {self.name!r}: "
+                    f"{array.name!r} has a size of its own, {array.shape}; give all elements"
+                )
 
     def variable(self, name: str) -> Variable:
-        """Find a variable by its name in the component.
+        """Find a variable, or an element of an array, by its name in the component.
 
         Raises:
             ConfigError: If there is none; the text suggests the nearest name.
         """
-        variables = self.fmu.description.variables
-        if name not in variables:
-            raise unknown_name(f"variable of the component {self.name!r}", name, variables)
-        return variables[name]
+        description = self.fmu.description
+        found = description.find(name)
+        if found is not None:
+            return found
+        if name.endswith("]"):
+            description.variable(name)  # which says what is wrong with the index of an element
+        raise unknown_name(f"variable of the component {self.name!r}", name, description.variables)
 
     @property
     def feedthrough(self) -> Feedthrough:
@@ -136,6 +169,8 @@ class OpenComponent:
             self.starts,
             limits,
             preload,
+            tuple(self.sizes.items()),
+            self.given.isolate,
         )
 
 
@@ -167,21 +202,22 @@ def start_number(name: str, variable: Variable, value: Any) -> float | str:
 
 
 def _opened(given: Component) -> FMU:
-    if not isinstance(given.fmu, FMU):
-        path = check_path("the path of an FMU", given.fmu)
-        return FMU(path, interface=given.interface)
-    if given.fmu.sizes:
-        name, sizes = given.fmu.path.name, shown(dict(given.fmu.sizes))
-        raise ConfigError(
-            f"{name} cannot be a component with sizes = {sizes}: systems have no arrays"
-        )
-    if given.interface in (None, given.fmu.description.interface):
-        return given.fmu
-    source = given.fmu
+    """Open the FMU with the interface and the sizes of arrays that the component wants."""
+    if isinstance(given.fmu, FMU):
+        fmu = given.fmu
+    else:
+        fmu = FMU(check_path("the path of an FMU", given.fmu), interface=given.interface)
+    variables = fmu.description.variables
+    known = {n: v for n, v in given.start_values.items() if n in variables}
+    sizes = {n: v for n, v in known.items() if variables[n].is_structural}
+    fits = given.interface in (None, fmu.description.interface)
+    if fits and sizes.items() <= fmu.sizes.items():
+        return fmu
     return FMU(
-        Path(source.path),
-        limits=source.limits,
-        preload=source.preload,
-        probe_timeout=source.probe_timeout,
-        interface=given.interface,
+        Path(fmu.path),
+        limits=fmu.limits,
+        preload=fmu.preload,
+        probe_timeout=fmu.probe_timeout,
+        interface=fmu.interface if given.interface is None else given.interface,
+        sizes={**fmu.sizes, **sizes},
     )

@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import count
 from typing import Final
 
-from fmugym.archive.description import Capabilities, ModelDescription, Unit, Variable
-from fmugym.errors import ConfigError, unknown_name
-from fmugym.systems.plan import Connector, End, SystemPlan
+import numpy as np
 
-__all__ = ["PartVariable", "SystemDescription", "describe_system"]
+from fmugym.archive.description import (
+    MOST_ELEMENTS,
+    Capabilities,
+    ModelDescription,
+    Unit,
+    Variable,
+)
+from fmugym.errors import ConfigError, unknown_name
+from fmugym.systems.plan import STATISTICS, Connector, End, SystemPlan
+
+__all__ = ["MASTER", "PartVariable", "SystemDescription", "compared", "describe_system"]
 
 
 _NO_PLAN: Final = SystemPlan("", ())
 """Dataclasses want a default here, for there are others before."""
 
 
+MASTER: Final = -1
+"""Stands for the index of a component."""
+
+
 @dataclass(frozen=True, eq=False)
 class PartVariable:
-    """A variable of a component behind a variable of the system.
+    """A scalar or element of a component behind one of the system.
 
     Attributes:
-        part: The index of the component.
+        part: The index of the component; ``MASTER`` for what the master itself tells.
         variable: As its FMU describes it.
         gain, offset: See ``fmugym.systems.plan.End``.
     """
@@ -40,13 +51,14 @@ class SystemDescription(ModelDescription):
     """The description of a system.
 
     Variables are called ``component.variable``, and connectors have names of their own. The value
-    reference of a variable is its index in ``ends``. All capabilities are those that all
-    components have.
+    reference of a scalar, or of an element of an array, is its index in ``ends``. All capabilities
+    are those that all components have.
 
     Attributes:
         plan: The system.
         parts: The descriptions of the components.
-        ends: What stands behind each variable; one, except for connectors with several ends.
+        ends: What stands behind each scalar and each element; one, except for connectors with
+            several ends.
     """
 
     plan: SystemPlan = _NO_PLAN
@@ -63,6 +75,19 @@ class SystemDescription(ModelDescription):
         """See ``ModelDescription.components``."""
         return self.parts
 
+    def resized(self, sizes: Mapping[str, int]) -> ModelDescription:
+        """Refuse sizes: the connections of the system fit the arrays as they are.
+
+        Raises:
+            ConfigError: If there are any.
+        """
+        for name in sizes:
+            raise ConfigError(
+                f"{name!r} is a structural parameter of a component: give it in the start_values "
+                "of the component, since connections depend on the sizes of arrays"
+            )
+        return self
+
 
 def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> SystemDescription:
     """Describe a system.
@@ -75,6 +100,11 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         ConfigError: If a name of the plan is unknown to a component.
     """
     variables, ends = _variables(plan, parts)
+    for own in _statistics(plan, parts):
+        if own.name in variables:
+            raise ConfigError(f"{own.name!r} is the name of two variables of {plan.name}")
+        variables[own.name] = replace(own, value_reference=len(ends))
+        ends = (*ends, (PartVariable(MASTER, own),))
     newest = max(parts, key=lambda part: part.fmi_major_version)
     return SystemDescription(
         fmi_version=newest.fmi_version,
@@ -110,6 +140,56 @@ def _step_size(plan: SystemPlan, parts: Sequence[ModelDescription]) -> float | N
     return min(steps, default=None)
 
 
+def compared(
+    plan: SystemPlan, parts: Sequence[ModelDescription]
+) -> dict[tuple[int, int, int], tuple[str, Variable]]:
+    """The values of which the master estimates errors: what connections carry, if it is real.
+
+    Args:
+        plan: The system.
+        parts: The descriptions of its components.
+
+    Returns:
+        By component, value reference and place in an array: the name of the component, and the
+        variable.
+    """
+    found: dict[tuple[int, int, int], tuple[str, Variable]] = {}
+    numbers = {component.name: index for index, component in enumerate(plan.components)}
+    for link in plan.links if plan.control is not None else ():
+        part = numbers[link.source]
+        for one in parts[part].variable(link.output).elements:
+            if one.kind == "real":
+                found.setdefault((part, one.value_reference, one.place), (link.source, one))
+    return found
+
+
+def _statistics(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Iterator[Variable]:
+    """What the master tells if it estimates errors.
+
+    Raises:
+        ConfigError: If a component has its name.
+    """
+    if plan.control is None:
+        return
+    if "master" in {component.name for component in plan.components}:
+        raise ConfigError(
+            "with error_tolerance no component can be named 'master': master.steps, master.error "
+            "and others are variables of the master"
+        )
+    for reference, (name, text) in enumerate(STATISTICS.items()):
+        unit = "s" if name == "step_size" else None
+        yield _own(f"master.{name}", reference, text, unit)
+    sources = compared(plan, parts).values()
+    for reference, (component, one) in enumerate(sources, len(STATISTICS)):
+        text = "largest estimated error in the last step"
+        yield _own(f"master.error({component}.{one.name})", reference, text, one.unit)
+
+
+def _own(name: str, reference: int, text: str, unit: str | None) -> Variable:
+    kind = "Real", reference, "local", "discrete", "calculated"
+    return Variable(name, *kind, unit=unit, description=text)
+
+
 def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabilities:
     """What all components can; a restriction of one restricts the system."""
     flags = [part.capabilities for part in parts]
@@ -137,69 +217,121 @@ def _units(parts: Iterable[ModelDescription]) -> dict[str, Unit]:
 def _variables(
     plan: SystemPlan, parts: Sequence[ModelDescription]
 ) -> tuple[dict[str, Variable], tuple[tuple[PartVariable, ...], ...]]:
-    numbers = count()
-    driven = _driven(plan)
+    driven = _driven(plan, parts)
     variables: dict[str, Variable] = {}
     ends: list[tuple[PartVariable, ...]] = []
     for index, (component, part) in enumerate(zip(plan.components, parts, strict=True)):
-        for own in _scalars(part, component.starts):
-            is_driven = (component.name, own.name) in driven
-            variable = _renamed(own, f"{component.name}.{own.name}", next(numbers), is_driven)
-            variables[variable.name] = variable
-            ends.append((PartVariable(index, own),))
+        for own in _usable(part, component.starts):
+            name = f"{component.name}.{own.name}"
+            variables[name] = _renamed(own, name, len(ends), driven[component.name])
+            ends += [(PartVariable(index, element),) for element in own.elements]
+    elements = {one.name for v in variables.values() if v.shape for one in v.elements}
     for connector in plan.connectors:
-        if connector.name in variables:
-            raise ConfigError(f"{connector.name!r} is the name of two variables of {plan.name}")
-        behind = tuple(_behind(plan, parts, end) for end in connector.ends)
-        variables[connector.name] = _connector_variable(connector, behind[0], next(numbers))
-        ends.append(behind)
+        behind = [_behind(plan, parts, end) for end in connector.ends]
+        variable = _connector_variable(connector, behind[0], len(ends))
+        names = {connector.name, *(one.name for one in variable.elements)}
+        for name in names & (variables.keys() | elements):
+            raise ConfigError(f"{name!r} is the name of two variables of {plan.name}")
+        variables[connector.name] = variable
+        elements |= names
+        ends += zip(*map(_elements_behind, behind), strict=True)
     return variables, tuple(ends)
 
 
-def _driven(plan: SystemPlan) -> set[tuple[str, str]]:
-    """What a link or a connector of the system sets: it cannot be set by another name."""
-    driven = {(link.target, link.input) for link in plan.links}
+def _driven(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, set[str]]:
+    """What links and connectors of the system set: it cannot be set by another name.
+
+    Returns:
+        The names of scalars and elements by component.
+    """
+    ends = [(link.target, link.input) for link in plan.links]
     for connector in plan.connectors:
         if connector.causality != "output":
-            driven |= {(end.component, end.variable) for end in connector.ends}
+            ends += [(end.component, end.variable) for end in connector.ends]
+    names = [component.name for component in plan.components]
+    driven: dict[str, set[str]] = {name: set() for name in names}
+    for component, variable in ends:
+        part = parts[_number_of(plan, component)]
+        driven[component].update(one.name for one in part.variable(variable).elements)
     return driven
 
 
-def _scalars(
+def _number_of(plan: SystemPlan, component: str) -> int:
+    names = [one.name for one in plan.components]
+    if component not in names:
+        raise unknown_name(f"component of {plan.name}", component, names)
+    return names.index(component)
+
+
+def _usable(
     part: ModelDescription, starts: Sequence[tuple[str, float | str]]
 ) -> Iterator[Variable]:
-    """Arrays, binary values and clocks cannot be variables of a system."""
+    """Binary values, arrays of Strings and clocks cannot be variables of a system."""
     values = dict(starts)
     for variable in part.variables.values():
-        if variable.numeric or (variable.kind == "string" and not variable.shape):
+        is_number = variable.is_number and not variable.ticking
+        is_text = variable.kind == "string" and variable.is_scalar
+        if (is_number and _is_good_array(variable)) or is_text:
             yield _started(variable, values)
+
+
+def _is_good_array(variable: Variable) -> bool:
+    """Whether it is a scalar, or an array whose elements have names and start values."""
+    if not variable.shape or not variable.settable_at_start:
+        return variable.size <= MOST_ELEMENTS
+    try:
+        return bool(variable.start_numbers)
+    except ConfigError:
+        return False
 
 
 def _started(variable: Variable, values: Mapping[str, float | str]) -> Variable:
     """The variable with the start value that the system gives it, as the XML would have it."""
-    if variable.name not in values:
+    texts = [_start_text(one, values.get(one.name)) for one in variable.elements]
+    if all(text is None for text in texts):
         return variable
-    value = values[variable.name]
+    return replace(variable, start=texts[0] if variable.is_scalar else _joined(variable, texts))
+
+
+def _start_text(variable: Variable, value: float | str | None) -> str | None:
+    if value is None:
+        return None
     if variable.kind == "boolean":
-        return replace(variable, start="true" if value else "false")
+        return "true" if value else "false"
     is_whole = variable.kind in {"integer", "enumeration"}
-    return replace(variable, start=str(int(value)) if is_whole else str(value))
+    return str(int(value)) if is_whole else str(value)
 
 
-def _renamed(own: Variable, name: str, reference: int, is_driven: bool) -> Variable:
+def _joined(array: Variable, texts: Iterable[str | None]) -> str:
+    """The start values of an array; those without a text of their own stay as they are."""
+    pairs = zip(array.elements, texts, strict=True)
+    return " ".join(repr(one.start_number) if text is None else text for one, text in pairs)
+
+
+def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -> Variable:
     """What something else drives cannot be set from outside."""
     variable = replace(own, name=name, value_reference=reference)
+    places = [place for place, one in enumerate(own.elements) if one.name in driven]
+    if own.shape:
+        variable = replace(variable, driven=frozenset(places))
+    is_driven = len(places) == len(own.elements) > 0
     return replace(variable, causality="local", initial=None) if is_driven else variable
 
 
 def _behind(plan: SystemPlan, parts: Sequence[ModelDescription], end: End) -> PartVariable:
-    names = [component.name for component in plan.components]
-    if end.component not in names:
-        raise unknown_name(f"component of {plan.name}", end.component, names)
-    part = names.index(end.component)
+    """The variable behind an end, which may be an array here."""
+    part = _number_of(plan, end.component)
     starts = dict(plan.components[part].starts)
-    variable = _started(parts[part].variable(end.variable), starts)
+    found = parts[part].variable(end.variable)
+    array = found if found.array is None else found.array
+    variable = _started(array, starts)
+    if found.array is not None:
+        variable = variable.elements[found.place]
     return PartVariable(part, variable, end.gain, end.offset)
+
+
+def _elements_behind(end: PartVariable) -> list[PartVariable]:
+    return [replace(end, variable=element) for element in end.variable.elements]
 
 
 def _connector_variable(connector: Connector, first: PartVariable, reference: int) -> Variable:
@@ -213,6 +345,9 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         own,
         name=connector.name,
         value_reference=reference,
+        array=None,
+        place=0,
+        driven=frozenset() if own.shape else None,
         causality=connector.causality,
         unit=own.unit if connector.unit is None else connector.unit,
         minimum=min(limits),
@@ -225,12 +360,14 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
 
 def _start(connector: Connector, first: PartVariable) -> str | None:
     own = first.variable
-    if own.start is None or not own.numeric or (first.gain, first.offset) == (1.0, 0.0):
+    if own.start is None or not own.is_number or (first.gain, first.offset) == (1.0, 0.0):
         return own.start
-    number = own.start_number
+    numbers = np.array([element.start_number for element in own.elements])
     if connector.causality == "output":
-        return repr(first.gain * number + first.offset)
-    return repr((number - first.offset) / first.gain)
+        numbers = first.gain * numbers + first.offset
+    else:
+        numbers = (numbers - first.offset) / first.gain
+    return " ".join(map(repr, numbers.tolist()))
 
 
 def _nominal(connector: Connector, first: PartVariable) -> float | None:

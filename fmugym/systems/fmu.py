@@ -10,13 +10,15 @@ from functools import cached_property
 from pathlib import Path
 
 from fmugym.archive.bundled import is_bundled
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
-from fmugym.errors import ConfigError, FMULoadError
+from fmugym.errors import ConfigError, FMULoadError, shown
 from fmugym.systems.description import SystemDescription, describe_system
 from fmugym.systems.layout import Layout
 from fmugym.systems.plan import Component, SystemPlan
+from fmugym.wine.loader import can_run_windows
 
 __all__ = ["ExtractedSystem", "SystemFMU"]
 
@@ -43,9 +45,17 @@ class ExtractedSystem(ExtractedFMU):
 def _parts_in(folder: Path, description: SystemDescription) -> tuple[LoadableFMU, ...]:
     pairs = zip(description.plan.components, description.parts, strict=True)
     return tuple(
-        ExtractedFMU(component.path, part, component.preload, folder / str(number))
+        _part_in(folder / str(number), component, part)
         for number, (component, part) in enumerate(pairs)
     )
+
+
+def _part_in(folder: Path, component: Component, description: ModelDescription) -> LoadableFMU:
+    """Of libraries for Windows, only those that run here in Wine were extracted."""
+    part = ExtractedFMU(component.path, description, component.preload, folder)
+    part.isolated = component.isolate
+    part.in_wine = can_run_windows() and not (folder / part.library).exists()
+    return part
 
 
 class SystemFMU(FMU):
@@ -97,6 +107,11 @@ class SystemFMU(FMU):
         assert isinstance(self.description, SystemDescription)
         return _parts_in(self.extract(), self.description)
 
+    @property
+    def whereabouts_by_name(self) -> dict[str, str]:
+        """Where each component runs: ``"here"``, ``"process"`` or ``"wine"``."""
+        return {component.name: fmu.whereabouts for component, fmu in self._pairs()}
+
     @cached_property
     def platforms(self) -> tuple[str, ...]:
         """The platforms for which all FMUs were built, by the names of each."""
@@ -104,11 +119,11 @@ class SystemFMU(FMU):
 
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
-        """What keeps the components from being loaded into one process; see ``FMU.obstacles``."""
+        """What keeps the components from being loaded; see ``FMU.obstacles``."""
         return tuple(
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()
-            for text in ((_WINDOWS_ONLY,) if fmu.in_wine else fmu.obstacles)
+            for text in fmu.obstacles
         )
 
     @cached_property
@@ -130,7 +145,7 @@ class SystemFMU(FMU):
             return self._folder
         for component, fmu in self._pairs():
             with _naming(component):
-                _require_native(fmu)
+                _require_runnable(fmu)
         folder = folder_name()
         self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
         try:
@@ -151,8 +166,20 @@ def _require_solvable(layout: Layout) -> None:
     """Refuse loops that no master could solve.
 
     Raises:
-        ConfigError: If a component of a loop cannot repeat a step, or has no Initialization Mode.
+        ConfigError: If a component cannot repeat a step although a loop or the estimate of errors
+            needs it, or a component of a loop has no Initialization Mode.
     """
+    for part in layout.parts if layout.plan.control is not None else ():
+        able = part.description.capabilities
+        for flag, what in (
+            (able.can_get_and_set_fmu_state, "save its FMU state"),
+            (able.can_handle_variable_communication_step_size, "vary its step size"),
+        ):
+            if not flag:
+                raise ConfigError(
+                    "error_tolerance needs components that can repeat steps as smaller ones, and "
+                    f"{part.label} cannot {what}"
+                )
     repeated = [group for group in layout.plan.groups if group.loop is not None]
     for group in repeated if layout.plan.master == "gauss_seidel" else ():
         numbers = layout.parts_of(group)
@@ -173,20 +200,17 @@ def _require_solvable(layout: Layout) -> None:
                 )
 
 
-_WINDOWS_ONLY = (
-    "it has libraries for Windows only. These run in Wine, in processes of their own, but all "
-    "components of a system run in one process"
-)
-
-
 def _open(component: Component) -> FMU:
     with _naming(component):
-        return FMU(
+        fmu = FMU(
             component.path,
             limits=component.limits,
             preload=component.preload,
             interface=component.interface,
+            sizes=dict(component.sizes),
         )
+    fmu.isolated = component.isolate
+    return fmu
 
 
 @contextmanager
@@ -198,7 +222,10 @@ def _naming(component: Component) -> Iterator[None]:
         raise FMULoadError(f"component {component.name!r}: {error}") from None
 
 
-def _require_native(fmu: FMU) -> None:
-    if fmu.in_wine:
-        raise FMULoadError(f"{fmu.path.name}: {_WINDOWS_ONLY}")
+def _require_runnable(fmu: FMU) -> None:
     fmu._check_library()
+    if fmu.in_wine and fmu.preload:
+        raise FMULoadError(
+            f"{fmu.path.name} has libraries for Windows only, which run here in Wine. There is no "
+            f"preload there, got {shown(list(fmu.preload))}"
+        )

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TypeAlias
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.errors import ConfigError
-from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.plan import Component, Evaluation, Group, Link
+from fmugym.systems.description import MASTER, PartVariable, SystemDescription, compared
+from fmugym.systems.plan import STATISTICS, Component, Evaluation, Group, Link
 
-__all__ = ["Layout", "PartLayout", "Route"]
+__all__ = ["Layout", "PartLayout", "Route", "array_key"]
 
 
 @dataclass
@@ -25,7 +26,8 @@ class PartLayout:
     Attributes:
         component: Of the plan.
         description: Of its FMU.
-        inputs, outputs: Its variables, one for each slot.
+        inputs, outputs: Its scalars and elements of arrays, one for each slot. Arrays are there as
+            a whole, because FMI sets them as a whole.
         first_input, first_output: The numbers of its first slots.
     """
 
@@ -51,6 +53,17 @@ class PartLayout:
         """What the plan sets before the initialization."""
         return tuple((self._settable(name), value) for name, value in self.component.starts)
 
+    def starts_of(self, variables: Iterable[Variable]) -> list[float]:
+        """What numeric scalars and elements of this component start with."""
+        known = dict(self.component.starts)
+        return [float(known.get(one.name, one.start_number)) for one in variables]
+
+    def span_of(self, place: int) -> slice:
+        """The places of all elements of an array among the inputs, of which one is at ``place``."""
+        variable = self.inputs[place]
+        first = place - variable.place
+        return slice(first, first + variable.size)
+
     def _settable(self, name: str) -> Variable:
         variable = self.description.variable(name)
         if not variable.settable_at_start:
@@ -63,15 +76,33 @@ class PartLayout:
 
 @dataclass(frozen=True)
 class Route:
-    """Carries the value of a slot of an output to a slot of an input; see ``Link``."""
+    """Carries values from slots of outputs to slots of inputs; see ``Link``.
+
+    Attributes:
+        source_part, target_part: Numbers of components.
+        source, target: The first slots.
+        count: How many slots follow each other: several for a whole array.
+        gain, offset, link: Those of the link, and its number.
+    """
 
     source_part: int
     source: int
     target_part: int
     target: int
+    count: int
     gain: float
     offset: float
     link: int
+
+    @property
+    def sources(self) -> range:
+        """The slots of outputs."""
+        return range(self.source, self.source + self.count)
+
+    @property
+    def targets(self) -> range:
+        """The slots of inputs."""
+        return range(self.target, self.target + self.count)
 
 
 class Layout:
@@ -87,6 +118,9 @@ class Layout:
         parts: One for each component.
         routes: In the order of their targets.
         number_of_inputs, number_of_outputs: Slots in all.
+        first_statistic: The first slot of what the master tells, after those of the components.
+        compared: The slots of the values of which the master estimates errors, and their nominal
+            values.
 
     Raises:
         ConfigError: If a name of the plan is unknown, or a variable cannot be used in its role.
@@ -102,8 +136,8 @@ class Layout:
         pairs = zip(self.plan.components, description.parts, strict=True)
         self.parts = [PartLayout(component, part) for component, part in pairs]
         self._numbers = {part.component.name: i for i, part in enumerate(self.parts)}
-        self._input_slots: dict[tuple[int, int, str], int] = {}
-        self._output_slots: dict[tuple[int, int, str], int] = {}
+        self._input_slots: dict[tuple[int, *_Key], int] = {}
+        self._output_slots: dict[tuple[int, *_Key], int] = {}
         self._fill(inputs, outputs)
         self.routes = self._find_routes()
 
@@ -113,8 +147,8 @@ class Layout:
         outs: list[tuple[int, Variable]] = [self._source(link) for link in self.plan.links]
         outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
         for index, part in enumerate(self.parts):
-            part.inputs = list(_different(v for number, v in ins if number == index))
-            part.outputs = list(_different(v for number, v in outs if number == index))
+            part.inputs = list(_different(_wholes(v for number, v in ins if number == index)))
+            part.outputs = list(_different(_wholes(v for number, v in outs if number == index)))
         self.number_of_inputs = self.number_of_outputs = 0
         for index, part in enumerate(self.parts):
             part.first_input, part.first_output = self.number_of_inputs, self.number_of_outputs
@@ -124,6 +158,18 @@ class Layout:
                 self._output_slots[index, *_key(variable)] = place
             self.number_of_inputs += len(part.inputs)
             self.number_of_outputs += len(part.outputs)
+        self._append_statistics()
+
+    def _append_statistics(self) -> None:
+        """Give slots to what the master tells, if it estimates errors."""
+        found = compared(self.plan, [part.description for part in self.parts])
+        self.first_statistic = self.number_of_outputs
+        self.compared = [
+            (self._output_slots[part, *_key(variable)], abs(variable.nominal or 1.0))
+            for (part, *_), (_, variable) in found.items()
+        ]
+        if self.plan.control is not None:
+            self.number_of_outputs += len(STATISTICS) + len(found)
 
     def _source(self, link: Link) -> tuple[int, Variable]:
         part = self._numbers[link.source]
@@ -138,11 +184,12 @@ class Layout:
         for number, link in enumerate(self.plan.links):
             source_part, output = self._source(link)
             target_part, variable = self._target(link)
-            source = self._output_slots[source_part, *_key(output)]
-            target = self._input_slots[target_part, *_key(variable)]
-            routes.append(
-                Route(source_part, source, target_part, target, link.gain, link.offset, number)
-            )
+            if not variable.elements:  # an array may have the size 0
+                continue
+            source = self._output_slots[source_part, *_key(output.elements[0])]
+            target = self._input_slots[target_part, *_key(variable.elements[0])]
+            ends = source_part, source, target_part, target, len(variable.elements)
+            routes.append(Route(*ends, link.gain, link.offset, number))
         return tuple(sorted(routes, key=lambda route: route.target))
 
     def ends_of(self, variable: Variable) -> tuple[PartVariable, ...]:
@@ -155,7 +202,20 @@ class Layout:
 
     def output_slot(self, end: PartVariable) -> int:
         """The slot that this variable is read into; -1 if there is none."""
+        if end.part == MASTER:
+            return self.first_statistic + end.variable.value_reference
         return self._output_slots.get((end.part, *_key(end.variable)), -1)
+
+    @cached_property
+    def arrays(self) -> dict[tuple[int, int, str], tuple[int, Variable]]:
+        """The arrays of all components behind variables of the system.
+
+        Returns:
+            By what ``array_key`` returns, the numbers of their components and the arrays.
+        """
+        ends = (end for group in self.description.ends for end in group)
+        found = ((end, end.variable.array) for end in ends)
+        return {array_key(end): (end.part, array) for end, array in found if array is not None}
 
     # Numbers in the place of names.
 
@@ -178,7 +238,8 @@ class Layout:
 
     def routes_of(self, evaluation: Evaluation) -> tuple[int, ...]:
         """The routes of an evaluation."""
-        return tuple(self._route_of_link[link] for link in evaluation.links)
+        known = self._route_of_link
+        return tuple(known[link] for link in evaluation.links if link in known)
 
     def loop_label(self, numbers: Iterable[int]) -> str:
         """Name a loop through these components, for messages."""
@@ -186,9 +247,23 @@ class Layout:
         return f"the algebraic loop of {', '.join(names)}"
 
 
-def _key(variable: Variable) -> tuple[int, str]:
+_Key: TypeAlias = tuple[int, str, int]
+
+
+def _key(variable: Variable) -> _Key:
     """What identifies a value of an FMU; value references of FMI 1.0 and 2.0 have a type."""
-    return variable.value_reference, variable.kind
+    return variable.value_reference, variable.kind, variable.place
+
+
+def array_key(end: PartVariable) -> tuple[int, int, str]:
+    """What identifies the array that an element belongs to."""
+    return end.part, end.variable.value_reference, end.variable.kind
+
+
+def _wholes(variables: Iterable[Variable]) -> Iterator[Variable]:
+    """Scalars as they are, and all elements of arrays of which something is there."""
+    for variable in variables:
+        yield from (variable if variable.array is None else variable.array).elements
 
 
 def _different(variables: Iterable[Variable]) -> Iterator[Variable]:

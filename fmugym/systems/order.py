@@ -63,15 +63,28 @@ def _chains(
     links: Sequence[Link], told: Mapping[str, Mapping[str, frozenset[str]]]
 ) -> dict[int, list[int]]:
     """For each link, the links whose values its own depends on at once."""
-    into: dict[tuple[str, str], int] = {(k.target, k.input): i for i, k in enumerate(links)}
+    into: dict[tuple[str, str], list[int]] = {}
+    for place, link in enumerate(links):
+        for name in _told_names(link.input):
+            into.setdefault((link.target, name), []).append(place)
     return {
         place: sorted(
-            into[link.source, name]
-            for name in told[link.source].get(link.output, ())
-            if (link.source, name) in into
+            other
+            for output in _told_names(link.output)
+            for name in told[link.source].get(output, ())
+            for other in into.get((link.source, name), ())
         )
         for place, link in enumerate(links)
     }
+
+
+def _told_names(name: str) -> tuple[str, ...]:
+    """The names by which an FMU may tell the feed-through of a variable.
+
+    FMI 3.0 tells it of arrays, not of their elements. The scalars of other versions, which may be
+    called ``y[1]``, have no other name.
+    """
+    return (name, name.rpartition("[")[0]) if name.endswith("]") else (name,)
 
 
 def _loops(graph: Mapping[int, Sequence[int]]) -> list[list[int]]:
@@ -121,7 +134,8 @@ def _order_of_teams(
 
 def _acts(link: Link, told: Mapping[str, Feedthrough]) -> bool:
     """Whether the value of a link acts on an output of its target at once."""
-    return any(link.input in inputs for inputs in told[link.target].in_step.values())
+    names = _told_names(link.input)
+    return any(not inputs.isdisjoint(names) for inputs in told[link.target].in_step.values())
 
 
 def _group(team: tuple[str, ...], loops: Iterable[Sequence[Link]], loop: Loop) -> Group:

@@ -28,8 +28,10 @@ from fmugym.archive.safe_zip import ArchiveLimits
 __all__ = [
     "LOOP_METHODS",
     "MASTERS",
+    "STATISTICS",
     "Component",
     "Connector",
+    "Control",
     "End",
     "Evaluation",
     "Group",
@@ -40,6 +42,14 @@ __all__ = [
 
 MASTERS: Final = ("gauss_seidel", "jacobi")
 """The orders in which values are exchanged and components step, the preferred one first."""
+
+STATISTICS: Final = {
+    "steps": "communication steps since the start of the episode",
+    "rejected_steps": "communication steps that were repeated as smaller ones, since then",
+    "step_size": "communication step size that is tried next",
+    "error": "largest estimated error in the last step, as a part of the tolerance",
+}
+"""What the master tells if it estimates errors; ``native/system.h`` has the same order."""
 
 LOOP_METHODS: Final = ("newton", "fixed_point")
 """How algebraic loops are solved, the preferred method first."""
@@ -54,9 +64,11 @@ class Component:
         path: The ``.fmu`` file, absolute.
         interface: One of ``fmugym.archive.description.INTERFACES``; None for the FMU's first one.
         steps: Communication steps in one step of the master.
-        starts: Values set before initialization, by the names of the component's variables.
-            Those that an environment sets win.
+        starts: Values set before initialization, by the names of the component's variables and
+            elements of arrays. Those that an environment sets win.
         limits, preload: See ``fmugym.FMU``.
+        sizes: The values of structural parameters.
+        isolate: Whether it runs in a process of its own.
     """
 
     name: str
@@ -66,6 +78,8 @@ class Component:
     starts: tuple[tuple[str, float | str], ...] = ()
     limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
+    sizes: tuple[tuple[str, int], ...] = ()
+    isolate: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,9 +88,9 @@ class Link:
 
     Attributes:
         source: The name of a component.
-        output: The name of its variable.
+        output: The name of its variable: a scalar, an element of an array, or a whole array.
         target: The name of a component.
-        input: The name of its variable; no other link has it.
+        input: The name of its variable, of the same shape; no other link has it.
         gain, offset: 1 and 0 leave the value as it is.
     """
 
@@ -102,6 +116,21 @@ class Loop:
     method: str = LOOP_METHODS[0]
     tolerance: float = 1e-9
     max_iterations: int = 50
+
+
+@dataclass(frozen=True)
+class Control:
+    """How the sizes of communication steps follow from an estimate of the error.
+
+    Attributes:
+        tolerance: The error that a step may add to the value of a connection, as a part of the
+            larger of its magnitude and its nominal value (1 if the FMU gives none).
+        min_step_size: Smaller steps are not tried, in seconds; None for 1/1024 of a step of the
+            system.
+    """
+
+    tolerance: float
+    min_step_size: float | None = None
 
 
 @dataclass(frozen=True)
@@ -136,7 +165,7 @@ class End:
 
     Attributes:
         component: The name of the component.
-        variable: The name of its variable.
+        variable: The name of its variable: a scalar, an element of an array, or a whole array.
         gain, offset: ``gain * x + offset`` is the value of the target if x is that of the source.
             An input or parameter of the system is the source, an output of it the target.
     """
@@ -184,6 +213,7 @@ class SystemPlan:
         tolerance: Of the default experiment.
         description: For people.
         findings: What is doubtful in the system, as texts.
+        control: How the step sizes follow from an estimate of the error; None if they do not.
         file: Where the system was read from; None if it was made in Python.
     """
 
@@ -200,4 +230,5 @@ class SystemPlan:
     tolerance: float | None = None
     description: str = ""
     findings: tuple[str, ...] = ()
+    control: Control | None = None
     file: Path | None = None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
-from fmugym.archive.description import Unit, Variable
+from fmugym.archive.description import MOST_ELEMENTS, Unit, Variable
 from fmugym.archive.units import IDENTITY, Conversion, conversion_of_link
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.components import OpenComponent
@@ -19,7 +20,7 @@ _SOURCES = ("output", "local", "calculatedParameter")
 
 @dataclass(frozen=True)
 class Port:
-    """A variable of a component."""
+    """A variable of a component: a scalar, an element of an array, or a whole array."""
 
     component: OpenComponent
     variable: Variable
@@ -39,6 +40,17 @@ class Port:
         """Of the variable, where items of enumerations count as integers."""
         kind = self.variable.kind
         return "integer" if kind == "enumeration" else kind
+
+    @property
+    def elements(self) -> Iterator[Port]:
+        """Its scalars: those of an array, or itself."""
+        return (Port(self.component, element) for element in self.variable.elements)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is a String that a component can be started with."""
+        variable = self.variable
+        return variable.kind == "string" and variable.is_scalar and variable.settable_at_start
 
 
 @dataclass
@@ -120,14 +132,16 @@ class Wiring:
 
     def _drive(self, target: Port, connection: Connection) -> None:
         """Note what drives an input; there may be only one."""
-        other = self._driven.setdefault(target.name, connection)
-        if other is not connection:
-            raise ConfigError(f"{target.name} has two sources: {other.source}, {connection.source}")
         variable = target.variable
-        if not variable.numeric:
-            raise ConfigError(f"{connection}: {_not_numeric(target)}")
-        is_parameter = variable.causality == "parameter" and variable.settable_at_start
         from_system = self.port(connection.source) is None
+        if not (from_system and target.is_text):
+            _require_number(connection, target)
+        for element in target.elements:
+            other = self._driven.setdefault(element.name, connection)
+            if other is not connection:
+                sources = f"{other.source}, {connection.source}"
+                raise ConfigError(f"{element.name} has two sources: {sources}")
+        is_parameter = variable.causality == "parameter" and variable.settable_at_start
         if variable.causality != "input" and not (from_system and is_parameter):
             raise ConfigError(
                 f"{connection}: {target.name} is a {variable.variability} {variable.causality}; "
@@ -142,7 +156,9 @@ class Wiring:
         ends = self._ends.setdefault(name, [])
         first = self._first(ends)
         conversion = self._own_conversion(name, connection, first or target, target)
-        if first is not None:
+        if first is None:
+            _check_gain(connection, target, target)
+        else:
             _check_kinds(connection, first, target)
         ends.append(_end(connection, target, conversion))
 
@@ -172,8 +188,7 @@ class Wiring:
             raise ConfigError(f"the output {name!r} of the system has two sources: {others}")
         self._driven[name] = connection
         self._claim(name, "output", connection)
-        if not source.variable.numeric:
-            raise ConfigError(f"{connection}: {_not_numeric(source)}")
+        _require_number(connection, source)
         own, definitions = self._own_unit(name, source)
         unit = source.variable.unit
         conversion = _conversion(connection, unit, source.units, own, definitions)
@@ -201,9 +216,20 @@ class Wiring:
         """The inputs of components that nothing drives; they are inputs of the system."""
         for component in self.components.values():
             for variable in component.fmu.description.variables.values():
-                port = Port(component, variable)
-                if variable.causality == "input" and port.name not in self._driven:
-                    yield port
+                if variable.causality == "input":
+                    yield from self._open_parts(Port(component, variable))
+
+    def _open_parts(self, port: Port) -> Iterator[Port]:
+        """An input if nothing drives any of it; or else those of its elements that are open."""
+        if not self._has_driven(port):
+            yield port
+        elif port.variable.shape:
+            yield from (one for one in port.elements if one.name not in self._driven)
+
+    def _has_driven(self, port: Port) -> bool:
+        if port.variable.size > MOST_ELEMENTS:  # connections name no elements of such an array
+            return False
+        return any(element.name in self._driven for element in port.elements)
 
 
 def _require_source(source: Port, connection: Connection) -> None:
@@ -248,8 +274,14 @@ def _conversion(
 
 def _check_kinds(connection: Connection, source: Port, target: Port) -> None:
     """Refuse what loses information: only integers may become reals."""
-    if not source.variable.numeric:
-        raise ConfigError(f"{connection}: {_not_numeric(source)}")
+    if not (source.is_text and target.is_text):
+        _require_number(connection, source)
+    shapes = source.variable.shape, target.variable.shape
+    if shapes[0] != shapes[1]:
+        raise ConfigError(
+            f"{connection}: {_shaped(source)}, and {_shaped(target)}; only equal shapes can be "
+            "connected. An element has a name of its own: 'component.array[1]'"
+        )
     kinds = source.kind, target.kind
     if kinds[0] != kinds[1] and kinds != ("integer", "real"):
         raise ConfigError(
@@ -268,7 +300,29 @@ def _check_gain(connection: Connection, source: Port, target: Port) -> None:
         )
 
 
-def _not_numeric(port: Port) -> str:
+def _shaped(port: Port) -> str:
+    shape = port.variable.shape
+    return f"{port.name} is an array of shape {shape}" if shape else f"{port.name} is a scalar"
+
+
+def _require_number(connection: Connection, port: Port) -> None:
+    """Refuse what a connection cannot carry.
+
+    Raises:
+        ConfigError: If the variable is neither a number nor a Boolean, nor an array of them.
+    """
     variable = port.variable
-    what = f"an array of shape {variable.shape}" if variable.shape else f"of type {variable.type}"
-    return f"{port.name} is {what}; only scalar numbers and Booleans can be connected"
+    if variable.is_number and not variable.ticking:
+        return
+    if variable.ticking:
+        text = "a clock. Each component lets its own clocks tick; connect a variable of the clock"
+    else:
+        text = f"of type {variable.type}{_REASONS.get(variable.type, '')}"
+    raise ConfigError(f"{connection}: {port.name} is {text}")
+
+
+_REASONS: Final = {
+    "String": ". Connections carry numbers and Booleans. A String parameter gets its text from "
+    "start_values of the component, or from a name of the system",
+    "Binary": ". Connections carry numbers and Booleans",
+}

@@ -9,13 +9,12 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription, Variable, unlisted
 from fmugym.archive.texts import with_texts
-from fmugym.checks import LARGEST_COUNT, check_number, flattened, integer_of
+from fmugym.checks import LARGEST_COUNT, check_number, integer_of, parts_of_array
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.fmi.access import unlisted
 from fmugym.pool.spec import (
     FIXED_STEP_SOLVERS,
     START_TIME,
@@ -327,7 +326,9 @@ def _check_inputs_are_whole(inputs: Sequence[Variable], started: Sequence[Variab
     arrays = {variable.array for variable in inputs}
     for variable in started:
         array = variable.array
-        if array is not None and array in arrays and variable.name not in names:
+        if array is None or variable.is_apart:
+            continue
+        if array in arrays and variable.name not in names:
             raise ConfigError(
                 f"{variable.name!r} cannot be given a start value while other elements of "
                 f"{array.name!r} are inputs; let all of {array.name!r} be inputs"
@@ -404,14 +405,8 @@ def spread(name: str, scalars: Sequence[Variable], value: Any) -> list[Any]:
     is_array = len(scalars) != 1 or (array is not None and array.name == name)
     if not is_array:
         return [value]
-    shape, parts = flattened(value)
-    if shape == ():
-        return parts * len(scalars)
-    expected = (len(scalars),) if array is None else array.shape
-    if shape not in {expected, (len(scalars),)}:
-        found = "lists of different lengths" if shape is None else f"the shape {shape}"
-        raise ConfigError(f"{name!r} is an array of shape {expected}, got {found}: {shown(value)}")
-    return [as_distribution(repr(name), part) for part in parts]
+    shape = (len(scalars),) if array is None else array.shape
+    return [as_distribution(repr(name), part) for part in parts_of_array(name, shape, value)]
 
 
 def _interval(frequency: float | None) -> float:

@@ -113,7 +113,9 @@ def _open_system(system: FMUSystem, config: EnvConfig) -> FMU:
             raise ConfigError(
                 f"config key {key!r} is for a single FMU; give it to a component of {system.name!r}"
             )
-    return system.as_fmu(config.probe_timeout)
+    fmu = system.as_fmu(config.probe_timeout)
+    fmu.description.resized(structural_values(fmu.description, config.model_parameters))
+    return fmu
 
 
 def _interface_of(cls: type, wanted: str | None, own: str | None) -> str | None:

@@ -332,7 +332,8 @@ def _round_down(value: float) -> float:
 def _scalars(variables: Sequence[Variable]) -> list[Variable]:
     """The numeric scalars, and the elements of numeric arrays that are not large."""
     usable = (v for v in variables if v.is_number and v.size <= MOST_ELEMENTS)
-    return [element for variable in usable for element in variable.elements]
+    # something else drives elements of another causality
+    return [one for v in usable for one in v.elements if one.causality == v.causality]
 
 
 def literal(variable: Variable) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
@@ -54,13 +54,17 @@ def overview_of_system(
     Returns:
         As ``overview``, with ``system``, a dict; ``docs/command-line.md`` describes the keys.
     """
-    facts = overview(system.as_fmu(), everything=everything, pattern=pattern)
+    fmu = system.as_fmu()
+    facts = overview(fmu, everything=everything, pattern=pattern)
     groups = [
         {"components": list(group.components), "is_loop": group.loop is not None}
         for group in system.order.groups
     ]
     facts["system"] = {
-        "components": [_component(system, name) for name in system.components],
+        "components": [
+            _component(system, name) | {"runs": where}
+            for name, where in fmu.whereabouts_by_name.items()
+        ],
         "connections": [asdict(link) for link in system.links],
         "connectors": [asdict(connector) for connector in system.connectors],
         "master": system.master,
@@ -119,6 +123,9 @@ def _group(group: Mapping[str, Any]) -> str:
     return f"({names})" if group["is_loop"] else names
 
 
+_WHEREABOUTS: Final = {"here": "", "process": ", in a process of its own", "wine": ", in Wine"}
+
+
 def _parts(system: Mapping[str, Any]) -> Iterator[str]:
     yield f"\nComponents ({len(system['components'])})"
     for one in system["components"]:
@@ -126,7 +133,7 @@ def _parts(system: Mapping[str, Any]) -> Iterator[str]:
         text = f"{one['name']}: {Path(one['fmu']).name}, FMI {one['fmi_version']} {kind}"
         tool = f", by {one['generation_tool']}" if one["generation_tool"] else ""
         steps = f", {one['steps']} steps in one of the system" if one["steps"] > 1 else ""
-        yield f"  {plain(text + tool + steps)}"
+        yield f"  {plain(text + tool + steps + _WHEREABOUTS[one['runs']])}"
     yield f"\nConnections ({len(system['connections'])})"
     for link in system["connections"]:
         yield f"  {plain(_link(link))}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -124,7 +125,8 @@ def make_pool(
         def note_crash(how: str) -> None:
             _note_crash(fmu, spec, starts, verdict, how, log)
 
-        actual = replace(spec, blind_start=verdict.blind_start)
+        timeout = math.inf if call_timeout is None else float(call_timeout)
+        actual = replace(spec, blind_start=verdict.blind_start, call_timeout=timeout)
         _tell_of_reading(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)

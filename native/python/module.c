@@ -2,6 +2,7 @@
 
 #include "programs.h"
 
+#include "served.h"
 #include "threads.h"
 
 PyObject *closed_error;
@@ -79,6 +80,19 @@ static PyObject *claim_initialization(PyObject *module, PyObject *args) {
     return PyFloat_FromDouble(next > now ? 1e-9 * (double)(next - now) : 0.0);
 }
 
+static PyObject *py_serve_component(PyObject *module, PyObject *unused) {
+    (void)module;
+    (void)unused;
+#if defined _WIN32
+    PyErr_SetString(PyExc_OSError, "components have processes of their own on Linux and macOS only");
+#else
+    Py_BEGIN_ALLOW_THREADS serve_standard_streams();
+    Py_END_ALLOW_THREADS
+    PyErr_SetString(PyExc_OSError, "the standard streams cannot be used");
+#endif
+    return NULL;
+}
+
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
@@ -88,6 +102,7 @@ static PyMethodDef functions[] = {
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
+    {"serve_component", py_serve_component, METH_NOARGS, NULL},
     {"claim_initialization", claim_initialization, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "python.h"
+#include "remote.h"
 
 /* Bytes that hold values of one size. */
 typedef struct {
@@ -97,26 +98,77 @@ static bool take_part_strings(PyObject *tuple, Component *part) {
     return part->strings != NULL;
 }
 
+static const char **texts_of(PyObject *tuple, size_t *count) {
+    *count = PyTuple_Check(tuple) ? (size_t)PyTuple_Size(tuple) : 0;
+    return PyTuple_Check(tuple) ? take_texts(tuple) : NULL;
+}
+
+/* None, or how the workers of a part run. take_texts adds a NULL to the texts. */
+static bool take_remote(PyObject *object, Component *part) {
+    PyObject *command, *environment, *preload;
+    Py_ssize_t workers, instances;
+    size_t unused;
+
+    if (object == Py_None) {
+        return true;
+    }
+    Remote *remote = calloc(1, sizeof *remote);
+    part->remote = remote;
+    if (remote == NULL || !PyTuple_Check(object) ||
+        !PyArg_ParseTuple(object, "OOOynnd", &command, &environment, &preload, &remote->path,
+                          &workers, &instances, &remote->call_timeout) ||
+        workers < 1 || instances < 1) {
+        return refuse("workers");
+    }
+    remote->workers = (size_t)workers;
+    remote->instances = (size_t)instances;
+    remote->command = texts_of(command, &unused);
+    remote->environment = texts_of(environment, &unused);
+    remote->preload = texts_of(preload, &remote->number_of_preloads);
+    part->fmi = remote_table(part->version);
+    return (remote->command != NULL && remote->environment != NULL && remote->preload != NULL &&
+            part->fmi != NULL) ||
+           refuse("workers");
+}
+
+static void drop_remote(const Remote *remote) {
+    if (remote != NULL) {
+        free((void *)remote->command);
+        free((void *)remote->environment);
+        free((void *)remote->preload);
+        free((void *)remote);
+    }
+}
+
 static bool take_part(PyObject *tuple, Component *part) {
-    PyObject *categories, *solving, *strings;
+    PyObject *categories, *solving, *strings, *remote;
     Variables inputs, outputs, starts;
-    Bytes input_starts, start_values, none = {NULL, 0};
+    Bytes input_starts, start_values, structural_references, structural_values, none = {NULL, 0};
     int version, manner, has_mode, rung;
     long long steps;
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#y#)y#(y#y#y#y#)(y#y#y#y#)y#O!", &part->name, &part->label,
-            &part->not_finite, &version, &manner, &has_mode, &rung, &part->model, &part->token,
-            &part->resources, &PyTuple_Type, &categories, &steps, &solving, VARIABLES(inputs),
+            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#y#)y#(y#y#y#y#)(y#y#y#y#)y#O!(y#y#)O", &part->name,
+            &part->label, &part->not_finite, &version, &manner, &has_mode, &rung, &part->model,
+            &part->token, &part->resources, &PyTuple_Type, &categories, &steps, &solving,
+            VARIABLES(inputs),
             BYTES(input_starts), VARIABLES(outputs), VARIABLES(starts), BYTES(start_values),
-            &PyTuple_Type, &strings)) {
+            &PyTuple_Type, &strings, BYTES(structural_references), BYTES(structural_values),
+            &remote)) {
         return refuse("parts");
     }
+    part->version = version;
+    part->manner = manner;
     part->fmi = version == 0 ? NULL : fmi_of(version, manner);
-    if (part->fmi == NULL || steps < 1 || rung < RUNG_RESTORE || rung > RUNG_LIBRARY) {
+    const size_t structural = count_of(structural_references, sizeof(uint32_t));
+    if (part->fmi == NULL || steps < 1 || rung < RUNG_RESTORE || rung > RUNG_LIBRARY ||
+        count_of(structural_values, sizeof(uint64_t)) != structural) {
         return refuse("parts");
     }
+    part->number_of_structural = structural;
+    part->structural_references = structural_references.data;
+    part->structural_values = structural_values.data;
     part->has_mode = has_mode;
     part->rung = (Rung)rung;
     part->steps = steps;
@@ -124,7 +176,7 @@ static bool take_part(PyObject *tuple, Component *part) {
     part->start_values = doubles_of(start_values);
     part->number_of_categories = (size_t)PyTuple_Size(categories);
     part->categories = take_texts(categories);
-    return part->categories != NULL && take_solving(solving, &part->solving) &&
+    return part->categories != NULL && take_remote(remote, part) && take_solving(solving, &part->solving) &&
            open_access(&part->inputs, part, inputs, input_starts) &&
            open_access(&part->outputs, part, outputs, none) &&
            open_access(&part->starts, part, starts, start_values) &&
@@ -187,27 +239,44 @@ static void share_out(System *s) {
     }
 }
 
+/* Whether an element's array has all of its slots around this one, and as many follow as the route
+ * needs. */
+static bool is_sound_slot(const Access *list, size_t place, uint32_t count) {
+    const Element *element = &list->variables[place];
+    return element->place <= place && count > 0 && count <= element->size - element->place &&
+           element->size - element->place <= list->count - place;
+}
+
+static bool is_sound_route(const System *s, const Route *route) {
+    const Component *source = &s->parts[route->source_part];
+    const Component *target = &s->parts[route->target_part];
+    return is_sound_slot(&source->outputs, route->source - source->first_output, route->count) &&
+           is_sound_slot(&target->inputs, route->target - target->first_input, route->count);
+}
+
 static bool take_routes(PyObject *tuple, System *s) {
-    Bytes sources, targets, gains, offsets;
+    Bytes sources, targets, counts, gains, offsets;
 
     if (!PyTuple_Check(tuple) ||
-        !PyArg_ParseTuple(tuple, "y#y#y#y#", &sources.data, &sources.size, &targets.data,
-                          &targets.size, &gains.data, &gains.size, &offsets.data, &offsets.size)) {
+        !PyArg_ParseTuple(tuple, "y#y#y#y#y#", BYTES(sources), BYTES(targets), BYTES(counts),
+                          BYTES(gains), BYTES(offsets))) {
         return refuse("routes");
     }
     s->number_of_routes = count_of(sources, sizeof(uint32_t));
     s->routes = calloc(s->number_of_routes + 1, sizeof *s->routes);
-    if (s->routes == NULL || targets.size != sources.size || gains.size != 2 * sources.size ||
-        offsets.size != gains.size || !all_below(sources, s->outputs) ||
-        !all_below(targets, s->inputs)) {
+    if (s->routes == NULL || targets.size != sources.size || counts.size != sources.size ||
+        gains.size != 2 * sources.size || offsets.size != gains.size ||
+        !all_below(sources, s->outputs) || !all_below(targets, s->inputs)) {
         return refuse("routes");
     }
     for (size_t i = 0; i < s->number_of_routes; i++) {
         const uint32_t source = numbers_of(sources)[i], target = numbers_of(targets)[i];
         s->routes[i] = (Route){source, target, part_with(s, source, false),
-                               part_with(s, target, true),
+                               part_with(s, target, true), numbers_of(counts)[i],
                                scale_of(doubles_of(gains)[i], doubles_of(offsets)[i])};
-        if (i > 0 && target <= s->routes[i - 1].target) {
+        const Route *route = &s->routes[i], *before = i > 0 ? route - 1 : NULL;
+        if (!is_sound_route(s, route) ||
+            (before != NULL && target < before->target + before->count)) {
             return refuse("routes");
         }
     }
@@ -216,40 +285,74 @@ static bool take_routes(PyObject *tuple, System *s) {
 }
 
 static bool is_sound_end(const System *s, const End *end) {
-    return end->part < s->count && end->type < NUMBER_OF_TYPES &&
-           end->input < (int64_t)s->inputs && end->output < (int64_t)s->outputs;
+    const int64_t place = end->element.place, after = end->element.size - place;
+    return end->part < s->count && end->type < NUMBER_OF_TYPES && after > 0 &&
+           (end->starts != NULL || end->element.size == 1) && end->output < (int64_t)s->outputs &&
+           (end->input < 0 || (end->input >= place && end->input + after <= (int64_t)s->inputs));
+}
+
+/* Where the start values of each array begin; NULL if the sizes and the values do not fit. */
+static const double **starts_of(Bytes sizes, Bytes starts) {
+    const size_t count = count_of(sizes, sizeof(uint32_t));
+    const double **found = calloc(count + 1, sizeof *found);
+    size_t sum = 0;
+
+    for (size_t i = 0; found != NULL && i < count; i++) {
+        found[i] = doubles_of(starts) + sum;
+        sum += numbers_of(sizes)[i];
+    }
+    if (found != NULL && sum != count_of(starts, sizeof(double))) {
+        free((void *)found);
+        found = NULL;
+    }
+    return found;
+}
+
+/* An end of which the part, type, element, slots and scale are known. Elements of arrays have the
+ * start values of these. */
+static void give_starts(End *end, int32_t array, Bytes sizes, const double *const *starts) {
+    if (array >= 0 && (size_t)array < count_of(sizes, sizeof(uint32_t))) {
+        end->starts = starts[array];
+        end->element.size = numbers_of(sizes)[array];
+    }
 }
 
 static bool take_ends(PyObject *tuple, System *s) {
-    Bytes firsts, parts, types, references, inputs, outputs, gains, offsets;
+    Bytes sizes, starts, firsts, parts, types, references, inputs, outputs, arrays, places;
+    Bytes gains, offsets;
 
     if (!PyTuple_Check(tuple) ||
-        !PyArg_ParseTuple(tuple, "y#y#y#y#y#y#y#y#", &firsts.data, &firsts.size, &parts.data,
-                          &parts.size, &types.data, &types.size, &references.data,
-                          &references.size, &inputs.data, &inputs.size, &outputs.data,
-                          &outputs.size, &gains.data, &gains.size, &offsets.data, &offsets.size)) {
+        !PyArg_ParseTuple(tuple, "y#y#y#y#y#y#y#y#y#y#y#y#", BYTES(sizes), BYTES(starts),
+                          BYTES(firsts), BYTES(parts), BYTES(types), BYTES(references),
+                          BYTES(inputs), BYTES(outputs), BYTES(arrays), BYTES(places),
+                          BYTES(gains), BYTES(offsets))) {
         return refuse("variables");
     }
     const size_t count = (size_t)types.size;
     s->number_of_variables = count_of(firsts, sizeof(uint32_t)) - 1;
     s->first_ends = numbers_of(firsts);
     s->ends = calloc(count + 1, sizeof *s->ends);
-    bool sound = s->ends != NULL && firsts.size >= (Py_ssize_t)sizeof(uint32_t) &&
+    const double **starts_of_arrays = starts_of(sizes, starts);
+    bool sound = s->ends != NULL && starts_of_arrays != NULL &&
+                 firsts.size >= (Py_ssize_t)sizeof(uint32_t) &&
                  count_of(parts, 4) == count && count_of(references, 4) == count &&
                  count_of(inputs, 4) == count && count_of(outputs, 4) == count &&
+                 count_of(arrays, 4) == count && count_of(places, 4) == count &&
                  count_of(gains, 8) == count && count_of(offsets, 8) == count;
     for (size_t i = 0; sound && i < count; i++) {
-        s->ends[i] = (End){numbers_of(parts)[i],
-                           numbers_of(references)[i],
-                           (Type)(uint8_t)types.data[i],
-                           (int32_t)numbers_of(inputs)[i],
-                           (int32_t)numbers_of(outputs)[i],
-                           scale_of(doubles_of(gains)[i], doubles_of(offsets)[i])};
+        s->ends[i] = (End){.part = numbers_of(parts)[i],
+                           .type = (Type)(uint8_t)types.data[i],
+                           .element = {numbers_of(references)[i], numbers_of(places)[i], 1},
+                           .input = (int32_t)numbers_of(inputs)[i],
+                           .output = (int32_t)numbers_of(outputs)[i],
+                           .scale = scale_of(doubles_of(gains)[i], doubles_of(offsets)[i])};
+        give_starts(&s->ends[i], (int32_t)numbers_of(arrays)[i], sizes, starts_of_arrays);
         sound = is_sound_end(s, &s->ends[i]);
     }
     for (size_t i = 0; sound && i < s->number_of_variables; i++) {
         sound = s->first_ends[i] < s->first_ends[i + 1] && s->first_ends[i + 1] <= count;
     }
+    free((void *)starts_of_arrays);
     return sound || refuse("variables");
 }
 
@@ -278,6 +381,15 @@ static void need_memory(System *s, size_t unknowns) {
     s->memory = wanted > s->memory ? wanted : s->memory;
 }
 
+/* How many values routes carry. */
+static size_t unknowns_of(const System *s, Bytes routes) {
+    size_t sum = 0;
+    for (size_t i = 0; i < count_of(routes, sizeof(uint32_t)); i++) {
+        sum += s->routes[numbers_of(routes)[i]].count;
+    }
+    return sum;
+}
+
 static bool take_group(PyObject *tuple, System *s, PartGroup *group) {
     Bytes parts, routes;
     PyObject *loop;
@@ -291,7 +403,8 @@ static bool take_group(PyObject *tuple, System *s, PartGroup *group) {
     group->count = count_of(parts, sizeof(uint32_t));
     group->routes = numbers_of(routes);
     group->number_of_routes = count_of(routes, sizeof(uint32_t));
-    need_memory(s, group->number_of_routes);
+    group->unknowns = unknowns_of(s, routes);
+    need_memory(s, group->unknowns);
     return take_loop(loop, &group->loop, &group->has_loop, &group->label);
 }
 
@@ -306,7 +419,8 @@ static bool take_transfer(PyObject *tuple, System *s, Transfer *transfer) {
     }
     transfer->routes = numbers_of(routes);
     transfer->count = count_of(routes, sizeof(uint32_t));
-    need_memory(s, transfer->count);
+    transfer->unknowns = unknowns_of(s, routes);
+    need_memory(s, transfer->unknowns);
     return take_loop(loop, &transfer->loop, &transfer->has_loop, &transfer->label);
 }
 
@@ -330,8 +444,30 @@ static bool take_transfers(PyObject *tuple, System *s) {
     return s->transfers != NULL;
 }
 
+/* The outputs of the master itself follow those of the parts. */
+static bool take_control(PyObject *tuple, System *s) {
+    StepControl *control = &s->control;
+    Bytes sources, nominals;
+
+    s->first_statistic = s->outputs;
+    if (tuple == Py_None) {
+        return true;
+    }
+    if (!PyTuple_Check(tuple) ||
+        !PyArg_ParseTuple(tuple, "ddy#y#", &control->tolerance, &control->smallest, BYTES(sources),
+                          BYTES(nominals)) ||
+        nominals.size != 2 * sources.size || !all_below(sources, s->outputs)) {
+        return refuse("estimates of errors");
+    }
+    control->sources = numbers_of(sources);
+    control->nominals = doubles_of(nominals);
+    control->count = count_of(sources, sizeof(uint32_t));
+    s->outputs += ERROR_OF_FIRST + control->count;
+    return true;
+}
+
 bool take_system(PyObject *object, System **system) {
-    PyObject *parts, *routes, *ends, *groups, *transfers;
+    PyObject *parts, *routes, *ends, *groups, *transfers, *control;
     int jacobi;
 
     if (object == Py_None) {
@@ -342,12 +478,12 @@ bool take_system(PyObject *object, System **system) {
         PyErr_NoMemory();
         return false;
     }
-    if (!PyTuple_Check(object) || !PyArg_ParseTuple(object, "OOOOOp", &parts, &routes, &ends,
-                                                    &groups, &transfers, &jacobi)) {
+    if (!PyTuple_Check(object) || !PyArg_ParseTuple(object, "OOOOOpO", &parts, &routes, &ends,
+                                                    &groups, &transfers, &jacobi, &control)) {
         return refuse("groups");
     }
     s->jacobi = jacobi;
-    return take_parts(parts, s) && take_routes(routes, s) && take_ends(ends, s) &&
+    return take_parts(parts, s) && take_control(control, s) && take_routes(routes, s) && take_ends(ends, s) &&
            take_groups(groups, s) && take_transfers(transfers, s);
 }
 
@@ -359,6 +495,7 @@ void drop_system(System *s) {
         access_close(&part->starts);
         free((void *)part->categories);
         free(part->strings);
+        drop_remote(part->remote);
     }
     if (s != NULL) {
         free(s->parts);

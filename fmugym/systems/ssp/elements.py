@@ -45,6 +45,7 @@ _INTERFACES: Final = {
     "CoSimulation": "co_simulation",
     "ModelExchange": "model_exchange",
 }
+_REALS: Final = ("Real", "Float64", "Float32")
 _IGNORED: Final = {
     "ElementGeometry",
     "SystemGeometry",
@@ -265,7 +266,8 @@ def _read_component(xml: Any, findings: list[str]) -> Element:
 def _read_connectors(xml: Any) -> dict[str, OwnConnector]:
     found = {}
     for one in children(xml, "Connectors/Connector"):
-        real = next(children(one, "Real"), None)
+        found_types = (next(children(one, name), None) for name in _REALS)
+        real = next((element for element in found_types if element is not None), None)
         unit = None if real is None else real.get("unit")
         kind, text = one.get("kind") or "", one.get("description") or ""
         found[one.get("name") or ""] = OwnConnector(kind, unit, text)

@@ -7,7 +7,7 @@ Connections make a forest of nodes: every node has one source at most.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fmugym.archive.description import ModelDescription, Unit, Variable
@@ -75,7 +75,7 @@ class Flat:
         element = self.components.get(node[0])
         if element is None:
             return None
-        return self.description_of(element).variables.get(node[1])
+        return self.description_of(element).find(node[1])
 
     # Connections
 
@@ -233,6 +233,9 @@ class Flat:
     def _ends(self, node: Node, setting: Setting) -> Iterator[tuple[Node, Any]]:
         """The variables of components that get a value by a node, and their values."""
         value = setting.value
+        if isinstance(value, tuple):
+            yield from self._ends_of_array(node, setting, value)
+            return
         if isinstance(value, bool | str):
             for end, _ in self._reached(node, _Value()):
                 yield end, value
@@ -242,6 +245,13 @@ class Flat:
         first = self._converted(first, units, setting, node)
         for end, reached in self._reached(node, first):
             yield end, reached.offset
+
+    def _ends_of_array(
+        self, node: Node, setting: Setting, values: tuple[float, ...]
+    ) -> Iterator[tuple[Node, Any]]:
+        columns = [list(self._ends(node, replace(setting, value=value))) for value in values]
+        for ends in zip(*columns, strict=True):
+            yield ends[0][0], [value for _, value in ends]
 
     def _converted(
         self, value: _Value, units: Mapping[str, Unit], setting: Setting, node: Node

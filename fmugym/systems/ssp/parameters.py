@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -21,7 +22,10 @@ __all__ = ["Setting", "read_settings"]
 
 _SET_TYPE: Final = "application/x-ssp-parameter-set"
 _MAPPING_TYPE: Final = "application/x-ssp-parameter-mapping"
-_NUMERIC: Final = ("Real", "Float64", "Float32", "Integer")
+_NUMERIC: Final = (
+    *("Real", "Float64", "Float32", "Integer"),
+    *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)),
+)
 _MAPPINGS: Final = {
     "Boolean": "BooleanMappingTransformation",
     "Integer": "IntegerMappingTransformation",
@@ -35,7 +39,8 @@ class Setting:
 
     Attributes:
         name: The hierarchical name, seen from the element that has the binding.
-        value: A number, a Boolean, a text, or the name of an item of an enumeration.
+        value: A number, a Boolean, a text, or the name of an item of an enumeration; of an array,
+            a tuple of numbers or Booleans in row-major order.
         unit: Of a real number; None if the source gives none.
         units: The definitions of units in the source.
         convert: Whether the value is converted to the unit of the parameter.
@@ -43,7 +48,7 @@ class Setting:
     """
 
     name: str
-    value: float | bool | str
+    value: float | bool | str | tuple[float, ...]
     unit: str | None
     units: dict[str, Unit]
     convert: bool = True
@@ -101,8 +106,14 @@ def _content(xml: Any, inline: str, read: Callable[[str], Any], kind: str) -> An
 
 def _setting(xml: Any, prefix: str, units: dict[str, Unit], findings: list[str]) -> Setting | None:
     name = prefix + (xml.get("name") or "")
+    is_array = next(children(xml, "Dimension"), None) is not None
     for element in xml.iterchildren("{*}*"):
         kind = element.tag.rpartition("}")[2]
+        if is_array and kind in {*_NUMERIC, "Boolean"}:
+            return Setting(name, _numbers(element), element.get("unit"), units)
+        if is_array and kind in {"String", "Enumeration"}:
+            findings.append(f"the parameter {shown(name)} is an array of {kind} and is ignored")
+            return None
         if kind in _NUMERIC:
             return Setting(name, number_in(element, "value"), element.get("unit"), units)
         if kind == "Boolean":
@@ -112,6 +123,19 @@ def _setting(xml: Any, prefix: str, units: dict[str, Unit], findings: list[str])
         if kind != "Annotations":
             findings.append(f"the parameter {shown(name)} of type {kind} is ignored")
     return None
+
+
+def _numbers(xml: Any) -> tuple[float, ...]:
+    """The values of an array, which are separated by spaces."""
+    texts = (xml.get("value") or "").split()
+    try:
+        numbers = tuple(float({"true": 1, "false": 0}.get(text, text)) for text in texts)
+    except ValueError:
+        numbers = (math.nan,)
+    if not all(map(math.isfinite, numbers)):
+        text = shown(xml.get("value"))
+        raise FMULoadError(f"line {xml.sourceline}: value is {text}, expected numbers")
+    return numbers
 
 
 def _mapped(settings: list[Setting], mapping: Any) -> Iterator[Setting]:
@@ -138,6 +162,10 @@ def _looked_up(
     setting: Setting, kind: str, texts: dict[str | None, str | None], entry: Any
 ) -> float | bool | str:
     key = setting.value
+    if isinstance(key, tuple):
+        raise FMULoadError(
+            f"line {entry.sourceline}: {_MAPPINGS[kind]} is not supported for arrays"
+        )
     if kind == "Boolean":
         table = {str(k in {"true", "1"}): v in {"true", "1"} for k, v in texts.items()}
         return table.get(str(bool(key)), key)

@@ -77,7 +77,8 @@ def _sources(components: Iterable[OpenComponent]) -> dict[Path, str]:
 
 def _document(system: WiredSystem, sources: Mapping[Path, str]) -> Any:
     root = etree.Element(_tag("ssd:SystemStructureDescription"), nsmap=_SPACES)
-    root.attrib.update({"version": "1.0", "name": system.name, "generationTool": "fmugym"})
+    version = "2.0" if _has_arrays(system) else "1.0"
+    root.attrib.update({"version": version, "name": system.name, "generationTool": "fmugym"})
     root.append(_system(system, sources))
     units = dict(_units_of(system))
     if units:
@@ -85,6 +86,17 @@ def _document(system: WiredSystem, sources: Mapping[Path, str]) -> Any:
     times = {"startTime": system.times["start_time"], "stopTime": system.times["stop_time"]}
     _add(root, "ssd:DefaultExperiment", **{k: _text(v) for k, v in times.items() if v is not None})
     return root
+
+
+def _has_arrays(system: WiredSystem) -> bool:
+    """Whether connections or start values are of arrays, which SSP has known since version 2.0."""
+    ports = (system.port(end) for one in system.connections for end in (one.source, one.target))
+    connected = any(port is not None and not port.variable.is_scalar for port in ports)
+    return connected or any(
+        not one.variable(name).is_scalar
+        for one in system.components.values()
+        for name in one.given.start_values
+    )
 
 
 def _system(system: WiredSystem, sources: Mapping[Path, str]) -> Any:
@@ -115,9 +127,9 @@ def _component(component: OpenComponent, source: str, used: set[str]) -> Any:
     implementation = _IMPLEMENTATIONS[component.fmu.interface]
     element.attrib.update({"type": FMU_TYPE, "source": source, "implementation": implementation})
     shown = [
-        variable
+        one
         for variable in component.fmu.description.variables.values()
-        if f"{component.name}.{variable.name}" in used
+        for one in _named_in(used, component.name, variable)
     ]
     if shown:
         connectors = _add(element, "ssd:Connectors")
@@ -128,8 +140,19 @@ def _component(component: OpenComponent, source: str, used: set[str]) -> Any:
     own = {} if component.given.steps == 1 else {"steps": str(component.given.steps)}
     if component.given.feedthrough is False:
         own["feedthrough"] = "false"
+    if component.given.isolate:
+        own["isolate"] = "true"
     _annotate(element, "Component", own)
     return element
+
+
+def _named_in(used: set[str], component: str, variable: Variable) -> Iterator[Variable]:
+    """A variable and those of its elements that connections name."""
+    if f"{component}.{variable.name}" in used:
+        yield variable
+    begin = f"{component}.{variable.name}["
+    if variable.shape and any(name.startswith(begin) for name in used):
+        yield from (one for one in variable.elements if f"{component}.{one.name}" in used)
 
 
 def _kind(variable: Variable) -> str:
@@ -147,18 +170,28 @@ def _add_connector(
     unit = unit or variable.unit
     if own == "Real" and unit is not None:
         found.set("unit", unit)
+    _add_dimensions(connector, variable)
+
+
+def _add_dimensions(parent: Any, variable: Variable) -> None:
+    for length in variable.shape:
+        _add(parent, "ssc:Dimension", size=str(length))
 
 
 def _add_values(element: Any, component: OpenComponent) -> None:
     binding = _add(_add(element, "ssd:ParameterBindings"), "ssd:ParameterBinding")
     values = _add(binding, "ssd:ParameterValues")
-    group = _add(values, "ssv:ParameterSet", version="1.0", name=f"{component.name} values")
+    given = {name: component.variable(name) for name in component.given.start_values}
+    version = "1.0" if all(variable.is_scalar for variable in given.values()) else "2.0"
+    group = _add(values, "ssv:ParameterSet", version=version, name=f"{component.name} values")
     parameters = _add(group, "ssv:Parameters")
-    for name, value in component.starts:
-        variable = component.variable(name)
+    known = {**dict(component.starts), **component.sizes}
+    for name, variable in given.items():
         own = _TYPES.get(variable.kind, "Integer")
         parameter = _add(parameters, "ssv:Parameter", name=name)
-        _add(parameter, f"ssv:{own}", value=_value(own, value))
+        texts = [_value(own, known[element.name]) for element in variable.elements]
+        _add(parameter, f"ssv:{own}", value=texts[0] if variable.is_scalar else " ".join(texts))
+        _add_dimensions(parameter, variable)
 
 
 def _value(kind: str, value: float | str) -> str:
@@ -220,6 +253,8 @@ def _own_of_system(system: WiredSystem) -> dict[str, str]:
         "step_size": system.times["step_size"],
         "tolerance": system.times["tolerance"],
         "loop_tolerance": system.loop.tolerance,
+        "error_tolerance": None if system.control is None else system.control.tolerance,
+        "min_step_size": None if system.control is None else system.control.min_step_size,
     }
     own = {"master": system.master, "loops": system.loops}
     own |= {
