@@ -31,8 +31,8 @@ _SCALES: Final = (0.1, 0.1, 1.0, 1.0, 10.0, 300.0)
 def require_equal(env: FMUEnv, task: SingleTask) -> None:
     """Run programs and hooks on random states, and compare all results to the last bit.
 
-    States in which a hook raises an exception are left out. NaNs are equal. Hooks that are left to
-    Python are called, too: they must change nothing.
+    States in which a hook raises an exception, or the programs ask for Python, are left out. NaNs
+    are equal. Hooks that are left to Python are called, too: they must change nothing.
 
     Args:
         env: The environment, in an episode; its FMU is not used.
@@ -140,6 +140,8 @@ class _Comparison:
                 if is_of_signal_handler(error):
                     raise
                 return False
+            if _leaves_to_python(self._wanted[:, index], np.array(inputs)):
+                return False
             _require("_get_inputs", self._wanted[:, index], np.array(inputs))
             self._place_after(index, inputs)
             try:
@@ -148,6 +150,8 @@ class _Comparison:
             except Exception as error:  # as above
                 if is_of_signal_handler(error):
                     raise
+                return False
+            if _leaves_to_python(self._judged[-1][index], np.asarray(result[1])):
                 return False
             self._compare_results(index, result)
         return True
@@ -230,6 +234,11 @@ class _Comparison:
             if kind_of(value) != self._task.variables[name]:
                 raise UntraceableError(f"_update gives {name!r} different types")
             _require("_update", self._after[name][:, index], np.asarray(value).reshape(-1))
+
+
+def _leaves_to_python(values: Any, expected: Any) -> bool:
+    """Whether a NaN asks Python to judge a step, where that finds a number."""
+    return bool(np.any((values != values) & (expected == expected)))
 
 
 def _require(hook: str, value: Any, expected: Any) -> None:
