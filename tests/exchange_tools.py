@@ -17,6 +17,7 @@ STATES = {
     "prothero": ["x"],
     "relay": ["x"],
     "sun": ["x"],
+    "season": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -32,6 +33,7 @@ OTHERS = {
     "prothero": ["k"],
     "relay": ["turns", "last", "speed"],
     "sun": ["now", "sine", "seconds", "u"],
+    "season": ["u"],
 }
 """The other variables in the order of their value references."""
 
@@ -50,6 +52,7 @@ START = {
     "prothero": {"x": 1, "k": 1},
     "relay": {"x": 0, "last": 1e9, "speed": 1},
     "sun": {"x": 0, "u": 0},
+    "season": {"x": 1, "u": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

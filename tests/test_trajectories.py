@@ -288,6 +288,60 @@ class TestModelExchange:
         assert (found.states, found.method) == (("x",), method)
 
 
+class TestTimeDependentFMU:
+    """x' = cos(t) (x + u), whose matrices change from step to step."""
+
+    @pytest.fixture(name="make_env", params=["1", "2", "3"])
+    def fixture_make_env(self, request, tmp_path):
+        """FMI 1.0 has no saved states: episodes are played again."""
+        path = exchange_tools.exchange_fmu(tmp_path / "M.fmu", "season", int(request.param))
+
+        class Season(fmugym.FMUEnv):
+            def __init__(self):
+                config = {
+                    "model_input_names": "u",
+                    "model_output_names": "x",
+                    "bounds": {"u": (-1, 1)},
+                    "tolerance": 1e-10,
+                    "time_step": 0.3,
+                    "start_time": 2.0,
+                    "substeps": 2,
+                }
+                super().__init__(path, config)
+
+            def _is_done(self):
+                return False
+
+        return Season
+
+    @pytest.mark.parametrize("passed", [0, 3])
+    @pytest.mark.parametrize("kind", ["python", "native"])
+    def test_is_the_solution_of_the_equation(self, make_env, kind, passed):
+        actions = np.linspace(-0.5, 0.8, 7, dtype=np.float32)[:, None]
+        with make_env() as env:
+            env.reset(seed=0)
+            for _ in range(passed):
+                env.step(np.zeros(1, np.float32))
+            snapshot = env.save_state()
+        envs = vector_of(make_env, 4, **POOLS[kind])
+        try:
+            envs.reset(seed=1)
+            envs.step(np.zeros((4, 1), np.float32))
+            here = envs.save_state()
+            found = linearize_along(envs, snapshot, actions, states=["x"], method="differences")
+            assert envs.save_state() == here
+        finally:
+            envs.close()
+        times = 2.0 + 0.3 * (passed + np.arange(8))
+        growth = np.exp(np.diff(np.sin(times)))
+        for name, values in {"A": growth, "B": growth - 1, "C": growth, "D": growth - 1}.items():
+            assert getattr(found, name).ravel() == pytest.approx(values, abs=1e-6), name
+        x = [np.exp(np.sin(times[0]) - np.sin(2.0))]
+        for rate, u in zip(growth, actions[:, 0].tolist(), strict=True):
+            x.append(rate * (x[-1] + u) - u)
+        assert found.x[:, 0] == pytest.approx(np.array(x), rel=1e-8)
+
+
 def test_wrong_derivatives_are_told(monkeypatch, caplog):
     along(exact)
     assert not caplog.records

@@ -47,12 +47,14 @@ class SavingPool(AttendedPool):
 
     _variable: Callable[[str], Variable]
     _start_time = 0.0
+    _warm_up_steps, _substeps = 0, 1
     _offered = SaveMethod.REPLAY
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
         """Take over what saving needs; returns whether the pool must keep records."""
         self._variable, self._start_time = description.variable, spec.start_time
+        self._warm_up_steps, self._substeps = spec.warm_up_steps, spec.substeps
         self._offered = offered_method(description, spec)
         return spec.records or self._offered is not SaveMethod.STATE
 
@@ -77,7 +79,8 @@ class SavingPool(AttendedPool):
         records = self._records(indices)
         lengths = [0 if record is None else len(record.inputs) for record in records]
         ends = np.zeros(len(indices), np.int64)
-        steps, copies = np.array(lengths, np.int64), self._copies(indices)
+        steps = (np.array(lengths, np.int64) + self._warm_up_steps) * self._substeps
+        copies = self._copies(indices)
         usual = self._start_time
         times = [usual if record is None else record.start_time(usual) for record in records]
         return Bundle(outputs, steps, np.array(times), b"", ends, tuple(records), copies)

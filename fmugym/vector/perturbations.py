@@ -12,6 +12,7 @@ from fmugym.errors import SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
+from fmugym.pool.spec import START_TIME
 from fmugym.task.interface import checked_value
 from fmugym.task.snapshot import Columns, Snapshot, stacked, taken
 from fmugym.vector.env import FMUVectorEnv
@@ -103,12 +104,12 @@ class _Perturbation:
         given = {
             name: column[0]
             for name, column in start.columns_for(envs._scope)["parameters"].items()
-            if column[0] is not None and name not in states.values()
+            if column[0] is not None and name not in {*states.values(), START_TIME.name}
         }
         fixed = [env._interface.parameter(name, value) for name, value in given.items()]
         pairs = zip(fixed, given.values(), strict=True)
         self._fixed = np.array([checked_value(variable, value) for variable, value in pairs])
-        self._variables = (*fixed, *map(env.fmu.variable, states.values()))
+        self._variables = (*fixed, *map(env.fmu.variable, states.values()), START_TIME)
         self._starts = tuple(states.values())
 
     def differentiate(self, nominal: npt.NDArray[Any], steps: tuple[float, float]) -> Matrices:
@@ -116,18 +117,41 @@ class _Perturbation:
         x, y = self._follow(nominal)
         scales = self._scales(x)
         trials, widths = self._trials(nominal, x[:-1], scales * steps[0], steps[1])
-        rounds = [self._play(trials.take(p)) for p in self._rounds(len(trials.at))]
-        before, after = (
-            np.concatenate(part)[: len(trials.at)] for part in zip(*rounds, strict=True)
-        )
+        before, after = self._play_at_any_time(trials, x, scales)
         n = len(self._x)
-        before, after = (rows.reshape(len(nominal), -1, rows.shape[1]) for rows in (before, after))
-        self._require_agreement(x, after[:, 0, :n], scales)
         slopes = _slopes(before[:, 1:], after[:, 1:], widths)
         (a, b), (c, d) = (
             (rows[:, :, :n], rows[:, :, n:]) for rows in (slopes[:, :n], slopes[:, n:])
         )
         return Matrices(a, b, c, d, x, y)
+
+    def _play_at_any_time(
+        self, trials: _Trials, x: FloatArray, scales: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Let the FMU start at the time of each step, or at that of the trajectory.
+
+        The first is right for all FMUs that can start at any time. Others may not depend on it.
+        """
+        try:
+            return self._play_all(trials, x, scales)
+        except SimulationError as reason:
+            self._times = np.full_like(self._times, self._times[0])
+            try:
+                return self._play_all(trials, x, scales)
+            except SimulationError:
+                raise reason from None
+
+    def _play_all(
+        self, trials: _Trials, x: FloatArray, scales: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The states before each trial, and the states and outputs after it, by step."""
+        rounds = [self._play(trials.take(p)) for p in self._rounds(len(trials.at))]
+        before, after = (
+            np.concatenate(part)[: len(trials.at)].reshape(len(x) - 1, -1, part[0].shape[1])
+            for part in zip(*rounds, strict=True)
+        )
+        self._require_agreement(x, after[:, 0, : len(self._x)], scales)
+        return before, after
 
     def _follow(self, nominal: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Play the trajectory, and keep each moment of it; returns x and y."""
@@ -149,6 +173,9 @@ class _Perturbation:
             y.append(self._pool.outputs[: self._count_of_y, 0].copy())
         self._bundle: Bundle = Bundle.of_all(bundles)
         self._columns: Columns = stacked(columns)
+        spec = self._envs._prototype._spec
+        pairs = zip(self._bundle.steps.tolist(), self._bundle.start_times.tolist(), strict=True)
+        self._times = np.array([spec.communication_point(*pair) for pair in pairs])
         return np.array(x), np.array(y)
 
     def _scales(self, x: FloatArray) -> FloatArray:
@@ -212,7 +239,8 @@ class _Perturbation:
 
     def _start_at(self, trials: _Trials) -> None:
         fixed = np.repeat(self._fixed[:, None], len(self._everywhere), axis=1)
-        values = np.ascontiguousarray(np.concatenate([fixed, trials.states.T]))
+        times = self._times[trials.at][None]
+        values = np.ascontiguousarray(np.concatenate([fixed, trials.states.T, times]))
         self._pool.reset(self._variables, values, trials.starts)
 
     # What may be wrong

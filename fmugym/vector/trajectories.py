@@ -100,8 +100,8 @@ def linearize_along(
       are far off, a warning is logged.
     - ``"differences"``: central differences, all states, actions and steps together, on all
       threads. Each state is moved by its start value: episodes that start at the states of the
-      trajectory do one step. So the start values of ``states`` must determine all of the FMU's
-      state, and the time must not matter; what an unmoved start leads to is compared with the
+      trajectory, each at the time of its step, do one step. So the start values of ``states`` must
+      determine all of the FMU's state; what an unmoved start leads to is compared with the
       trajectory. The result is that of the FMU's solver with its step size.
 
     Args:
