@@ -175,7 +175,7 @@ class _Perturbation:
         self._columns: Columns = stacked(columns)
         spec = self._envs._prototype._spec
         pairs = zip(self._bundle.steps.tolist(), self._bundle.start_times.tolist(), strict=True)
-        self._times = np.array([spec.communication_point(*pair) for pair in pairs])
+        self._times: FloatArray = np.array([spec.communication_point(*pair) for pair in pairs])
         return np.array(x), np.array(y)
 
     def _scales(self, x: FloatArray) -> FloatArray:
