@@ -13,10 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import building
+import clocks_tools
 import exchange_tools
 import fmu_tools
 import numpy as np
 import pytest
+import values_tools
 import wine_tools
 from process_tools import faulty_fmu, start_values
 from system_tools import linear, linear_fmu, masses, system
@@ -205,6 +207,70 @@ class TestResults:
         pool = make(apart(plan, "first"), MASSES, fault_retries=2)
         assert play(pool).tobytes() == rows.tobytes()
         assert pool.health()["retries"].sum() > 0
+
+    @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+    def test_arrays_with_sizes_of_their_own(self, make, tmp_path, interface):
+        path = values_tools.state_space_fmu(tmp_path / "S.fmu")
+        sizes = {"n": 3, "m": 2, "r": 2}
+        starts = {
+            "A": (-np.eye(3) + 0.1).tolist(),
+            "B": np.full((3, 2), 0.3).tolist(),
+            "C": np.arange(6.0).reshape(2, 3).tolist(),
+            "D": np.zeros((2, 2)).tolist(),
+            "x_0": [1.0, -0.5, 0.25],
+        }
+        results = []
+        for isolate in (False, True):
+            one = Component(path, sizes | starts, interface, feedthrough=False, isolate=isolate)
+            both = FMUSystem({"p": one, "q": one}, ["p.y -> q.u", "q.y -> p.u"])
+            outputs = [f"{name}.y[{i}]" for name in "pq" for i in (1, 2)]
+            pool = make(both.plan, outputs)
+            results.append(play(pool))
+        assert np.ptp(results[0]) > 1.0
+        assert results[0].tobytes() == results[1].tobytes()
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_numbers_of_every_type(self, make, tmp_path, version):
+        path = values_tools.feedthrough_fmu(tmp_path / "F.fmu", version)
+        plan = system([Planned("f", path)], ())
+        fmu = SystemFMU(plan)
+        names = [v.name for v in fmu.description.variables.values() if v.is_number]
+        inputs = [n for n in names if fmu.variable(n).causality == "input"]
+        outputs = [n for n in names if fmu.variable(n).causality == "output"]
+        rows = []
+        for one in (plan, apart(plan, "f")):
+            pool = make(one, outputs, inputs=inputs)
+            assert not reset(pool).any(), pool.failure(0)
+            for k in range(3):
+                values = np.full((len(inputs), 2), float(k)) + np.array([0.0, 1.0])
+                outs, statuses = pool.step(values)
+                assert not statuses.any(), pool.failure(0)
+                rows.append(outs.tobytes())
+        assert len(set(rows)) == 3
+        assert rows[:3] == rows[3:]
+
+    def test_clocks(self, make, tmp_path):
+        path = clocks_tools.clocks_fmu(tmp_path / "Clocks.fmu")
+        plan = system([Planned("c", path)], ())
+        outputs = ["c.x", "c.sample", "c.alarms"]
+        rows = play(make(plan, outputs, inputs=["c.plain"]), 20)
+        pool = make(apart(plan, "c"), outputs, inputs=["c.plain"])
+        assert play(pool, 20).tobytes() == rows.tobytes()
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_strings_and_messages(self, make, tmp_path, caplog, version):
+        """The FMU logs its String; the message names the system and the component."""
+        probe = fmu_tools.probe_fmu(tmp_path, version)
+        told = []
+        for isolate in (False, True):
+            parts = Planned("loud", probe, starts=(("label", "Ümlaut"),), isolate=isolate)
+            pool = make(system([parts], ()), ["loud.sum"])
+            caplog.clear()
+            assert not reset(pool, ["loud.log_status"], [[-1.0, 1.0]]).any(), pool.failure(0)
+            pool.step()
+            told.append([r.getMessage() for r in caplog.records if "loud" in r.getMessage()])
+        assert any("system_1.loud" in text and "Ümlaut is 100%" in text for text in told[0])
+        assert told[0] == told[1]
 
     def test_many_threads(self, make, fmus):
         plan = masses([fmus[2], fmus[3]])
@@ -471,6 +537,16 @@ class TestInWine:
         mixed = masses([path, fmus[3]])
         assert SystemFMU(mixed).whereabouts_by_name == {"first": "wine", "second": "here"}
         assert play(make(mixed, MASSES)).tobytes() == rows.tobytes()
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_model_exchange(self, make, tmp_path, version):
+        """x' = -k x from 1: the closed form."""
+        path = wine_tools.exchange_fmu(tmp_path / "Model.fmu", "dahlquist", version)
+        pool = make(system([Planned("d", path)], ()), ["d.x"], tolerance=1e-8)
+        assert not reset(pool, ["d.k"], [[1.0, 2.0]]).any(), pool.failure(0)
+        for _ in range(10):
+            assert not pool.step()[1].any()
+        np.testing.assert_allclose(pool.outputs[0], np.exp([-1.0, -2.0]), rtol=1e-6)
 
     def test_a_pendulum_beside_a_native_one(self, tmp_path):
         """The libraries differ in their sine and cosine by rounding."""
